@@ -101,8 +101,10 @@ def state() -> str:
 
 def make(name: str, runs: Path, now: str, minutes: float) -> str:
     """Run a source unless it is finished; return why its figures are not there, or nothing."""
-    folder, command = runs / name, list(SOURCES[name])
-    stamp, now = folder / "state", f"{now}\n{' '.join(command)}"
+    folder = runs / name
+    command = list(SOURCES[name])
+    stamp = folder / "state"
+    now = f"{now}\n{' '.join(command)}"
     if stamp.is_file() and stamp.read_text(encoding="utf-8") == now:
         return ""
     print(f"running {name}: {' '.join(command)}", flush=True)
@@ -134,7 +136,8 @@ def figure(where: str, runs: Path) -> str:
         if found is None:
             raise LookupError(f"{where}: the output has no such line")
         return found[1]
-    word, digits = scale[0] if scale else "x1", int(scale[1]) if len(scale) > 1 else 3
+    word = scale[0] if scale else "x1"
+    digits = int(scale[1]) if len(scale) > 1 else 3
     factor = DEG if word == "deg" else float(word.removeprefix("x"))
     return shown(entry(json.loads(content), path), factor, digits)
 
@@ -208,7 +211,8 @@ def main() -> None:
     wanted = set(options.only.split(",")) if options.only else used
     if unknown := wanted - set(SOURCES):
         parser.error(f"no source '{min(unknown)}'; valid: {', '.join(SOURCES)}")
-    now, changed = state(), 0
+    now = state()
+    changed = 0
     reasons = dict.fromkeys(used - wanted, "not asked for")
     for name in sorted(used & wanted):
         reason = make(name, options.runs, now, options.minutes)

@@ -160,7 +160,8 @@ def test_other_logs_are_judged_as_those_of_the_fit(
 
 
 def test_stepping_with_arrays(models: residnet.Models, data: residnet.Dataset) -> None:
-    model, log = models["ridge"], data.logs("test")[0]
+    model = models["ridge"]
+    log = data.logs("test")[0]
     x0, w = log.y[0], log.w[:20]
     states = model.rollout(x0, w)
     x, s = x0, None
@@ -199,7 +200,8 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> No
     table = build_metrics_table(metrics["rows"])
     result = residnet.run(config, report=False)
     pd.testing.assert_frame_equal(result.metrics, table, rtol=1e-12)
-    prepared, evaluation = config["prepare"], config["evaluation"]
+    prepared = config["prepare"]
+    evaluation = config["evaluation"]
     data = residnet.prepare(
         config["data"],
         config["signals"]["inputs"],

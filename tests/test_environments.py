@@ -23,7 +23,9 @@ pytestmark = pytest.mark.long
 
 def written(folder: Path, names: list[str]) -> Path:
     """Return a config of a baseline beside logs of a boat in canonical files, one of each name."""
-    source, logs, files = random_logs("boat", 3, 1)[0], folder / "logs", list[str]()
+    source = random_logs("boat", 3, 1)[0]
+    logs = folder / "logs"
+    files = list[str]()
     logs.mkdir()
     length = len(source[0]) // -(-len(names) // 3)
     for number, name in enumerate(names):

@@ -37,7 +37,8 @@ class Conditions(NamedTuple):
 
 def even_noise() -> Iterator[float]:
     """Even noise of unit variance, as `autopilot.cpp` draws it."""
-    mask, state = 2**64 - 1, 1
+    mask = 2**64 - 1
+    state = 1
     while True:
         state = (state + 0x9E3779B97F4A7C15) & mask
         z = ((state ^ (state >> 30)) * 0xBF58476D1CE4E5B9) & mask
@@ -50,11 +51,16 @@ def fly(
     policy: Any, given: Conditions, heading: float, steps: int
 ) -> tuple[list[tuple[float, float, float]], float]:
     """Heading, yaw rate and rudder by step, and the median time of a step in microseconds."""
-    track, taken, psi, r = [], [], 0.0, 0.0
-    dt, drawn = given.dt, even_noise()
+    track = []
+    taken = []
+    psi = 0.0
+    r = 0.0
+    dt = given.dt
+    drawn = even_noise()
     late = deque([0.0] * round(given.delay / dt))
     decay = math.exp(-dt / given.time)
-    y, reference = torch.zeros(1, 3), torch.full((1, 1), heading)
+    y = torch.zeros(1, 3)
+    reference = torch.full((1, 1), heading)
     y[0, 1] = given.speed
     with torch.inference_mode():
         memory = policy.initial_state(y)
@@ -103,12 +109,14 @@ def main() -> None:
     compiled = torch.jit.load(str(given.policy), _extra_files=extra)
     card = json.loads(extra["card.json"])
     plain = eager(given.policy.parent.parent / "models" / card["policy"], card)
-    turning, noise = card["turning"], math.radians(given.noise)
+    turning = card["turning"]
+    noise = math.radians(given.noise)
     flown = Conditions(
         turning["K"], turning["T"], turning["speed"], card["dt"], given.delay, noise, noise
     )
     dt = flown.dt
-    heading, steps = math.radians(given.heading), round(given.seconds / dt)
+    heading = math.radians(given.heading)
+    steps = round(given.seconds / dt)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "track.csv"
         words = [

@@ -30,15 +30,15 @@ def measured(x: float, y: float, psi: float, speed: float, r: float) -> torch.Te
 
 def fly(module: Any, card: dict[str, Any], seconds: float) -> tuple[list[tuple[float, ...]], float]:
     """`COLUMNS` by step until the course ends, and the median time of a step in microseconds."""
-    k, constant, speed, dt = (
-        card["turning"]["K"],
-        card["turning"]["T"],
-        card["turning"]["speed"],
-        card["dt"],
-    )
+    k = card["turning"]["K"]
+    constant = card["turning"]["T"]
+    speed = card["turning"]["speed"]
+    dt = card["dt"]
     x, y, psi, r = card["start"]["north"], card["start"]["east"], card["start"]["heading"], 0.0
-    decay, half = math.exp(-dt / constant), math.exp(-0.5 * dt / constant)
-    track, taken = [], []
+    decay = math.exp(-dt / constant)
+    half = math.exp(-0.5 * dt / constant)
+    track = []
+    taken = []
     with torch.inference_mode():
         memory = module.initial_state(measured(x, y, psi, speed, r))
         for _ in range(round(seconds / dt)):
@@ -91,7 +91,8 @@ def main() -> None:
     extra = {"card.json": ""}
     module = torch.jit.load(str(given.course), _extra_files=extra)
     card = json.loads(extra["card.json"])
-    turning, start = card["turning"], card["start"]
+    turning = card["turning"]
+    start = card["start"]
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "track.csv"
         numbers = (

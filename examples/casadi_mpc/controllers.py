@@ -16,7 +16,8 @@ from track import Track
 
 INTERVALS = 20
 """Control intervals within the horizon."""
-_ACROSS, _ALONG = 0.1, 1.0
+_ACROSS = 0.1
+_ALONG = 1.0
 """Errors in m that cost as much as each other, across and along the course."""
 _SPEED = 0.2
 """Error of the speed, as a share of what is asked, that costs as much."""
@@ -26,7 +27,8 @@ _LEAVING = 1e3
 """Cost of leaving the training range by its own width: dear, but never without a solution."""
 _LITTLE = 1e-6
 """Curvature of that cost, so that the programme has one solution."""
-_ROUNDS, _FIRST = 2, 10
+_ROUNDS = 2
+_FIRST = 10
 """Gauss-Newton steps of a move and of the first one, at most."""
 _SETTLED = 1e-3
 """Change of all inputs, as a share of their range, that ends them."""
@@ -53,7 +55,9 @@ class Predictive:
     def __init__(
         self, model: Identified, track: Track, speed: float, interval: float, rates: np.ndarray
     ) -> None:
-        self.model, self.track, self.speed = model, track, speed
+        self.model = model
+        self.track = track
+        self.speed = speed
         self.every = max(1, round(interval / model.dt))
         self.interval = self.every * model.dt
         self.bias = np.zeros(3)
@@ -61,12 +65,15 @@ class Predictive:
         self.expected: np.ndarray | None = None
         self.plan: np.ndarray | None = None
         self.ahead = self._ahead()
-        n, span = INTERVALS, self.model.high - self.model.low
-        self.low, self.span = self.model.low, span
+        n = INTERVALS
+        span = self.model.high - self.model.low
+        self.low = self.model.low
+        self.span = span
         # of what is asked: the change within each interval [2 n, 2 n]
         self.changes = np.eye(2 * n) - np.eye(2 * n, k=-2)
         self.fastest = np.tile(rates * self.interval, n)
-        rows, columns = 6 * n + 2 * n, 3 * n
+        rows = 6 * n + 2 * n
+        columns = 3 * n
         dense = casadi.Sparsity.dense
         shape = {"h": dense(columns, columns), "a": dense(rows, columns)}
         self.solver = casadi.conic("moves", "daqp", shape, {"error_on_fail": False})
@@ -76,12 +83,18 @@ class Predictive:
 
         States [6, n] stand at the ends of intervals, slopes [6 n, 2 n] are theirs by the inputs.
         """
-        n, step, dt = INTERVALS, self.model.step, self.model.dt
+        n = INTERVALS
+        step = self.model.step
+        dt = self.model.dt
         x, s = casadi.MX.sym("x", 6), casadi.MX.sym("s", self.model.memory)
-        inputs, bias = casadi.MX.sym("inputs", 2, n), casadi.MX.sym("bias", 3)
-        slope, states, slopes = step.forward(1), [], []
+        inputs = casadi.MX.sym("inputs", 2, n)
+        bias = casadi.MX.sym("bias", 3)
+        slope = step.forward(1)
+        states = []
+        slopes = []
         start = [x, s]
-        by_x, by_s = casadi.MX(6, 0), casadi.MX(self.model.memory, 0)
+        by_x = casadi.MX(6, 0)
+        by_s = casadi.MX(self.model.memory, 0)
         for k in range(n):
             w = inputs[:, k]
             by_x = casadi.horzcat(by_x, casadi.MX(6, 2))
@@ -157,7 +170,9 @@ class Predictive:
             wanted: place and direction of the course [n, 3].
             used: inputs now [2].
         """
-        n, span, high = INTERVALS, self.span, self.model.high
+        n = INTERVALS
+        span = self.span
+        high = self.model.high
         by = slopes.reshape(n, 6, 2 * n)
         north, east = (states[:, :2] - wanted[:, :2]).T
         sin, cos = np.sin(wanted[:, 2]), np.cos(wanted[:, 2])
@@ -251,7 +266,10 @@ class FeedForwardPID:
     """
 
     def __init__(self, model: Identified, track: Track, speed: float, gains: Gains) -> None:
-        self.model, self.track, self.speed, self.gains = model, track, speed, gains
+        self.model = model
+        self.track = track
+        self.speed = speed
+        self.gains = gains
         sharpest = 1.2 * float(np.abs(track.curvature).max()) + 1e-3
         self.bends = np.linspace(-sharpest, sharpest, 21)
         turns = [model.steady(speed, speed * bend) for bend in self.bends]
@@ -265,7 +283,8 @@ class FeedForwardPID:
 
     def __call__(self, measured: np.ndarray, place: float) -> np.ndarray:
         """Return the inputs [2] of the next step of the model."""
-        gains, dt = self.gains, self.model.dt
+        gains = self.gains
+        dt = self.model.dt
         x, y, psi, u, v, r = measured
         aside = self.track.aside(x, y, place)
         way = float(self.track.at(place)[2])

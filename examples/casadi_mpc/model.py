@@ -53,7 +53,8 @@ class Identified:
         return self._turns[u, r]
 
     def _steady(self, u: float, r: float) -> tuple[np.ndarray, np.ndarray]:
-        low, high = self.low[3:], self.high[3:]
+        low = self.low[3:]
+        high = self.high[3:]
         unknown = np.r_[0.0, 0.5 * (low + high)]
         unknown[1:] += 0.25 * (high - low) * (np.abs(low + high) > 0.1 * (high - low))
         scale = np.r_[0.1, high - low]
@@ -80,7 +81,8 @@ class Identified:
 
     def slopes(self, nu: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivatives of the acceleration by velocities [3, 3] and inputs [3, 2]."""
-        x, given = casadi.MX.sym("nu", 3), casadi.MX.sym("w", 2)
+        x = casadi.MX.sym("nu", 3)
+        given = casadi.MX.sym("w", 2)
         state = casadi.vertcat(0, 0, 0, x)
         change = (self.step(state, given, np.zeros(self.memory))[0][3:] - x) / self.dt
         both = casadi.Function(

@@ -98,16 +98,19 @@ class OnModel:
 
     def __init__(self, model: Identified) -> None:
         self.model = model
-        self.measured, self.memory = np.zeros(6), np.zeros(model.memory)
+        self.measured = np.zeros(6)
+        self.memory = np.zeros(model.memory)
 
     def step(self, given: np.ndarray) -> None:
         after, memory, _ = self.model.step(self.measured, given, self.memory)
-        self.measured, self.memory = np.asarray(after).ravel(), np.asarray(memory).ravel()
+        self.measured = np.asarray(after).ravel()
+        self.memory = np.asarray(memory).ravel()
 
 
 def sailed(pilot: FeedForwardPID, craft: Plant | OnModel, track: Track, limit: float) -> np.ndarray:
     """Return place and cross-track error [T, 2] of a course under the PID."""
-    place, rows = 0.0, []
+    place = 0.0
+    rows = []
     for _ in range(round(limit / pilot.model.dt)):
         x, y = craft.measured[:2]
         place = track.place(x, y, place)
@@ -122,7 +125,9 @@ def predicted(
     pilot: Predictive, craft: Plant, track: Track, limit: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return place and cross-track error [T, 2] under the MPC, and seconds of each solution."""
-    place, rows, taken = 0.0, [], []
+    place = 0.0
+    rows = []
+    taken = []
     given = craft.used
     for k in range(round(limit / pilot.model.dt)):
         x, y = craft.measured[:2]

@@ -86,7 +86,8 @@ class Vessel:
 
     def rollout(self, x: Array, w: Array, s: Array) -> tuple[Array, Array, Array]:
         """Return states [T + 1, 6] under inputs [T, m], the last memory, and flags [T]."""
-        path, flags = [np.asarray(x, self.dtype).reshape(-1)], []
+        path = [np.asarray(x, self.dtype).reshape(-1)]
+        flags = []
         for row in w:
             after, s, outside = self.step(path[-1], row, s)
             path.append(after[0])

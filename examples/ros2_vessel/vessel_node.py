@@ -66,7 +66,8 @@ class VesselNode(Node):
         north, east, psi, u, v, r = self.x
         out = Odometry()
         out.header.stamp = now.to_msg()
-        out.header.frame_id, out.child_frame_id = "map", "base_link"
+        out.header.frame_id = "map"
+        out.child_frame_id = "base_link"
         out.pose.pose.position.x, out.pose.pose.position.y = east, north
         half = 0.5 * (0.5 * math.pi - psi)
         out.pose.pose.orientation.z, out.pose.pose.orientation.w = math.sin(half), math.cos(half)

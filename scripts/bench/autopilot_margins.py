@@ -47,8 +47,10 @@ def margins(run: Path, name: str) -> dict[str, float]:
     laws = [row["model"] for row in judged if row["kind"] == "classical"]
     constants = [row["model"] for row in judged if row["kind"] == "constants"]
     own, pd = find[name, "conditions"], find.get(("pd", "conditions"))
-    quiet, nominal = find[name, "quiet"], find[name, "nominal"]
-    cost, best = costs[name], min(costs[law] for law in laws)
+    quiet = find[name, "quiet"]
+    nominal = find[name, "nominal"]
+    cost = costs[name]
+    best = min(costs[law] for law in laws)
     off = costs.get(f"{name} network off", math.nan)
     beyond = [policy / law - 1 for policy, law, _ in outside(run, name).values()]
     cpu = run / "cpu.txt"
@@ -110,10 +112,13 @@ class Drawn:
 
     def zigzag(self, file: Path, angle: float, rng: np.random.Generator) -> Path:
         """Write a zigzag in noise at 10 Hz, with half of the delay, by Euler's rule."""
-        dt, fine = 0.1, 10
+        dt = 0.1
+        fine = 10
         late = round(0.5 * self.delay / (dt / fine))
         r = psi = rudder = 0.0
-        side, held, rows = 1.0, [0.0] * (late + 1), []
+        side = 1.0
+        held = [0.0] * (late + 1)
+        rows = []
         for k in range(round(60.0 * self.time / dt)):
             side = -side if side * psi > angle else side
             noise = rng.normal(size=2) * (0.2, 0.15)
@@ -132,7 +137,8 @@ class Drawn:
 def trained(name: str, vessel: Drawn, out: Path, rng: np.random.Generator, *, logs: bool) -> Path:
     """Draft, train and compare for a vessel; returns the folder of the run."""
     out.mkdir(parents=True, exist_ok=True)
-    file, run = out / f"{name}.yaml", out / name
+    file = out / f"{name}.yaml"
+    run = out / name
     if (run / "metrics.json").is_file():
         return run
     if logs:
@@ -165,9 +171,11 @@ def seeded(config: str, policy: str, seeds: Sequence[int], out: Path) -> list[Pa
     base = yaml.safe_load((bench.CONFIGS / f"{config}.yaml").read_text())
     base["policies"] = {policy: base["policies"][policy]}
     base.pop("predictive", None)
-    tuned, runs = out / "peers.json", []
+    tuned = out / "peers.json"
+    runs = []
     for seed in seeds:
-        file, run = out / f"seed_{seed}.yaml", out / f"seed_{seed}"
+        file = out / f"seed_{seed}.yaml"
+        run = out / f"seed_{seed}"
         runs.append(run)
         if (run / "metrics.json").is_file():
             continue
@@ -186,10 +194,12 @@ def main() -> None:
         __doc__, runs=(), policy="learned", draw=0, logs=0, config="autopilot_conditions",
         seeds=0, seed=0, out="runs/drawn",
     )  # fmt: skip
-    runs, out = [Path(run) for run in given.runs], Path(given.out)
+    runs = [Path(run) for run in given.runs]
+    out = Path(given.out)
     rng = np.random.default_rng(given.seed)
     for k in range(given.draw + given.logs):
-        vessel, logs = Drawn(rng), k >= given.draw
+        vessel = Drawn(rng)
+        logs = k >= given.draw
         name = f"{'logs' if logs else 'vessel'}_{k + 1}"
         print(f"{name}: {vessel}", flush=True)
         noise = np.random.default_rng((given.seed, k))

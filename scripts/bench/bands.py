@@ -75,11 +75,14 @@ def add(found: Found, judged: SplitEvaluation, models: Sequence[str], draw: int 
 
 def stored(folder: Path, model: str | None) -> Found:
     """Return the free runs of one model of a finished run over its test logs."""
-    run, config = RunFolder(folder), load_config(folder / "resolved.yaml", [], FitConfig)
-    store, found = RunModelStore(run), Found()
+    run = RunFolder(folder)
+    config = load_config(folder / "resolved.yaml", [], FitConfig)
+    store = RunModelStore(run)
+    found = Found()
     fitted = [store.load(name) for name in store.names()]
     logs = {"test": prepare_splits(config.load_logs(), config)["test"]}
-    limit, step = divergence_limit(fitted[-1].spec, config), config.prepare.grid.step
+    limit = divergence_limit(fitted[-1].spec, config)
+    step = config.prepare.grid.step
     judged = evaluate_splits(make_candidates(fitted), logs, config.evaluation, step, limit)["test"]
     add(found, judged, [model or str(run.read_metrics()["selected"])])
     return found
@@ -206,7 +209,8 @@ def coverage(judged: Sequence[Judged]) -> np.ndarray:
 
 def score(judged: Sequence[Judged], widths: Sequence[np.ndarray]) -> np.ndarray:
     """Return the mean interval score of each channel [c], in errors of `constant_velocity`."""
-    level, unit = judged[0][1].level, judged[0][1].score_unit
+    level = judged[0][1].level
+    unit = judged[0][1].score_unit
     pairs = zip(judged, widths, strict=True)
     each = [interval_score(run.error, width, level) for (run, _), width in pairs]
     return np.asarray(np.nanmean(np.concatenate(each), axis=0) / unit)
@@ -254,7 +258,8 @@ def singles(found: Found, calibrate: int) -> None:
     overall = np.array([coverage(judged)[-2] for judged in found.values()])
     within = np.mean(np.abs(overall - 0.9) <= _ASKED)
     print(f"\nmean coverage of single models within .88 and .92: {within:.2f} of {len(overall)}")
-    rows, apart = [], []
+    rows = []
+    apart = []
     for (protocol, model, number), judged in found.items():
         for kind in ("all", *{run.manoeuvre for run, _ in judged}):
             of = [one for one in judged if kind in ("all", one[0].manoeuvre)]
@@ -281,14 +286,16 @@ def main() -> None:
     if given.draws:
         found = Found()
         for number in range(given.draws):
-            started, random = time.process_time(), np.random.default_rng([given.seed, number])
+            started = time.process_time()
+            random = np.random.default_rng([given.seed, number])
             vessel = list(PUSH)[number % len(PUSH)]
             logs = trials(vessel, random, given.logs, given.test, given.others)
             drawn(found, vessel, number, logs)
             took = time.process_time() - started
             print(f"draw {number + 1}: {vessel}, {took:.0f} s", flush=True)
     elif given.cross:
-        model, file = given.model or "baseline", Path(given.cross)
+        model = given.model or "baseline"
+        file = Path(given.cross)
         left_out = alone(load_config(file, given.s, FitConfig), model) if given.alone else []
         config = load_config(file, [*given.s, *left_out], FitConfig)
         found = crossed(config, model, given.seed, given.kinds)

@@ -39,7 +39,8 @@ from residnet.physics.vessel import load_vessel
 
 Array = NDArray[np.float64]
 RUDDER = math.radians(5.0)
-BUOYS, SPACING = (6, 10), (3.0, 12.0)
+BUOYS = (6, 10)
+SPACING = (3.0, 12.0)
 """Fewest and most buoys, and their distances in turning radii."""
 
 
@@ -54,7 +55,8 @@ class Drawn:
 
 def draw(rng: np.random.Generator, unit: float, radius: float) -> Drawn:
     """Draw a course; the next buoy lies in any direction."""
-    at, places = np.zeros(2), []
+    at = np.zeros(2)
+    places = []
     for _ in range(int(rng.integers(BUOYS[0], BUOYS[1] + 1))):
         towards = rng.uniform(-math.pi, math.pi)
         far = rng.uniform(*(unit * one for one in SPACING))
@@ -66,7 +68,8 @@ def draw(rng: np.random.Generator, unit: float, radius: float) -> Drawn:
 def passes(track: Array, buoys: Array) -> list[int]:
     """Return the sample at which each buoy is passed: nearest in sum, and in their order."""
     distance = np.hypot(*np.moveaxis(track[:, None] - buoys, -1, 0))
-    least, chosen = distance[:, 0], []
+    least = distance[:, 0]
+    chosen = []
     for i in range(1, len(buoys)):
         best = np.minimum.accumulate(least)
         first = np.maximum.accumulate(np.where(least <= best, np.arange(len(least)), 0))
@@ -84,7 +87,8 @@ def faults(track: Array, course: Drawn, protocol: str) -> list[str]:
     The closest approach on the whole track counts, and the one in the buoy's turn. A circle in
     which the track begins counts from where the track, outside of it, comes nearer again.
     """
-    found, radius = [], course.radius
+    found = []
+    radius = course.radius
     turn = passes(track, course.buoys)
     for i, (place, side) in enumerate(zip(course.buoys, course.sides, strict=True)):
         distance = np.hypot(*(track - place).T)
@@ -140,7 +144,8 @@ class Ship:
 
     def tracks(self, planned: PlannedCourse, currents: np.ndarray) -> list[Any]:
         """Return the flights of the nominal vessel in steady currents [B, 2] in m/s."""
-        turning, vessel = self.turning, self.vessel
+        turning = self.turning
+        vessel = self.vessel
         law = HeadingPD.from_pole_placement(
             vessel.state,
             gain=turning.gain,
@@ -175,7 +180,8 @@ def judge(args: argparse.Namespace, ship: Ship, number: int) -> dict[str, Any]:
     radius = 1.000001 * args.clearance * ship.steady.radius
     course = draw(rng, ship.steady.radius, radius)
     out: dict[str, Any] = {"number": number, "buoys": len(course.buoys)}
-    config, begun = ship.config(course, args.current), time.process_time()
+    config = ship.config(course, args.current)
+    begun = time.process_time()
     try:
         planned = plan_course(config, args.protocol, ship.vessel, ship.turning, RUDDER, ship.steady)
     except ResidnetError as error:
@@ -198,7 +204,8 @@ def main() -> None:
         __doc__, courses=100, seed=0, protocol="sides", vessel="nomoto_oceanos",
         clearance=1.0, current=0.0, fly=False,
     )  # fmt: skip
-    ship, rows = Ship(args.vessel), []
+    ship = Ship(args.vessel)
+    rows = []
     print(f"{args.vessel}: R {ship.steady.radius:.4g} m, K {ship.turning.gain:.4g}/s", end="")
     print(f", T {ship.turning.time:.4g} s, {ship.turning.speed:.3g} m/s", flush=True)
     for number in range(args.courses):

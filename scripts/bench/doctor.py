@@ -30,7 +30,8 @@ from residnet.core.log import Log
 from residnet.preprocessing.masks import MaskRule
 from residnet.quality import Finding, inspect_log, inspect_log_set, statistics
 
-_TOGETHER, _MEASURED = 3, 4
+_TOGETHER = 3
+_MEASURED = 4
 """Measured logs that are looked at together, and how often."""
 
 
@@ -106,7 +107,9 @@ def loud(log: Log, longest: float) -> set[str]:
 
 def long_logs(rows: int, seed: int, faults: Sequence[Fault]) -> None:
     """Print of each fault in a long log what either look alone finds."""
-    usual, alike, count = statistics._MAX_SUBSAMPLE, 0, 0
+    usual = statistics._MAX_SUBSAMPLE
+    alike = 0
+    count = 0
     ship = next(one for one in SHIPS if one.name == "wam_v")
     hosts = simulate(2, rows, seed)
     for number, fault in enumerate([None, *faults]):
@@ -118,8 +121,10 @@ def long_logs(rows: int, seed: int, faults: Sequence[Fault]) -> None:
         except (Undecidable, KeyError):
             # the boat has no such channel
             continue
-        few, whole = loud(log, usual), loud(log, math.inf)
-        alike, count = alike + (few == whole), count + 1
+        few = loud(log, usual)
+        whole = loud(log, math.inf)
+        alike = alike + (few == whole)
+        count = count + 1
         told = f"by stretches alone {sorted(few - whole)}, by all rows {sorted(whole - few)}"
         said = "alike" if few == whole else told
         print(f"{'none' if fault is None else fault.name}: {said}; {sorted(whole)}", flush=True)
@@ -136,12 +141,14 @@ def main() -> None:
     hosts = [*simulated(given.seed, given.vessels), *measured(given.seed)]
     names = list(dict.fromkeys(host.ship.name for host in hosts))
     table: dict[tuple[str, str], list[bool]] = {}
-    checked, loud = 0, 0
+    checked = 0
+    loud = 0
     for number, host in enumerate(hosts):
         for log in host.logs if not given.faults else ():
             said = inspect_log(log, host.inputs, host.masks).findings
             told = [f"{f.code} ({f.effect}): {f.text}" for f in said if f.level != "note"]
-            checked, loud = checked + 1, loud + bool(told)
+            checked = checked + 1
+            loud = loud + bool(told)
             if told:
                 print(f"alarm: {log.name}: {'; '.join(told)}", file=sys.stderr)
         for fault in faults:

@@ -110,7 +110,8 @@ def ways(variant: str, folder: Path, cpp: Path, aoti: bool) -> dict[str, Way]:
     feed = {i.name: feed[i.name] for i in session.get_inputs()}
     function = CasadiModel(files["casadi"]).function
     doubles = [np.asarray(part, dtype=float) for part in given]
-    loop, program = c_loop(folder), [str(cpp), str(files["torchscript"]), "4", "400"]
+    loop = c_loop(folder)
+    program = [str(cpp), str(files["torchscript"]), "4", "400"]
     out: dict[str, Way] = {
         "eager": lambda: timed(lambda: model.step(x, w, s)),
         "eager, checked inputs": lambda: timed(lambda: guarded.flagged_step(x, w, s)),

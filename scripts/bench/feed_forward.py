@@ -77,7 +77,8 @@ def drawn_ferry(folder: Path, random: torch.Generator) -> Path:
 def drawn_course(random: torch.Generator, *, kind: str = "any", count: int = 12) -> dict[str, Any]:
     """Return waypoints in a square of 30 m, with headings ahead, astern or any of them."""
     points: list[list[Any]] = []
-    at, heading = torch.zeros(2), 0.0
+    at = torch.zeros(2)
+    heading = 0.0
     while len(points) < count:
         after = 30.0 * torch.rand(2, generator=random) - 15.0
         way = after - at
@@ -113,7 +114,8 @@ def judge_ferry(number: int, random: torch.Generator, folder: Path) -> str:
     required = AsExported(model, results["models"]["plsr"]["exported"]["range"])
     hull = load_vessel("milliampere").build()
     assert isinstance(hull, HullPlant)
-    ferry, told = config.build_loop(str(true)), []
+    ferry = config.build_loop(str(true))
+    told = []
     for kind in ("ahead", "astern"):
         path = config.course.model_validate(drawn_course(random, kind=kind, count=6))
         feeds: list[Any] = [(ForceModel(hull.hull), None), (required, model.lag)]

@@ -26,10 +26,17 @@ def main() -> None:
     print(f"{'':26s} named  cause  others  seconds a fleet")
     planted = {**CONTRADICTIONS, **SHARED}
     for what in given.contradictions or ("clean", *planted):
-        hits, causes, total, others, began, count = 0, 0, 0, 0, time.process_time(), 0
+        hits = 0
+        causes = 0
+        total = 0
+        others = 0
+        began = time.process_time()
+        count = 0
         for number, fleet in enumerate(fleets):
             random = np.random.default_rng([given.seed, number])
-            logs, concerned, cause = list(fleet.logs), (), "none"
+            logs = list(fleet.logs)
+            concerned = ()
+            cause = "none"
             if what == "exchanged sides" and fleet.steering == "delta":
                 continue
             if what != "clean":
@@ -39,7 +46,8 @@ def main() -> None:
             loud = [one for one in found if one.level != "note"]
             names = [f"log_{i:02d}" for i in concerned] or [fleet.steering]
             about = [[one for one in loud if one.text.startswith(name)] for name in names]
-            count, total = count + 1, total + len(names)
+            count = count + 1
+            total = total + len(names)
             hits += sum(map(bool, about))
             causes += sum(cause in first.code for first, *_ in filter(None, about))
             others += any(not one.text.startswith((*names,)) for one in loud)

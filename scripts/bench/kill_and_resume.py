@@ -71,7 +71,8 @@ def faults(code: int, error: str, number: signal.Signals) -> list[str]:
     """Return what is wrong with how a run ended that a signal was sent to."""
     if code == 0:
         return []  # it was done before the signal came
-    found, last = [], (error.splitlines() or [""])[-1]
+    found = []
+    last = (error.splitlines() or [""])[-1]
     if code != CODES[number]:
         found.append(f"exit code {code} after {number.name}")
     if "Traceback" in error:
@@ -88,9 +89,11 @@ def rows(run: Path) -> str:
 
 def chain(run: Path, seconds: float, truth: str, draw: random.Random) -> bool:
     """Interrupt and resume one run; print what was done and tell whether something was wrong."""
-    found, told = [], []
+    found = []
+    told = []
     for place in range(draw.randint(1, 4)):
-        after, number = draw.uniform(0.2, 1.05 * seconds), draw.choice(DRAWN)
+        after = draw.uniform(0.2, 1.05 * seconds)
+        number = draw.choice(DRAWN)
         words = ["--resume"] if place else []
         code, error = attempt(run, *words, after=after, number=number)
         told.append(f"{number.name} at {after:.1f} s" if code else "done before that")
@@ -112,11 +115,13 @@ def main() -> None:
     """Run the chains and print the tally."""
     given = bench.options(__doc__, chains=20, seed=0)
     with tempfile.TemporaryDirectory(prefix="interrupted-") as name:
-        whole, begun = Path(name) / "whole", time.monotonic()
+        whole = Path(name) / "whole"
+        begun = time.monotonic()
         code, error = attempt(whole)
         if code:
             sys.exit(f"the undisturbed run ends with {code}: {error[-2000:]}")
-        seconds, draw = time.monotonic() - begun, random.Random(given.seed)
+        seconds = time.monotonic() - begun
+        draw = random.Random(given.seed)
         print(f"undisturbed: {seconds:.0f} s", flush=True)
         bad = sum(
             chain(Path(name) / f"chain_{number:02d}", seconds, rows(whole), draw)

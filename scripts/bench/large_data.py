@@ -36,7 +36,8 @@ from residnet.core.config import validate_config
 from residnet.core.log import Log
 from residnet.io.readers import ReaderConfig
 
-STEP, LOGS = 0.1, 1000
+STEP = 0.1
+LOGS = 1000
 _STEPS = {"steps": 100, "one_step": {"epochs": 1, "window": "2 s"}, "multi_step": []}
 HEADS: dict[str, dict[str, Any]] = {
     "plsr": {"heads": {"plsr": {"kind": "plsr", "choose": "one_step"}}},

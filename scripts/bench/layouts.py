@@ -89,7 +89,8 @@ def drawn(rng: np.random.Generator) -> Layout:
     def one(*options: str) -> str:
         return str(rng.choice(options))
 
-    language, delimiter = one(*LANGUAGES), one(",", ";", "\t", "|")
+    language = one(*LANGUAGES)
+    delimiter = one(",", ";", "\t", "|")
     comma = delimiter != "," and language != "English" and rng.random() < 0.8
     return Layout(
         language=language,

@@ -112,7 +112,8 @@ def scaled(name: str, factor: float, offset: float = 0.0) -> Change:
 
 def cases(vessel: str, flown: str, folder: Path) -> dict[str, tuple[str, Change, str]]:
     """Return the planted changes: vessel that is flown, what becomes of its logs, right cause."""
-    same, inputs = scaled("u", 1.0), bench.SIGNALS[vessel]["inputs"]
+    same = scaled("u", 1.0)
+    inputs = bench.SIGNALS[vessel]["inputs"]
     side = "n_stbd" if "n_stbd" in inputs else "n"
     out = {
         "mass +15 %": (changed_vessel(flown, heavier, folder), same, "mass"),
@@ -129,7 +130,8 @@ def watched(
     watch: ChangeDetector, settings: FitSettings, logs: Sequence[Log]
 ) -> list[MonitorVerdict]:
     """Return what the monitor says, window by window."""
-    watcher, out = OnlineChangeDetector(watch), []
+    watcher = OnlineChangeDetector(watch)
+    out = []
     for log in logs:
         watcher.start_new_log()
         known = prepare_log(log, "external", settings.signals.input_columns, settings.prepare)
@@ -155,7 +157,8 @@ def judge(vessel: str, sailed: str, seed: int, seeds: int, hours: float, folder:
     planted = cases(vessel, sailed, folder) if seeds else {}
     for name, (flown, change, right) in planted.items():
         logs = [change(log) for log in trials(flown, SEA[vessel], 7 + seed, PER_SEED * seeds)]
-        alarmed, firsts = [], []
+        alarmed = []
+        firsts = []
         for k in range(seeds):
             verdicts = watched(watch, settings, logs[PER_SEED * k : PER_SEED * (k + 1)])
             alarmed.append(any(verdict.is_alarm for verdict in verdicts))

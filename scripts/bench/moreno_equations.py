@@ -99,7 +99,8 @@ def tanker() -> None:
     w = torch.stack((factors[:, None] * padded[:, :-1, 3], padded[:, :-1, 4]), dim=-1)
     x0 = torch.cat((torch.zeros(len(w), 3, dtype=torch.float64), padded[:, 0, :3]), dim=-1)
     runs = run(x0, w, 0.2)
-    shares, errors = torch.zeros(len(w)), torch.full((len(w),), torch.nan)
+    shares = torch.zeros(len(w))
+    errors = torch.full((len(w),), torch.nan)
     for row, ran in enumerate(runs):
         part, values = records[row % len(records)]
         wild = ~(ran[: len(values)].abs() < FASTEST).all(dim=-1)

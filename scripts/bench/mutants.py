@@ -57,7 +57,8 @@ class Mutant:
 def changed(node: ast.AST) -> str | None:
     """Change a node in place; returns what was done, or nothing where there is nothing to do."""
     if isinstance(node, ast.BinOp) and type(node.op) in SWAPS:
-        before, node.op = node.op, SWAPS[type(node.op)]()  # type: ignore[assignment]
+        before = node.op
+        node.op = SWAPS[type(before)]()  # type: ignore[assignment]
         return f"{type(before).__name__} to {type(node.op).__name__}"
     if isinstance(node, ast.BoolOp):
         node.op = SWAPS[type(node.op)]()  # type: ignore[assignment]
@@ -66,7 +67,8 @@ def changed(node: ast.AST) -> str | None:
         node.ops[0] = SWAPS[type(node.ops[0])]()  # type: ignore[assignment]
         return f"to {type(node.ops[0]).__name__}"
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        before_value, node.value = node.value, node.value + 1
+        before_value = node.value
+        node.value = node.value + 1
         return f"{before_value} to {node.value}"
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
         node.op = ast.UAdd()
@@ -94,9 +96,11 @@ def mutant(file: Path, place: int) -> Mutant:
     node = list(ast.walk(ast.parse(source)))[place]
     assert isinstance(node, ast.expr)
     what = changed(node) or ""
-    first, last = node.lineno, node.end_lineno or node.lineno
+    first = node.lineno
+    last = node.end_lineno or node.lineno
     lines = [line.encode() for line in source.splitlines()[first - 1 : last]]
-    before, after = lines[0][: node.col_offset], lines[-1][node.end_col_offset :]
+    before = lines[0][: node.col_offset]
+    after = lines[-1][node.end_col_offset :]
     text = (before + f"({ast.unparse(node)})".encode() + after).decode()
     return Mutant(file.relative_to(ROOT).as_posix(), first, last, text, what)
 

@@ -47,7 +47,9 @@ TERMS = {
     "example_rudder_boat": (*_HULL, "n|n|", "|n| u", "u|u| delta"),
 }
 COMMANDS = {"n_port": "cmd_port", "n_stbd": "cmd_stbd", "n": "cmd_n", "delta": "cmd_delta"}
-STEP, SECONDS, PICKED = 0.1, 60.0, 3
+STEP = 0.1
+SECONDS = 60.0
+PICKED = 3
 BOOKLET = (
     "turn_starboard_drive_100",
     "turn_port_drive_100",
@@ -60,11 +62,10 @@ BOOKLET = (
 def shares_of(vessel: str, flown: str) -> dict[str, InputShare]:
     """Return how a vessel's commands follow drive and steer, as its booklet would say."""
     plant = load_vessel(flown).build()
-    one, none = torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
-    drive, steer = (
-        plant.commands_for_demand(one, none)[0].tolist(),
-        plant.commands_for_demand(none, one)[0].tolist(),
-    )
+    one = torch.ones(1, dtype=torch.float64)
+    none = torch.zeros(1, dtype=torch.float64)
+    drive = plant.commands_for_demand(one, none)[0].tolist()
+    steer = plant.commands_for_demand(none, one)[0].tolist()
     # a plant has an order of its own, such as the rudder before the propeller
     found = dict(zip(plant.input_names, zip(drive, steer, strict=True), strict=False))
     out = {}
@@ -114,7 +115,8 @@ def drawn(vessel: str, seed: int, times: int) -> tuple[float, float, np.ndarray]
     prepared = prepare_splits(split, settings)
     fitted = fit_models(prepared, settings)["baseline"]
     open_ = left(fitted, settings, prepared["train"])
-    low, high = np.array(fitted.spec.low), np.array(fitted.spec.high)
+    low = np.array(fitted.spec.low)
+    high = np.array(fitted.spec.high)
     most = 10.0 * settings.evaluation.divergence
     wide = compute_velocity_limits(low, high, most, fitted.spec.signals.dof)
     refit = settings.refit["baseline"]

@@ -55,7 +55,9 @@ SHIPPED: dict[str, dict[str, Any]] = {
 }
 """Step of the logs in s, largest standard deviations of random forces in N and N m (None where the
 vessel has no masses), and a time in s in which the vessel answers."""
-TRAINING, STRETCHES, PAST = 3, 4, 2.0
+TRAINING = 3
+STRETCHES = 4
+PAST = 2.0
 """Logs of training, logs of training and validation, and seconds that the peer reads."""
 Splits = dict[str, list[Log]]
 
@@ -171,7 +173,8 @@ class Peer(nn.Module):
         ]
         optimiser = torch.optim.Adam(self.parameters(), 3e-3)
         falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-        random, best = np.random.default_rng(0), (np.inf, copy.deepcopy(self.state_dict()))
+        random = np.random.default_rng(0)
+        best = (np.inf, copy.deepcopy(self.state_dict()))
         for number in range(steps):
             picked = [starts[i] for i in random.integers(len(starts), size=64)]
             past = torch.stack([logs[i][k - self.past : k] for i, k in picked])
@@ -192,7 +195,9 @@ class Peer(nn.Module):
     @torch.no_grad()
     def error(self, split: str) -> float:
         """Mean NRMSE over the windows of a split, as the rows of metrics.json have it."""
-        logs, scales, out = self.data.logs(split), self.data.evaluation.scales.to_array(), []
+        logs = self.data.logs(split)
+        scales = self.data.evaluation.scales.to_array()
+        out = []
         for window in self.windows(split):
             z = self.scaled(logs[window.log_index])
             begin = max(window.start - self.past, 0)
@@ -241,7 +246,8 @@ class Missed:
     """
 
     def __init__(self, models: residnet.Models, names: Sequence[str], split: str) -> None:
-        evaluation, found = models.data.evaluation, models.runs[split].evaluation
+        evaluation = models.data.evaluation
+        found = models.runs[split].evaluation
         run = next(run for run in found.free_runs if run.protocol == evaluation.selection)
         errors = [
             FreeRunErrors.from_predictions(run.windows, run.predictions[name], found.logs)
@@ -276,7 +282,8 @@ class Missed:
 def means(models: residnet.Models, first: residnet.Models | None) -> dict[str, float]:
     """Return the test errors of the means of fewer members, and of weighed ones."""
     names = models["ensemble"].fitted_model.notes["members"] if "ensemble" in models else ["hull"]
-    test, out = Missed(models, names, "test"), {}
+    test = Missed(models, names, "test")
+    out = {}
     for count in range(1, len(names) + 1):
         for some in combinations(names, count):
             out[" + ".join(some)] = test.error(np.array([(n in some) / count for n in names]))
@@ -291,7 +298,8 @@ def judged(splits: Splits, given: Namespace) -> dict[str, Any]:
     began = time.process_time()
     parts = ["network"] if given.network else []
     models = fitted(splits, given.effort, parts)
-    seconds, first = time.process_time() - began, None
+    seconds = time.process_time() - began
+    first = None
     if given.weights:
         with mock.patch.object(fit, "final_fit", return_value=False):
             first = fitted(splits, given.effort, parts)
@@ -349,7 +357,8 @@ def main() -> None:
         without=[], network=False, peer=False, weights=False,
     )  # fmt: skip
     source, names = SOURCES[given.logs]
-    names, first = given.vessels or names, max(given.numbered, 0)
+    names = given.vessels or names
+    first = max(given.numbered, 0)
     records = []
     for number in range(given.count):
         name = names[(number + first) % len(names)]

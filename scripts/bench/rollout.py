@@ -54,8 +54,12 @@ from residnet.preprocessing.windows import WindowSampler, WindowStore
 from residnet.training.refit import RefitConfig, build_problem, refit, simulate
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")
-_BATCH, _STEPS, _SLOPE = 1_024, 200, 40
-_WINDOW, _WINDOWS, _BATCHES = 100, 64, 25
+_BATCH = 1_024
+_STEPS = 200
+_SLOPE = 40
+_WINDOW = 100
+_WINDOWS = 64
+_BATCHES = 25
 _INPUTS = ("n_port", "n_stbd")
 _TERMS = (
     *("u", "v", "r", "u|u|", "v|v|", "r|r|", "u r", "u v"),
@@ -201,7 +205,8 @@ def epochs(repeats: int) -> None:
             yield [part.index_select(0, rows).unflatten(0, (_WINDOWS, _WINDOW)) for part in data]
 
     def stepped(cell: nn.LSTMCell, out: nn.Linear, seen: Tensor) -> Tensor:
-        state, found = None, []
+        state = None
+        found = []
         for k in range(_WINDOW):
             state = cell(seen[:, k], state)
             found.append(out(state[0]))
@@ -210,7 +215,8 @@ def epochs(repeats: int) -> None:
     for hidden in (24, 100):
         head = LstmConfig(hidden_size=hidden).build(NAMES).to(torch.float32).train()
         ours = torch.optim.AdamW(head.parameters())
-        cell, out = nn.LSTMCell(5, hidden), nn.Linear(hidden, 3)
+        cell = nn.LSTMCell(5, hidden)
+        out = nn.Linear(hidden, 3)
         usual = torch.optim.AdamW([*cell.parameters(), *out.parameters()])
         own = least(partial(_epoch, windows, head.teacher_forced_residuals, ours), repeats)
         batches = partial(islice, loader, _BATCHES)
@@ -232,7 +238,8 @@ def refits(repeats: int) -> None:
         "grid": {"step": f"{large_data.STEP} s", "held": [*_INPUTS]},
         "derivative": {"kind": "savitzky_golay", "window": "1.1 s", "order": 2},
     }
-    config, signals = PrepareConfig.model_validate(settings), SignalsConfig(inputs=_INPUTS)
+    config = PrepareConfig.model_validate(settings)
+    signals = SignalsConfig(inputs=_INPUTS)
     flown = large_data.simulate(12, 1_000, 1)
     logs = [prepare_log(log, "train", signals.input_columns, config) for log in flown]
     built = signals.build()

@@ -25,7 +25,9 @@ from residnet.identification.prepared import prepare_splits
 from residnet.manoeuvres.trials import ManoeuvreRun, SimulatedTrials, build_plant, simulate_trials
 from residnet.tasks.fit.config import FitConfig
 
-_DETERMINED, _ASKED, _NOTHING = 2.5, 5.0, 1e-9
+_DETERMINED = 2.5
+_ASKED = 5.0
+_NOTHING = 1e-9
 
 
 def true_rows(
@@ -33,7 +35,8 @@ def true_rows(
 ) -> torch.Tensor:
     """Return the true coefficients [n, J]."""
     assert isinstance(config.data, SimulatedTrials)
-    signals, plant = config.signals, build_plant(config.data.vessel, config.data.disturbance)
+    signals = config.signals
+    plant = build_plant(config.data.vessel, config.data.disturbance)
     moved = [flight.true_log for flight in flights]
     columns = [list(plant.state_names), list(plant.input_names[: plant.n_commands])]
     x, w = (
@@ -48,7 +51,8 @@ def true_rows(
         phi = baseline.library(built(own, built.prepare(seen)))
     theta = torch.zeros_like(baseline.theta)
     for axis, name in enumerate(live):
-        own_terms, target = baseline.term_columns(axis), rates[:, plant.state_names.index(name)]
+        own_terms = baseline.term_columns(axis)
+        target = rates[:, plant.state_names.index(name)]
         if own_terms:
             found = torch.linalg.lstsq(phi[:, own_terms], target[:, None], driver="gelsd").solution
             theta[axis, own_terms] = found[:, 0]
@@ -68,7 +72,8 @@ def drawn(vessel: str, seed: int, overrides: Sequence[str]) -> tuple[list[str], 
     prepared = prepare_splits(logs, config)
     begun = time.process_time()
     fitted = Fitter(prepared, config, FitStore()).fit_baseline("hull")
-    seconds, baseline = time.process_time() - begun, fitted.model.baseline
+    seconds = time.process_time() - begun
+    baseline = fitted.model.baseline
     assert isinstance(baseline, RegressorBaseline)
     true = true_rows(flights, config, baseline)
     print(
@@ -76,7 +81,8 @@ def drawn(vessel: str, seed: int, overrides: Sequence[str]) -> tuple[list[str], 
         f" {fitted.notes['validation']:.4f} by the refit, {seconds:.1f} s",
         flush=True,
     )
-    names, found = [], []
+    names = []
+    found = []
     for row in fitted.notes["coefficients"]:
         place = baseline.output_names.index(row["axis"]), baseline.library.terms.index(row["term"])
         names.append(f"{row['axis']:6} {row['term']}")
@@ -90,11 +96,13 @@ def main() -> None:
     given = bench.options(__doc__, vessels=vessels, seeds=10, s=[])
     for vessel in given.vessels:
         draws = [drawn(vessel, 1 + k, given.s) for k in range(given.seeds)]
-        names, found = draws[0][0], torch.stack([part for _, part in draws])
+        names = draws[0][0]
+        found = torch.stack([part for _, part in draws])
         true = found[:, :, 1].mean(0)
         size = torch.where(true.abs() > _NOTHING, true.abs() / 100.0, 1.0)
         off = (found[:, :, 0] - found[:, :, 1]) / size
-        spread, near = off.std(0), (off.abs() <= _ASKED).sum(0)
+        spread = off.std(0)
+        near = (off.abs() <= _ASKED).sum(0)
         known = (spread <= _DETERMINED) & (true.abs() > _NOTHING)
         print(f"{vessel}: coefficient, truth; mean error, spread, in % where there is a truth")
         for k, name in enumerate(names):
@@ -102,7 +110,8 @@ def main() -> None:
                 f"  {name:33} {true[k]:10.4g} {off[:, k].mean():+8.1f} {spread[k]:7.1f}"
                 + f"  {near[k]} of {len(off)} within 5 %" * bool(known[k])
             )
-        count, right = int(known.sum()) * len(off), int(near[known].sum())
+        count = int(known.sum()) * len(off)
+        right = int(near[known].sum())
         print(
             f"{vessel}: {int(known.sum())} of {len(names)} are determined; {right} of {count}"
             f" ({right / max(count, 1):.0%}) of these are within 5 %"

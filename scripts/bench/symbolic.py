@@ -59,11 +59,9 @@ from residnet.regression.sparse import SparseSearchConfig, find_equation, reduce
 Log = dict[str, np.ndarray]
 Signal = Callable[[np.ndarray], np.ndarray]
 Truth = Mapping[str, Mapping[str, float]]
-FORCES, JETS, SPRING = (
-    ("u", "v", "r", "tau_x", "tau_y", "tau_n"),
-    ("u", "v", "r", "rpm", "nozzle"),
-    ("x", "w", "tau"),
-)
+FORCES = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
+JETS = ("u", "v", "r", "rpm", "nozzle")
+SPRING = ("x", "w", "tau")
 FORCE = CandidatesConfig(input_degree=2, coupling=("u", "v", "r"))
 JET = CandidatesConfig(
     inputs=("rpm",), input_degree=2, coupling=("u",), coupling_degree=2, angles=("nozzle",)
@@ -167,7 +165,8 @@ def right(found: Mapping[str, float], truth: Mapping[str, float], within: float 
 
 def exact(count: int, _: int) -> None:
     """Print in how many designs all six equations are found, and how long that takes."""
-    times, good = [], 0
+    times = []
+    good = 0
     for force, jet in zip(force_logs(count), jet_logs(count), strict=True):
         a, seconds_a = regress(force, FORCES, FORCE, accelerations(force))
         b, seconds_b = regress(jet, JETS, JET, accelerations(jet))
@@ -182,8 +181,11 @@ def exact(count: int, _: int) -> None:
 
 def delay(_: int, __: int) -> None:
     """Print in how many noisy records the delay is found."""
-    log, hits, times = msd_log(delay=0.5), 0, []
-    zeros, names = np.zeros(len(log["t"])), ("u", "v", "tau")
+    log = msd_log(delay=0.5)
+    hits = 0
+    times = []
+    zeros = np.zeros(len(log["t"]))
+    names = ("u", "v", "tau")
     for seed in range(20):
         random = np.random.default_rng(seed)
         z = {
@@ -267,7 +269,10 @@ def drawn(
     kind: type[SymbolicConfig | GeneticConfig] = SymbolicConfig,
 ) -> None:
     """Print how often the structure of each drawn equation is found, and the delay."""
-    good, late, count, times = 0, 0, 0, []
+    good = 0
+    late = 0
+    count = 0
+    times = []
     for design in designs:
         head = kind.model_validate(config).build(CHANNELS)
         head.calibrate(design.samples)
@@ -277,7 +282,8 @@ def drawn(
         late += int(notes.get("delay", {"steps": 0})["steps"] == delay)
         for axis, truth in zip(ACCELERATION_NAMES, design.truth, strict=True):
             found = {c["term"]: c["value"] for c in notes["coefficients"] if c["axis"] == axis}
-            good, count = good + int(alike(found) == alike(truth)), count + 1
+            good = good + int(alike(found) == alike(truth))
+            count = count + 1
     print(
         f"{label:11s} structure right in {good} of {count}, delay in {late} of {len(designs)};"
         f" {np.median(times):.2f} s for three equations (median), {max(times):.2f} s (slowest)"

@@ -29,17 +29,22 @@ SLOPE = 2800.0
 """
 STEPS = {"ahead": (0.0, 2380.0), "reversal": (1500.0, -2380.0)}
 """Commanded revolutions in rpm before and after each step."""
-SAMPLE, LENGTH, AT, DELAY = 0.025, 6.0, 1.35, 0.1
+SAMPLE = 0.025
+LENGTH = 6.0
+AT = 1.35
+DELAY = 0.1
 """Sampling period, length, time of the step and dead time of the shaft, in s."""
 
 
 def tables() -> dict[str, pd.DataFrame]:
     """Return the tests by name of their file, in the units of a test engineer."""
-    vessel, random = load_vessel("wam_v_cal"), np.random.default_rng(2018)
+    vessel = load_vessel("wam_v_cal")
+    random = np.random.default_rng(2018)
     assert isinstance(vessel, FossenConfig)
     unit = vessel.actuators.build()
     assert isinstance(unit, Thrusters)
-    limit, rate = float(unit.n_max[0]) / RPM, unit.servos[0].fastest / RPM
+    limit = float(unit.n_max[0]) / RPM
+    rate = unit.servos[0].fastest / RPM
     throttle = np.arange(-100, 101, 5)
     rpm = np.clip(SLOPE / 100 * throttle, -limit, limit) + random.normal(0, 5, throttle.size)
     out = {"throttle": pd.DataFrame({"throttle_percent": throttle, "rpm": rpm.round(1)})}

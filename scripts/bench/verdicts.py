@@ -20,19 +20,22 @@ from fleets import drawn
 import residnet
 from residnet.evaluation.verdict import known_horizons, longest_good_horizon, rate_model
 
-_FITTED, _NEW = 20, 8
+_FITTED = 20
+_NEW = 8
 
 
 def judged(models: residnet.Models, new: Any) -> tuple[list[int], str]:
     """Return where errors called good lie: below the interval (-1), within or above; and a line."""
     evidence = models.evidence
-    own, until = evidence.selected, longest_good_horizon(evidence)
+    own = evidence.selected
+    until = longest_good_horizon(evidence)
     found = residnet.free_run(models, residnet.prepare(new, settings_from=models.data), "external")
     seen = {
         entry["seconds"]: entry
         for entry in found.evaluation.limits_by_protocol[evidence.protocol]["horizons"]
     }
-    places, texts = [], []
+    places = []
+    texts = []
     for entry in known_horizons(evidence):
         if entry["seconds"] > until:
             continue

@@ -49,7 +49,9 @@ VOLATILE = re.compile(
     r"|peak|memory|python|machine|command|run$|id$|file"
 )
 """Keys that differ between two runs of one state."""
-LOGS, FIGURES, SHOWN = 1e-12, 1e-6, 8
+LOGS = 1e-12
+FIGURES = 1e-6
+SHOWN = 8
 """Relative differences allowed in logs, which are read, and in figures, which go through
 optimisers; and how many of a file are shown."""
 
@@ -165,7 +167,8 @@ def differences(old: Any, new: Any, tolerance: float, where: str = "") -> Iterat
         elif all(isinstance(one, int | float) for one in (*old, *new)):
             yield from differences(np.array(old), np.array(new), tolerance, where)
         else:
-            left, right = dict(enumerate(old)), dict(enumerate(new))
+            left = dict(enumerate(old))
+            right = dict(enumerate(new))
             yield from differences(left, right, tolerance, where)
     elif isinstance(old, np.ndarray | int | float) and type(old) is type(new):
         a, b = np.asarray(old, dtype=float), np.asarray(new, dtype=float)
@@ -188,7 +191,8 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--only", default=",".join(PARTS), help="parts, with commas between")
     given = parser.parse_args()
-    kept, total = given.folder.resolve(), 0
+    kept = given.folder.resolve()
+    total = 0
     if not (kept / "samples").is_dir():
         samples(kept / "samples")
     for part in given.only.split(","):
@@ -198,7 +202,8 @@ def main() -> int:
         if given.verb == "make":
             file.write_text(text)
             continue
-        before, found = json.loads(file.read_text()), json.loads(text)
+        before = json.loads(file.read_text())
+        found = json.loads(text)
         for name in sorted({*before, *found}):
             tolerance = LOGS if part == "logs" else FIGURES
             told = list(differences(before.get(name), found.get(name), tolerance))

@@ -3,4 +3,5 @@
 source "$(dirname "${BASH_SOURCE[0]}")/../_venv.sh"
 install_residnet "[dev]"
 .venv/bin/ruff check src tests scripts docs examples
+.venv/bin/python scripts/ci/parallel_assignments.py src tests scripts docs examples
 .venv/bin/mypy

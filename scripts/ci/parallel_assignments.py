@@ -56,7 +56,8 @@ def parallel_assignments(tree: ast.AST) -> Iterator[ast.Assign]:
     for node in ast.walk(tree):
         if not isinstance(node, ast.Assign) or len(node.targets) != 1:
             continue
-        target, value = node.targets[0], node.value
+        target = node.targets[0]
+        value = node.value
         if not isinstance(target, ast.Tuple) or not isinstance(value, ast.Tuple):
             continue
         if len(target.elts) != len(value.elts) or any(

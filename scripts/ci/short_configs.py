@@ -93,7 +93,8 @@ def keys(place: str, values: Mapping[str, str]) -> list[str]:
 
 def general(content: Mapping[str, Any]) -> list[str]:
     """Return the overrides that follow from the parts of a config."""
-    data, out = content.get("data") or {}, []
+    data = content.get("data") or {}
+    out = []
     kinds = {one["kind"] for one in data.get("trials", ())}
     out += DIVES if "depth_step" in kinds else TRIALS if "three_two_one_one" in kinds else ()
     out += COARSE if data.get("kind") == "measured" else ()
@@ -257,7 +258,8 @@ def carry_out(name: str, runs: Path) -> Result:
 
     The run is a fork of this process, which has the libraries loaded: ten seconds less each.
     """
-    one, started = SHORT[name], time.monotonic()
+    one = SHORT[name]
+    started = time.monotonic()
     folder = runs / name.replace("/", "_")
     if one.data and not (Path(os.environ.get("RESIDNET_DATA", "")) / one.data).is_dir():
         result = Result("skipped", f"no RESIDNET_DATA/{one.data}")

@@ -99,7 +99,8 @@ class _PlainProgress:
         if progress.done is None or progress.total is None:
             return
         if progress.stage != self._stage:
-            self._stage, self._stage_start = progress.stage, time.monotonic()
+            self._stage = progress.stage
+            self._stage_start = time.monotonic()
         if progress.done < progress.total:
             self._completed_stages.discard(progress.stage)
             self._current_work = f"{progress.stage}, {progress.done:g} of {progress.total:g}"
@@ -184,7 +185,8 @@ class ProgressLogFile:
 
     def __init__(self, folder: Path, *, is_enabled: bool = True) -> None:
         self._fallback_path = folder.with_name(f"{folder.name}.log.txt")
-        self._is_enabled, self._buffer = is_enabled, ""
+        self._is_enabled = is_enabled
+        self._buffer = ""
         self._file: Path | None = None
 
     def add_line(self, text: str) -> None:
@@ -414,10 +416,8 @@ def new(
     from residnet.tasks.drafting import write_new_config
 
     with show_progress(quiet=quiet):
-        prompt, config_file = (
-            None if defaults else interactive_prompt(),
-            output_file or Path("my_boat.yaml"),
-        )
+        prompt = None if defaults else interactive_prompt()
+        config_file = output_file or Path("my_boat.yaml")
         lines = write_new_config(logs, config_file, prompt, overwrite=overwrite)
     print("\n".join(lines))
 

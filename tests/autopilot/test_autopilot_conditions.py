@@ -126,7 +126,8 @@ def test_policies_are_exported_with_their_cards_and_read_back(run: Path) -> None
     config = load_config(run / "resolved.yaml", [], AutopilotConfig)
     policy = load_trained_policy(config, run / "models", "network", 0.1)
     policy.set_state_columns(("psi", "u", "r"))
-    memory, s = policy.initial_state(measured.double()), module.initial_state(measured)
+    memory = policy.initial_state(measured.double())
+    s = module.initial_state(measured)
     for _ in range(5):
         command, s, _ = module.step(measured, torch.tensor([[0.5]]), s)
         wish, memory = policy(measured.double(), torch.tensor([[0.5]]).double(), memory)

@@ -72,7 +72,8 @@ def test_a_command_acts_after_its_delay_and_the_push_beside_the_bias() -> None:
     assert len(set(changes.delay_steps.tolist())) > 2
     # the yaw rate that this gives, with Nomoto's exact step, bias and push included
     angle = arrived + push + changes.vessel_variation[:, 2:3]
-    keep, r = math.exp(-0.05 / 3.94), torch.zeros(6, dtype=torch.float64)
+    keep = math.exp(-0.05 / 3.94)
+    r = torch.zeros(6, dtype=torch.float64)
     for k in range(inputs.shape[1]):
         r = keep * r + (1 - keep) * 3.47 * angle[:, k]
     assert torch.allclose(states[:, -1, VESSEL.state_column("r")], r, atol=1e-8)
@@ -136,7 +137,8 @@ def test_disturbances_have_the_statistics_that_are_stated() -> None:
     correlation = np.mean(pushed[:, lag:] * pushed[:, :-lag]) / pushed.var()
     assert correlation == pytest.approx(math.exp(-1), abs=0.08)
     assert float(changes.noise[:, :, 0].std()) == pytest.approx(config.noise_psi, rel=0.02)
-    low, high = changes.vessel_variation.amin(0), changes.vessel_variation.amax(0)
+    low = changes.vessel_variation.amin(0)
+    high = changes.vessel_variation.amax(0)
     assert 0.8 <= float(low[0]) < 0.82
     assert 1.18 < float(high[0]) <= 1.2
     assert float(changes.delay_steps.max()) == round(0.4 / 0.05)
@@ -162,7 +164,8 @@ def test_the_motion_in_waves_has_its_size_its_period_and_its_own_rate() -> None:
 
 def test_waves_are_added_to_what_is_measured_and_change_nothing_else() -> None:
     config = ConditionsConfig(dt=0.05, duration=10.0)
-    calm, rough = drawn(config, 60), drawn(config.model_copy(update={"waves": DEG}), 60)
+    calm = drawn(config, 60)
+    rough = drawn(config.model_copy(update={"waves": DEG}), 60)
     assert torch.equal(calm.push, rough.push)
     assert torch.equal(calm.vessel_variation, rough.vessel_variation)
     added = (rough.noise - calm.noise)[:, :, 0].std(1)

@@ -72,7 +72,8 @@ def test_the_last_epochs_take_the_step_of_the_conditions() -> None:
 def test_epochs_far_from_the_start_ease_the_charge() -> None:
     settings = PolicyTraining(dt=0.1, hold=0.0, validation=4, nominal=0.05, spread=0.15)
     fit = fitted(settings.model_copy(update={"epochs": 10, "stricter": 1.5}))
-    fit.start_score, fit.best_state = 6.0, {"any": torch.zeros(1)}
+    fit.start_score = 6.0
+    fit.best_state = {"any": torch.zeros(1)}
     # the first two epochs fly less than the full conditions; the third swings only
     costs = [(9.0, 1_000_000), (9.0, 1_000_000), (5.9, 3), (7.0, 1_000_000), (6.1, 1_000_000)]
     fit.history = [
@@ -88,7 +89,9 @@ def test_epochs_that_swing_come_after_those_that_do_not() -> None:
     settings = PolicyTraining(dt=0.1, hold=0.0, validation=4, steady=SteadinessLimits(flights=4))
     fit = fitted(settings)
     # five of twenty-four flights are beyond the limits: they count twice
-    fit.best_state, fit.best_score, fit.best_diverged = {"any": torch.zeros(1)}, 6.0, 5
+    fit.best_state = {"any": torch.zeros(1)}
+    fit.best_score = 6.0
+    fit.best_diverged = 5
     for refused, cost, better in ((0, 9.0, True), (5, 5.9, True), (0, math.nan, False),
                                   (10, 5.2, False), (10, 4.9, True), (1, 6.9, True)):  # fmt: skip
         fit.diverged = refused

@@ -81,7 +81,8 @@ def test_the_steady_turn_is_that_of_the_model_and_tells_what_is_possible(
 def test_turns_take_the_time_of_full_rudder_and_counter_rudder(vessel: SteeredPlant) -> None:
     """T r_dot + r = K delta, rest to rest: turned K d (t1 - t2), t2 = T ln(2 - exp(-t1 / T))."""
     make = TurnMaker(vessel, TURNING, 0.05)
-    holds, rudders = np.array([[3.0, 9.0], [5.03, 12.0]]), 0.9 * LIMIT * np.array([1, -1])
+    holds = np.array([[3.0, 9.0], [5.03, 12.0]])
+    rudders = 0.9 * LIMIT * np.array([1, -1])
     made = make(holds, rudders, [make.straight_state] * 2, 4.0)
     for side, turn in (
         (side, turn) for side, row in zip((1, -1), made, strict=True) for turn in row
@@ -120,7 +121,8 @@ def test_a_turn_with_the_step_chosen_ends_where_one_with_a_thirtieth_does(
     steered = SteeredPlant(load_vessel(name).build())
     step = choose_time_step(steered, turning, LIMIT)
     assert step > 0.1 * turning.time
-    ends, hold = [], np.array([[1.5 * turning.time]])
+    ends = []
+    hold = np.array([[1.5 * turning.time]])
     for dt in (step, step / 30.0):
         make = TurnMaker(steered, turning, dt)
         ((turn,),) = make(hold, np.array([LIMIT]), [make.straight_state], 1.0)
@@ -144,9 +146,11 @@ def test_a_plan_leaves_every_buoy_on_its_side_outside_its_circle(
 ) -> None:
     """Judged by the points of the plan alone; no part is tighter than the vessel turns."""
     planned = plan_of(vessel, buoys=buoys)
-    course, radius = planned.course, planned.steady.radius
+    course = planned.course
+    radius = planned.steady.radius
     count = int(course.length / course.step)
-    track, passed = course.track[: count + 2], -1
+    track = course.track[: count + 2]
+    passed = -1
     assert np.abs(np.diff(course.direction[:count])).max() <= 1.03 * course.step / radius
     for one in buoys:
         away = np.array([one.north, one.east]) - track
@@ -168,7 +172,8 @@ def test_a_given_heading_lengthens_the_shortest_course_past_sides(vessel: Steere
     more.
     """
     free = plan_of(vessel)
-    along, radius = float(free.course.heading[0]), free.steady.radius
+    along = float(free.course.heading[0])
+    radius = free.steady.radius
     onward, away = (plan_of(vessel, heading=heading) for heading in (along, along + math.pi))
     assert onward.reference_length == pytest.approx(free.reference_length, rel=2e-3)
     assert onward.course.length == pytest.approx(free.course.length, rel=0.02)
@@ -224,7 +229,8 @@ def test_a_vessel_that_sways_and_rolls_follows_turns_that_join_each_other() -> N
     with torch.no_grad():
         loop = Rollout(patrol.model(0.1), ClosedLoop(follower, guidance))
         states, _, _ = loop(x, w.unsqueeze(1).expand(-1, 2500, -1), nominal)
-    place, aside = torch.zeros(1, 1, dtype=torch.float64), []
+    place = torch.zeros(1, 1, dtype=torch.float64)
+    aside = []
     for state in states[0, ::5]:
         _, place = guidance(state[None], 0, place)
         aside.append(abs(float(guidance.track_error(state[None], place[:, 0])[1])))

@@ -76,12 +76,15 @@ def test_rows_are_the_policies_of_their_own_constants(vessel: SteeredPlant) -> N
     assert list(open_.parameter_values()) == list(wanted) == list(open_.search_ranges(TURNING))
     assert open_.with_parameters(wanted) == COMPLETE
     rows = {name: torch.tensor([value, 2.0 * value]) for name, value in wanted.items()}
-    many, one = open_.build_batched(rows, steering).float(), COMPLETE.build(steering).float()
+    many = open_.build_batched(rows, steering).float()
+    one = COMPLETE.build(steering).float()
     x = torch.zeros(2, len(vessel.state))
     x[:, vessel.state_column("u")], x[:, vessel.state_column("theta")] = 2.5, -0.1
-    reference, s = torch.tensor([[0.5], [0.5]]), one.initial_state(x)
+    reference = torch.tensor([[0.5], [0.5]])
+    s = one.initial_state(x)
     with torch.no_grad():
-        got, alone = many(x, reference, s)[0], one(x, reference, s)[0]
+        got = many(x, reference, s)[0]
+        alone = one(x, reference, s)[0]
     assert float(got[0]) == pytest.approx(float(alone[0]), abs=1e-6)
     assert float(got[1]) != pytest.approx(float(alone[1]), abs=1e-3)
 

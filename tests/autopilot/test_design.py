@@ -18,14 +18,23 @@ from residnet.core.config import load_config, load_mapping
 from residnet.core.errors import UsageError
 from residnet.core.progress import on_progress
 
-GAIN, TIME, GEAR, DELAY, NOISE, SPEED = 0.31, 7.4, 6.0, 0.3, 0.15, 2.5
+GAIN = 0.31
+TIME = 7.4
+GEAR = 6.0
+DELAY = 0.3
+NOISE = 0.15
+SPEED = 2.5
 
 
 def zigzag(file: Path, angle: float, seed: int) -> Path:
     """Write a zigzag of Nomoto's model with a steering gear, integrated here by Euler's rule."""
-    dt, fine, rng = 0.1, 10, np.random.default_rng(seed)
+    dt = 0.1
+    fine = 10
+    rng = np.random.default_rng(seed)
     r = psi = rudder = north = east = 0.0
-    side, held, rows = 1.0, [0.0] * (round(DELAY / dt) + 1), []
+    side = 1.0
+    held = [0.0] * (round(DELAY / dt) + 1)
+    rows = []
     for k in range(2400):
         side = -side if side * psi > angle else side
         noise = NOISE * rng.normal(size=2)

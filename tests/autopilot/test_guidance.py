@@ -39,7 +39,10 @@ from residnet.engine.rollout import Rollout
 from residnet.physics.vessel import load_vessel
 
 STATE = ("x", "y", "psi", "u", "v", "r")
-DT, LIMIT, SPEED, LEG = 0.1, math.radians(5), 3.2, 0.7
+DT = 0.1
+LIMIT = math.radians(5)
+SPEED = 3.2
+LEG = 0.7
 TURNING = NomotoModel(3.47, 3.94, SPEED)
 VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
 LAW = HeadingPD.from_pole_placement(
@@ -90,7 +93,8 @@ def test_it_steers_for_where_a_circle_about_the_vessel_meets_the_leg(turn: float
     """The point is found here from the quadratic equation of a circle and a line, its root further
     along the leg.
     """
-    radius, leg = 5.0, np.array(aside(turn, 100.0, 0.0))
+    radius = 5.0
+    leg = np.array(aside(turn, 100.0, 0.0))
     guidance = WaypointGuidance([tuple(leg)], 2.0, EnclosureConfig(radius=radius).build(0.1), STATE)
     s = guidance.initial_state(at((0.0, 0.0)))
     for along, across in ((20.0, 3.0), (21.0, 0.0), (22.0, -3.0), (23.0, 4.9), (24.0, -4.9)):
@@ -155,7 +159,8 @@ def turned(change: float) -> np.ndarray:
 
     def flown(held: float) -> np.ndarray:
         over = solve_ivp(rate, (0.0, held), np.zeros(4), args=(LIMIT,), **exact)
-        last, back = over.y[:, -1], (-LIMIT,)
+        last = over.y[:, -1]
+        back = (-LIMIT,)
         after = solve_ivp(rate, (0.0, 20.0), last, args=back, events=stopped, **exact)
         return np.concatenate((over.y.T, after.y.T))
 
@@ -183,7 +188,8 @@ def test_a_sharp_turn_still_reaches_into_the_circle(share: float) -> None:
 def test_legs_change_at_the_wheel_over_on_the_leg_but_in_the_circle_beside_it() -> None:
     over = WheelOver(TURNING, LIMIT, 3.4)
     # straight on needs none and a slow rudder needs half its way more
-    quick, slow = over(d(0.0, 1.0)), WheelOver(TURNING, LIMIT, 3.4, rate=LIMIT / 2.0)(d(0.0, 1.0))
+    quick = over(d(0.0, 1.0))
+    slow = WheelOver(TURNING, LIMIT, 3.4, rate=LIMIT / 2.0)(d(0.0, 1.0))
     assert float(quick[0]) == 0.0
     assert (slow - quick).tolist() == pytest.approx([3.2, 3.2])
     guidance = WaypointGuidance(
@@ -193,7 +199,8 @@ def test_legs_change_at_the_wheel_over_on_the_leg_but_in_the_circle_beside_it() 
     assert before > 3.4
     # short of it, there, there but aside of the leg, in the circle; the last way-point, which has
     # no wheel-over; and there, on the leg, but at a crab angle
-    short, there = 99.9 - before, 100.1 - before
+    short = 99.9 - before
+    there = 100.1 - before
     x = at((short, 0.0), (there, 0.0), (there, 3.0), (97.0, 0.0), (100.0, 96.5), (there, 0.0))
     x[5, 2] = 0.15
     s = torch.zeros(6, 3, dtype=torch.float64)
@@ -214,9 +221,11 @@ def circle(radius: float, rudder: float, step: float = 0.1) -> Course:
 
 def test_a_course_asks_for_tangent_yaw_rate_and_line_of_sight_on_a_circle() -> None:
     guidance = CourseGuidance(circle(20.0, 0.04), 8.0, STATE)
-    angle, across = 0.7, 3.0
+    angle = 0.7
+    across = 3.0
     # to port of a turn to starboard: outside the circle
-    x, away = torch.zeros(1, 6, dtype=torch.float64), 20 + across
+    x = torch.zeros(1, 6, dtype=torch.float64)
+    away = 20 + across
     x[0, :4] = d(away * math.sin(angle), 20 - away * math.cos(angle), angle, 3.0)
     s = d(20 * angle - 0.5)[None]
     for _ in range(4):
@@ -280,10 +289,13 @@ def test_a_quarter_of_the_speed_returns_to_the_leg_as_two_equal_poles_do() -> No
     """e(t) = e0 (1 - a t) exp(-a t), a = U / (2 look-ahead), for small errors of a vessel that
     turns at once.
     """
-    drift, a = DriftEstimate(12.0, 0.8, 0.01), SPEED / 24.0
+    drift = DriftEstimate(12.0, 0.8, 0.01)
+    a = SPEED / 24.0
     sight = LookAheadLineOfSight(12.0, drift)
     assert sight.n_state == 2
-    error, s, direction = d(0.1), d(0.0, 0.0)[None], d(LEG)
+    error = d(0.1)
+    s = d(0.0, 0.0)[None]
+    direction = d(LEG)
     for _ in range(1000):
         angle, s = sight(error, direction, s)
         error = error + 0.01 * SPEED * torch.sin(angle)
@@ -295,7 +307,9 @@ def test_what_one_leg_has_taught_is_known_on_the_next() -> None:
     """Set to starboard of a leg to the north is ahead on one to the east, and to port on one to the
     south.
     """
-    drift, s, north = DriftEstimate(10.0, 0.5, 0.1), d(0.0, 0.0)[None], d(0.0)
+    drift = DriftEstimate(10.0, 0.5, 0.1)
+    s = d(0.0, 0.0)[None]
+    north = d(0.0)
     for _ in range(20):
         s = drift(d(1.0), north, s)
     learnt = float(drift.cross_component(north, s))

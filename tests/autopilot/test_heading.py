@@ -36,7 +36,9 @@ from residnet.physics.vessel import load_vessel
 from residnet.testing.checks import SUBMERGED_SIGNALS, make_example_spec
 
 DEG = math.pi / 180
-GAIN, TIME, LIMIT = 3.47, 3.94, 5 * DEG
+GAIN = 3.47
+TIME = 3.94
+LIMIT = 5 * DEG
 STATE = ("x", "y", "psi", "u", "v", "r")
 OCEANOS = of_kind(load_vessel("nomoto_oceanos").build(), NomotoVessel)
 RATED = SteeredPlant(load_vessel("nomoto_oceanos_rate10").build())
@@ -97,7 +99,8 @@ class Askew(Policy):
 
     def __init__(self, policy: Policy) -> None:
         super().__init__()
-        self.policy, self.n_state = policy, policy.n_state
+        self.policy = policy
+        self.n_state = policy.n_state
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         command, s = self.policy(x, reference, s)
@@ -185,10 +188,12 @@ def test_the_document_s_autopilot_creeps_as_errata_says() -> None:
 
 def test_a_simulated_predictor_is_the_simulation_of_each_candidate() -> None:
     plant = of_kind(load_vessel("patrol_p06").build(), HullPlant).without_environment()
-    model, held = PlantDynamics(plant, 0.25), torch.tensor([1e5], dtype=torch.float64)
+    model = PlantDynamics(plant, 0.25)
+    held = torch.tensor([1e5], dtype=torch.float64)
     x = plant.make_initial_state(2)
     x[1, 3], x[1, 7] = 0.3, 0.02
-    rudder, targets = torch.tensor([-0.08, 0.0, 0.08]).double(), torch.tensor([0.5, 0.4]).double()
+    rudder = torch.tensor([-0.08, 0.0, 0.08]).double()
+    targets = torch.tensor([0.5, 0.4]).double()
     error, rate = SimulatedPredictor(model, plant.state_names, 8, held)(x, targets, rudder)
     assert error.shape == rate.shape == (2, 3)
     for row, target in enumerate(targets.tolist()):
@@ -215,7 +220,8 @@ def test_wrong_numbers_stop(make: Callable[[], object], message: str) -> None:
 
 def made(error: list[list[float]], dt: float = 0.5) -> ClosedLoopTrajectories:
     errors = torch.tensor(error, dtype=torch.float64)
-    rudder, start = torch.full_like(errors[:, 1:], 0.2), torch.zeros(len(errors))
+    rudder = torch.full_like(errors[:, 1:], 0.2)
+    start = torch.zeros(len(errors))
     about = (dt, ("psi",), HEADING, start, errors.shape[1])
     return ClosedLoopTrajectories(-errors.unsqueeze(-1), rudder, 0.0 * errors[:, 0], *about)
 
@@ -323,8 +329,10 @@ def steered(name: str) -> tuple[SteeredPlant, SteeredModel]:
 @pytest.mark.parametrize("name", ["nomoto_oceanos", "nomoto_oceanos_rate10"])
 def test_a_perfect_model_flies_as_its_vessel(name: str) -> None:
     """A learned model that is Nomoto's own: with any variation both move alike."""
-    pair, flights = steered(name), []
-    turning, changes = pair[0].estimate_nomoto(LIMIT, 60.0), torch.tensor([0.5, 0.3, -0.4])
+    pair = steered(name)
+    flights = []
+    turning = pair[0].estimate_nomoto(LIMIT, 60.0)
+    changes = torch.tensor([0.5, 0.3, -0.4])
     for vessel in pair:
         pd = PdConfig(kp=3.0, damping_time=1.5).build(ControlTask(vessel, turning, LIMIT, 0.01))
         flights.append(simulate_heading_steps(vessel, pd, changes, VARIED, dt=0.01, duration=8.0))

@@ -65,7 +65,9 @@ def test_body_velocity_and_acceleration_belong_to_the_pose() -> None:
     x = torch.tensor([[3.0, 1.0, 0.4, 0, 0, 0]], dtype=torch.float64)
     found = asked(config.build(dt), 3000, x)[0].numpy()
     np.testing.assert_array_equal(found[0], [3.0, 1.0, 0.4, 0, 0, 0, 0, 0, 0])
-    eta, nu, nu_dot = found[:, :3], found[:, 3:6], found[:, 6:]
+    eta = found[:, :3]
+    nu = found[:, 3:6]
+    nu_dot = found[:, 6:]
     slope = (eta[2:] - eta[:-2]) / (2 * dt)
     c, s = np.cos(eta[1:-1, 2]), np.sin(eta[1:-1, 2])
     body = np.stack(
@@ -129,7 +131,8 @@ def test_pid_by_hand() -> None:
     """Two steps: error in the body frame, heading wrapped, the integral used before its update."""
     x = torch.tensor([[1.0, 2.0, 3.0, 0.5, -0.1, 0.02, 7.0]], dtype=torch.float64)
     reference = torch.tensor([[4.0, 1.0, -3.1, 0.6, 0.1, 0.0, 0.3, 0.2, 0.1]], dtype=torch.float64)
-    controller, dt = GAINS.build(0.1), 0.1
+    controller = GAINS.build(0.1)
+    dt = 0.1
     first, s = controller(x, reference, controller.initial_state(x))
     second, s = controller(x, reference, s)
     c, sn = np.cos(3.0), np.sin(3.0)

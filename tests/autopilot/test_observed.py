@@ -138,7 +138,8 @@ def test_a_constant_push_is_taken_away(law: PtosConfig | ObservedLqrConfig) -> N
 
 
 def test_the_memory_does_not_depend_on_the_step_to_first_order() -> None:
-    coarse, fine = trained(8), trained(8)
+    coarse = trained(8)
+    fine = trained(8)
     cell = fine.network
     features = torch.randn(10, 11).double()
     memory = torch.zeros(10, 8, dtype=torch.float64)

@@ -22,7 +22,8 @@ from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
 LIMIT = 5 * DEG
-GAIN, TIME = 3.47, 3.94
+GAIN = 3.47
+TIME = 3.94
 VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
 STEERING = ControlTask(VESSEL, VESSEL.estimate_nomoto(LIMIT, 60.0), LIMIT, 0.1)
 SETTINGS = PredictorTraining(states=1000, epochs=40, batch=50)
@@ -32,12 +33,14 @@ def test_answers_are_nomotos_closed_form() -> None:
     """T r_dot + r = K delta from the yaw rate r0 under a held angle, for every state and angle of
     the data.
     """
-    law, horizon = DocumentConfig(horizon=2.0), 2.0
+    law = DocumentConfig(horizon=2.0)
+    horizon = 2.0
     angles = torch.linspace(-LIMIT, LIMIT, 41, dtype=torch.float64)
     x, change = simulate_rudder_responses(
         VESSEL, law.build_exact_predictor(STEERING), angles, SETTINGS, 50, 3
     )
-    start, steady = x[:, VESSEL.state_column("r"), None], GAIN * angles[None, :]
+    start = x[:, VESSEL.state_column("r"), None]
+    steady = GAIN * angles[None, :]
     decay = 1 - math.exp(-horizon / TIME)
     torch.testing.assert_close(change[:, 1], (steady - start) * decay, rtol=1e-4, atol=1e-7)
     torch.testing.assert_close(

@@ -17,9 +17,16 @@ def sailed(
     gain: float, time: float, delay: float, bias: float, noise: float, seed: int, gear: Any = 9e9
 ) -> Log:
     """A zigzag of T r_dot + r = K (delta(t - delay) + bias), by Euler's rule in small steps."""
-    dt, fine, rng = 0.5, 50, np.random.default_rng(seed)
-    rate, heading, rudder, side = 0.01, 0.0, 0.0, 1.0
-    commands, rates, held = [], [], [0.0] * max(round(delay / dt * fine), 1)
+    dt = 0.5
+    fine = 50
+    rng = np.random.default_rng(seed)
+    rate = 0.01
+    heading = 0.0
+    rudder = 0.0
+    side = 1.0
+    commands = []
+    rates = []
+    held = [0.0] * max(round(delay / dt * fine), 1)
     for _ in range(800):
         if side * heading > math.radians(20):
             side = -side

@@ -24,8 +24,10 @@ B, C = -A @ PHI, -A @ BIAS
 def trials(noise: float = 0.0) -> Samples:
     """Exact runs of the linear system: five constant inputs, two of each dynamic kind."""
     rng = np.random.default_rng(0)
-    dt, steps = 0.5, 1000
-    time, one = dt * np.arange(steps), np.ones(steps)
+    dt = 0.5
+    steps = 1000
+    time = dt * np.arange(steps)
+    one = np.ones(steps)
     # forces [2, T] of each
     parts = [("constant", ((100.0 + 120 * k) * one, (-200 + 90.0 * k) * one)) for k in range(5)]
     for k in range(2):
@@ -39,14 +41,16 @@ def trials(noise: float = 0.0) -> Samples:
     block = np.zeros((6, 6))
     block[:3, :3], block[:3, 3:5], block[:3, 5] = A, B, C
     step = expm(block * dt)
-    z, target = [], []
+    z = []
+    target = []
     for _, forces in parts:
         tau, nu = np.stack(forces, axis=1), np.zeros((steps, 3))
         for k in range(steps - 1):
             nu[k + 1] = (step @ np.concatenate((nu[k], tau[k], [1.0])))[:3]
         z.append(np.concatenate((nu, tau), axis=1))
         target.append(nu @ A.T + tau @ B.T + C + noise * rng.normal(size=nu.shape))
-    kinds, t = [kind for kind, _ in parts], np.tile(time, len(parts))
+    kinds = [kind for kind, _ in parts]
+    t = np.tile(time, len(parts))
     whole = np.concatenate(z), np.concatenate(target)
     return sampled(*whole, NAMES, groups=len(parts), t=t, kinds=kinds)
 
@@ -118,7 +122,8 @@ def test_nomoto_keeps_the_steady_states_and_its_own_structure(model: str) -> Non
     ],
 )
 def test_what_is_missing_is_named(left_out: tuple[str, ...], settled: float, message: str) -> None:
-    samples, config = trials(), LinearSteadyConfig(settled=settled)
+    samples = trials()
+    config = LinearSteadyConfig(settled=settled)
     keep = torch.tensor([kind not in left_out for kind in samples.kinds])
     with pytest.raises(FitError, match=message):
         config.fit_preferred(config.build(NAMES), samples.select(keep[samples.group]))

@@ -45,7 +45,8 @@ def published() -> MMGBaseline:
 
 def channels(rows: int, seed: int = 0) -> Tensor:
     random = np.random.default_rng(seed)
-    low, high = [0.5, -0.2, -0.06, 9.0, -0.6], [1.2, 0.2, 0.06, 11.0, 0.6]
+    low = [0.5, -0.2, -0.06, 9.0, -0.6]
+    high = [1.2, 0.2, 0.06, 11.0, 0.6]
     return torch.from_numpy(random.uniform(low, high, size=(rows, 5)))
 
 
@@ -73,7 +74,8 @@ def test_the_published_tanker_turns_as_published() -> None:
 
 
 def test_a_symmetric_ship_mirrors_and_signs() -> None:
-    baseline, turned = built(C_2p=(1.3, 0.1), C_2n=(1.3, 0.1)), torch.tensor([1.0, -1.0, -1.0])
+    baseline = built(C_2p=(1.3, 0.1), C_2n=(1.3, 0.1))
+    turned = torch.tensor([1.0, -1.0, -1.0])
     mirror = torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0], dtype=torch.float64)
     z = channels(50)
     asked = [[0.5, 0, 0, 10, 0], [1, 0, 0, 10, 0.3], [1, 0, 0, 0, 0], [0] * 5]
@@ -87,7 +89,8 @@ def test_a_symmetric_ship_mirrors_and_signs() -> None:
 
 
 def test_sensitivities_are_those_of_forward_differentiation() -> None:
-    baseline, z = built(), channels(7)
+    baseline = built()
+    z = channels(7)
     theta = baseline.theta.detach()
     exact = torch.func.jacfwd(lambda t: baseline.force_model(z, t))(theta)
     torch.testing.assert_close(baseline.parameter_jacobian(z), exact, rtol=1e-6, atol=1e-7)
@@ -97,7 +100,8 @@ def test_sensitivities_are_those_of_forward_differentiation() -> None:
 
 
 def test_accelerations_of_a_known_ship_move_the_beliefs_to_it() -> None:
-    truth, config = published(), MMGConfig.model_validate({**TANKER, "correlation": 1})
+    truth = published()
+    config = MMGConfig.model_validate({**TANKER, "correlation": 1})
     z = channels(4000, 3)
     with torch.no_grad():
         target = truth(z) + 1e-5 * torch.from_numpy(np.random.default_rng(4).normal(size=(4000, 3)))

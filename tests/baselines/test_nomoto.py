@@ -86,7 +86,9 @@ def test_step_response_in_closed_form() -> None:
     with torch.no_grad():
         states = Rollout(model)(x0, w, x0[:, :0])[0][0].numpy()
     t = 0.05 * np.arange(401)
-    steady, slow, fast = LAGS["K"] * 0.2 + LAGS["b"], LAGS["T"], SLIP["T_beta"]
+    steady = LAGS["K"] * 0.2 + LAGS["b"]
+    slow = LAGS["T"]
+    fast = SLIP["T_beta"]
     r = steady * (1 - np.exp(-t / slow))
     lagged = 1 - (slow * np.exp(-t / slow) - fast * np.exp(-t / fast)) / (slow - fast)
     v = speed * (SLIP["b_beta"] - SLIP["K_beta"] * steady * lagged)
@@ -108,7 +110,8 @@ def test_a_refit_may_not_move_what_nothing_determines() -> None:
     unexplained.
     """
     baseline = NomotoBaselineConfig().build(NAMES)
-    terms, size = baseline.library.terms, baseline.library.n_terms
+    terms = baseline.library.terms
+    size = baseline.library.n_terms
     movable = {(i // size, terms[i % size]) for i in baseline.free_indices().tolist()}
     assert movable == {(0, "u"), (0, "n"), (0, "1"), (2, "r"), (2, "delta"), (2, "1")}
     assert len(NomotoSideslipBaselineConfig().build(NAMES).free_indices()) == 9

@@ -55,7 +55,8 @@ def test_exact_coefficients_from_noise_free_samples() -> None:
         assert entry.value == pytest.approx(TRUTH[entry.axis[0]][entry.term], rel=1e-10)
         assert entry.standard_error < 1e-10 * max(abs(entry.value), 1.0)
     z = np.random.default_rng(1).normal(size=(2, 30, 5)) * [1, 0.3, 0.3, 300, 200]
-    found, wanted = baseline(torch.from_numpy(z)), accelerations(z.reshape(-1, 5))
+    found = baseline(torch.from_numpy(z))
+    wanted = accelerations(z.reshape(-1, 5))
     np.testing.assert_allclose(found.reshape(-1, 3), wanted, rtol=1e-9, atol=1e-12)
     # terms of all axes, and the linear ones where none are named
     assert RegressorsConfig().build(NAMES).library.terms == ("1", *NAMES)
@@ -192,7 +193,8 @@ def test_what_cannot_be_is_a_config_error(
 def test_each_of_several_penalties_is_the_fit_with_it() -> None:
     rng = np.random.default_rng(2)
     z, y = rng.normal(size=(200, 5)), rng.normal(size=(200, 3))
-    samples, penalties = sampled(z, y, SHIP, groups=10), (0.0, 1e-2, 1.0)
+    samples = sampled(z, y, SHIP, groups=10)
+    penalties = (0.0, 1e-2, 1.0)
     several = RegressorsConfig(sets=("linear",), ridge=penalties)
     baseline = several.build(SHIP)
     found = several.fit_solutions(baseline, samples)

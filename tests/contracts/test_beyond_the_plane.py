@@ -74,11 +74,9 @@ from residnet.testing.checks import (
     make_example_spec,
 )
 
-PHI, P, DEPTH = (
-    ROLL_LAYOUT.state_names.index("phi"),
-    ROLL_LAYOUT.state_names.index("p"),
-    SIX_DOF_LAYOUT.state_names.index("z"),
-)
+PHI = ROLL_LAYOUT.state_names.index("phi")
+P = ROLL_LAYOUT.state_names.index("p")
+DEPTH = SIX_DOF_LAYOUT.state_names.index("z")
 HULL = RegressorsConfig(sets=("fossen",), ridge=1e-4)
 HEADS = [RidgeConfig(), GRUEnsembleConfig(hidden_size=6)]
 
@@ -101,8 +99,10 @@ def started(
 ) -> tuple[HybridDynamics, Tensor, Tensor, Tensor]:
     """A model of an integrator under way, inputs [2, T, m] that push it, and its memory."""
     spec = make_example_spec(head, signals).model_copy(update={"integrator": scheme})
-    model, n = make_example_model(spec).double(), len(signals.dof.dynamic_states)
-    low, high = torch.tensor(spec.low).double(), torch.tensor(spec.high).double()
+    model = make_example_model(spec).double()
+    n = len(signals.dof.dynamic_states)
+    low = torch.tensor(spec.low).double()
+    high = torch.tensor(spec.high).double()
     x = torch.zeros(2, 3 + n, dtype=torch.float64)
     x[:, 3:] = low[:n] * 0.3 + high[:n] * 0.7
     w = (low[n:] * 0.4 + high[n:] * 0.6).expand(2, steps, -1)
@@ -113,13 +113,15 @@ def started(
 def test_the_roll_angle_moves_by_the_roll_rate(scheme: Integrator, head: Any) -> None:
     model, x, w, s = started(head, ROLLING_SIGNALS, scheme, 60)
     states = trace_rollout(Rollout(model), 10_000)(x, w, s)[0]
-    alone, after = [x], x
+    alone = [x]
+    after = x
     for k in range(60):
         after, s = model.step(after, w[:, k], s)
         alone.append(after)
     torch.testing.assert_close(states, torch.stack(alone, dim=1), rtol=0, atol=1e-9)
     moved = states[0].detach().numpy()
-    rate, p = np.diff(moved[:, PHI]) / model.dt, moved[:, P]
+    rate = np.diff(moved[:, PHI]) / model.dt
+    p = moved[:, P]
     # the angle's rate lies between the velocities at both ends of a step
     apart = np.abs(np.diff(p)).max() + 1e-9
     assert np.abs(rate - 0.5 * (p[1:] + p[:-1])).max() <= 0.51 * apart
@@ -203,11 +205,13 @@ def test_sensitivities_are_the_derivatives_of_the_step(scheme: Integrator) -> No
     s = 0.1 * torch.randn(3, 10, len(active), generator=random, dtype=torch.float64)
     by_state, by_theta = StepJacobian.of_model(model)(x, w)
     found = by_state @ s + by_theta
-    start, size = baseline.theta.detach().flatten()[active].clone(), 1e-6
+    start = baseline.theta.detach().flatten()[active].clone()
+    size = 1e-6
     for j in range(0, len(active), 17):
         ends = []
         for sign in (1.0, -1.0):
-            values, moved = start.clone(), x.clone()
+            values = start.clone()
+            moved = x.clone()
             values[j] += sign * size
             moved[:, 2:] += sign * size * s[:, :, j]
             baseline.set_free(values)
@@ -219,7 +223,8 @@ def test_sensitivities_are_the_derivatives_of_the_step(scheme: Integrator) -> No
 
 def test_a_drafted_model_swings_as_its_vessel() -> None:
     """The roll of a torpedo has a period of ten steps of its logs."""
-    rate, none = 6.3, ("u v",)
+    rate = 6.3
+    none = ("u v",)
     rows = dict.fromkeys(("u", "v", "r", "w", "q"), none) | {"p": ("cos(theta) sin(phi)",)}
     swing = RegressorsConfig.model_validate({"terms": rows})
     changes = {"integrator": choose_integrator(SUBMERGED_SIGNALS.dof), "baseline": swing, "dt": 0.1}
@@ -242,18 +247,21 @@ def test_what_logs_tell() -> None:
     assert told("x", "y", "psi", "phi").velocities == ("u", "v", "r", "p")
     assert told("x", "y", "psi", "p").is_planar
     assert told("x", "y", "psi", "phi", "p", moving=False).is_planar
-    motion, noise = 0.1 * np.sin(np.arange(0.0, 60.0, 0.1)), np.random.default_rng(0)
+    motion = 0.1 * np.sin(np.arange(0.0, 60.0, 0.1))
+    noise = np.random.default_rng(0)
     for size, moves in ((0.05, True), (0.2, False)):
         phi = motion + size * noise.normal(size=motion.size)
         assert DegreesOfFreedom.from_channels({"u": motion, "phi": phi}).has_roll == moves
-    rolls, planar = told("u", "r", "phi", "p"), DegreesOfFreedom()
+    rolls = told("u", "r", "phi", "p")
+    planar = DegreesOfFreedom()
     assert rolls.fixed_states == ("v",)
     assert rolls.active_states == ("u", "r", "p", "phi")
     assert DegreesOfFreedom.intersection([rolls, planar]).velocities == ("u", "r")
     assert DegreesOfFreedom.intersection(
         [DegreesOfFreedom(("u",)), DegreesOfFreedom(("r",))]
     ).is_planar
-    low, high = -np.ones(12), 2.0 * np.ones(12)
+    low = -np.ones(12)
+    high = 2.0 * np.ones(12)
     # a depth and a loop are no runaway
     reach = SUBMERGED_SIGNALS.dof.range_limits(low, high)
     assert reach[:6].tolist() == [2.0] * 6
@@ -387,7 +395,8 @@ def test_a_draft_sets_the_rates_of_a_roll_beside_means() -> None:
 def test_a_monitor_tells_stiffness_from_damping(
     signals: SignalsConfig, names: tuple[str, ...]
 ) -> None:
-    spec, live = make_example_spec(None, signals), signals.dof
+    spec = make_example_spec(None, signals)
+    live = signals.dof
     model = make_example_model(spec).double()
     noise = np.full(len(live.state_names), 0.003)
     noise[:5] = 0.0, 0.0, 0.002, 0.02, 0.02
@@ -425,11 +434,10 @@ def test_a_monitor_tells_stiffness_from_damping(
 
 
 def test_a_model_that_rolls_flies_behind_the_gear_of_its_vessel() -> None:
-    spec, plant = (
-        make_example_spec(RidgeConfig(), ROLLING_SIGNALS),
-        load_vessel("patrol_p06_linear").build(),
-    )
-    model, columns = make_example_model(spec).double(), spec.signals.input_columns
+    spec = make_example_spec(RidgeConfig(), ROLLING_SIGNALS)
+    plant = load_vessel("patrol_p06_linear").build()
+    model = make_example_model(spec).double()
+    columns = spec.signals.input_columns
     gear = PlantActuators(plant, spec.dt)
     flown = ActuatedDynamics(model, columns, "start", gear)
     helm = Helm(gear.commands_for_demand, flown.state_names, gear.input_names)
@@ -485,7 +493,8 @@ def test_a_simulator_shows_the_roll(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("gain", [1.0, -1.0, 57.3])
 def test_the_doctor_sets_the_roll_rate_against_the_roll_angle(gain: float) -> None:
-    random, t = np.random.default_rng(2), np.arange(0.0, 120.0, 0.1)
+    random = np.random.default_rng(2)
+    t = np.arange(0.0, 120.0, 0.1)
     phi = 0.05 * np.sin(0.9 * t) + 0.001 * random.normal(size=t.size)
     p = gain * 0.05 * 0.9 * np.cos(0.9 * t) + 0.001 * random.normal(size=t.size)
     still = dict.fromkeys(("x", "y", "psi", "u", "v", "r"), 0.0 * t)

@@ -182,7 +182,8 @@ def test_a_model_stored_in_single_precision_keeps_its_answers(kind: str, tmp_pat
 @pytest.mark.parametrize("kind", sorted({*load_kinds(HeadConfig)} - {"sklearn"}))
 def test_a_head_flies_in_c_as_it_does_in_torch(kind: str) -> None:
     config = head_of(kind)
-    model, z = make_example_model(make_example_spec(config)).eval(), make_example_samples().z
+    model = make_example_model(make_example_spec(config)).eval()
+    z = make_example_samples().z
     model.has_position = False
     z = z[torch.arange(3)[:, None] * 100 + torch.arange(100)]
     given = (
@@ -197,7 +198,8 @@ def test_a_head_flies_in_c_as_it_does_in_torch(kind: str) -> None:
         slow = Rollout(model.to(dtype))
         fast = CompiledRollout(slow, x, w, s)
         with torch.no_grad():
-            found, wanted = fast(x, w, s), slow(x, w, s)
+            found = fast(x, w, s)
+            wanted = slow(x, w, s)
             exact = wanted if dtype == torch.float64 else exact
         for one, other, true in zip(found, wanted, exact, strict=True):
             assert one.shape == other.shape
@@ -254,7 +256,8 @@ def test_baseline_beyond_the_plane(kind: str, signals: SignalsConfig, refusal: s
 def test_zero_goes_on_level(signals: SignalsConfig) -> None:
     content = make_example_spec(None, signals).model_dump(mode="json", by_alias=True)
     content |= {"role": "constant_velocity", "baseline": {"kind": "still"}}
-    model, live = ModelSpec.model_validate(content).build().double(), signals.dof
+    model = ModelSpec.model_validate(content).build().double()
+    live = signals.dof
     x = torch.zeros(1, len(live.state_names), dtype=torch.float64)
     x[0, 3:] = torch.tensor([1.5, *[0.1] * (live.n_dynamic - 1)])
     w = torch.zeros(1, len(signals.input_columns), dtype=torch.float64)
@@ -340,10 +343,8 @@ LAYOUTS = {"drawn": None, "roll": ROLLING_SIGNALS, "six": SUBMERGED_SIGNALS}
 @pytest.mark.parametrize("name", formats("torchscript", "c", "parameters"))
 def test_a_format_holds_what_its_layout_names(name: str, layout: str, tmp_path: Path) -> None:
     signals = LAYOUTS[layout] or _drawn(name)
-    spec, file = (
-        make_example_spec(RidgeConfig(), signals),
-        tmp_path / f"model{get_exporter(name).suffix}",
-    )
+    spec = make_example_spec(RidgeConfig(), signals)
+    file = tmp_path / f"model{get_exporter(name).suffix}"
     exported = ExportedVessel(spec, make_example_model(spec))
     if name in ("feed_forward", "parameters"):
         with pytest.raises(UsageError, match="fit a"):

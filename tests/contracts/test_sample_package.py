@@ -61,7 +61,8 @@ def python(site: Path, *words: object) -> subprocess.CompletedProcess[str]:
 def write_knots(file: Path) -> None:
     """The made trial as the sample package's logger would write it."""
     log = trial(20.0)
-    degrees, knots = 180.0 / math.pi, 3600.0 / 1852.0
+    degrees = 180.0 / math.pi
+    knots = 3600.0 / 1852.0
     columns = [
         log.t,
         log["x"],
@@ -95,7 +96,8 @@ def test_its_head_runs_by_name_from_yaml(site: Path, tmp_path: Path) -> None:
         "export": {"models": ["slow"]},
     }
     del config["ensembles"]
-    file, run = tmp_path / "sample.yaml", tmp_path / "run"
+    file = tmp_path / "sample.yaml"
+    run = tmp_path / "run"
     file.write_text(yaml.safe_dump(config))
     done = python(site, "-m", "residnet.cli", "run", file, "--out", run)
     assert done.returncode == 0, done.stderr

@@ -14,14 +14,16 @@ from residnet.core.stretches import find_run_bounds, find_runs, number_runs
 def test_find_runs_equals_a_reference_loop(seed: int) -> None:
     random = np.random.default_rng(seed)
     labels = np.repeat(random.integers(-1, 3, size=12), random.integers(1, 4, size=12))
-    expected, place = [], 0
+    expected = []
+    place = 0
     for label, group in itertools.groupby(labels.tolist()):
         stop = place + len(list(group))
         expected += [(place, stop)] if label >= 0 else []
         place = stop
     starts, stops = find_runs(labels)
     assert list(zip(starts.tolist(), stops.tolist(), strict=True)) == expected
-    numbers, (begins, ends) = number_runs(labels), find_run_bounds(labels)
+    numbers = number_runs(labels)
+    (begins, ends) = find_run_bounds(labels)
     for place, label in enumerate(labels.tolist()):
         if label < 0:
             assert (numbers[place], begins[place], ends[place]) == (-1, place, place)

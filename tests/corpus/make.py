@@ -13,7 +13,9 @@ import numpy as np
 import pandas as pd
 
 HERE = Path(__file__).parent
-STEP, EVERY, LENGTH = 0.02, 10, 100.0
+STEP = 0.02
+EVERY = 10
+LENGTH = 100.0
 COMMANDS = {1: (1, 12.0), 2: (2, 9.0)}
 """Trip -> seed of its commands, and their longest hold in s."""
 
@@ -21,14 +23,17 @@ COMMANDS = {1: (1, 12.0), 2: (2, 9.0)}
 def trip(number: int) -> pd.DataFrame:
     """Return the truth of a trip each 0.02 s: pose, velocities, roll, shaft in 1/s, rudder."""
     seed, longest = COMMANDS[number]
-    random, t = np.random.default_rng(seed), np.arange(0.0, LENGTH, STEP)
+    random = np.random.default_rng(seed)
+    t = np.arange(0.0, LENGTH, STEP)
 
     def steps(low: float, high: float) -> np.ndarray:
         at = np.cumsum(random.uniform(3.0, longest, 60))
         return random.uniform(low, high, 61)[np.searchsorted(at, t)]
 
-    n, delta = steps(8.0, 25.0), np.radians(steps(-25.0, 25.0))
-    state, rows = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]), []
+    n = steps(8.0, 25.0)
+    delta = np.radians(steps(-25.0, 25.0))
+    state = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+    rows = []
     for i in range(t.size):
         rows.append(state)
         _, _, psi, u, v, r, phi, p = state
@@ -52,7 +57,8 @@ def trip(number: int) -> pd.DataFrame:
 
 def seen(number: int, every: int = EVERY) -> pd.DataFrame:
     """Return what sensors say each `every` steps, in deg and rpm."""
-    true, random = trip(number)[::every].reset_index(drop=True), np.random.default_rng(70 + number)
+    true = trip(number)[::every].reset_index(drop=True)
+    random = np.random.default_rng(70 + number)
 
     def noisy(name: str, size: float) -> np.ndarray:
         return np.asarray(true[name] + size * random.normal(size=len(true)))

@@ -47,7 +47,8 @@ def test_what_ran_stands_in_the_pages_and_what_did_not_is_named(
 ) -> None:
     made = {name: (str(tmp_path / f"{name}.py"), "7") for name in ("good", "bad", "long", "other")}
     lines = [f"<!--= {name} stdout took\\s(\\d+) -->old<!--/-->" for name in made]
-    page, good = tmp_path / "page.md", tmp_path / "good.py"
+    page = tmp_path / "page.md"
+    good = tmp_path / "good.py"
     page.write_text("\n".join(lines))
     good.write_text("import sys; print('took', sys.argv[1])")
     (tmp_path / "bad.py").write_text("raise SystemExit('no such luck')")

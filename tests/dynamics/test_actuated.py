@@ -39,7 +39,8 @@ def still(columns: tuple[str, ...], dt: float = 0.1) -> HybridDynamics:
 def test_the_gear_is_the_plants_whatever_its_kind(vessel: str) -> None:
     """Actuator states equal those of the plant that is given the same commands."""
     plant = load_vessel(vessel).build()
-    step, substeps = 0.1, 2
+    step = 0.1
+    substeps = 2
     gear = PlantActuators(plant, step, substeps)
     random = np.random.default_rng(0)
     demands = torch.from_numpy(random.uniform(-1, 1, (2, 2, 12))).repeat_interleave(5, dim=-1)
@@ -57,10 +58,8 @@ def test_the_gear_is_the_plants_whatever_its_kind(vessel: str) -> None:
     assert len(gear.state_names) == len([name for name in plant.state_names if name not in hull])
     for name in gear.state_names:
         if name != "_yaw_lag":
-            found, wanted = (
-                mine[..., model.state_names.index(name)],
-                truth[..., plant.state_names.index(name)],
-            )
+            found = mine[..., model.state_names.index(name)]
+            wanted = truth[..., plant.state_names.index(name)]
             torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
     assert float((truth[:, -1, 0] - truth[:, 0, 0]).abs().max()) > 0.01
 

@@ -58,8 +58,10 @@ class Helm(Source):
 
 def loop(longest: int = 3) -> tuple[Rollout, tuple[Tensor, Tensor, Tensor]]:
     torch.manual_seed(2)
-    rows, steps = 21, 30
-    wanted, late = 2.0 * torch.randn(rows, 1), (torch.arange(rows) % (longest + 1.0))[:, None]
+    rows = 21
+    steps = 30
+    wanted = 2.0 * torch.randn(rows, 1)
+    late = (torch.arange(rows) % (longest + 1.0))[:, None]
     w = torch.stack((wanted.expand(-1, steps), late.expand(-1, steps)), dim=2)
     return Rollout(Boat(DT, "rk4"), Helm(longest)), (torch.randn(rows, 2), w, torch.zeros(rows, 1))
 
@@ -127,7 +129,8 @@ def test_functions_of_many_numbers_are_right_to_the_last_digits(
         )
     )
     for name in functions:
-        found, wanted = torch.empty_like(given), getattr(torch, name)(given.double()).to(dtype)
+        found = torch.empty_like(given)
+        wanted = getattr(torch, name)(given.double()).to(dtype)
         room = ctypes.c_void_p(given.data_ptr()), ctypes.c_void_p(found.data_ptr())
         library[f"each_{name}"](*room, ctypes.c_long(len(given)))
         torch.testing.assert_close(found, wanted, rtol=close, atol=tiny, equal_nan=True)

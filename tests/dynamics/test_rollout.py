@@ -56,7 +56,8 @@ def lstm_model() -> HybridDynamics:
 
 def test_linear_baseline_equals_the_matrix_exponential() -> None:
     """ZeroHead on a linear baseline: velocities by exact zero-order-hold discretisation."""
-    block, dt = np.zeros((6, 6)), 0.05
+    block = np.zeros((6, 6))
+    dt = 0.05
     block[:3, :3], block[:3, 3:5], block[:3, 5] = A, B, C
     exact = expm(block * dt)
     x0, w = starts(4), inputs(4, 100)
@@ -70,7 +71,9 @@ def test_linear_baseline_equals_the_matrix_exponential() -> None:
 
 
 def test_a_run_in_two_parts_is_the_whole_run() -> None:
-    model, x0, w = lstm_model(), starts(3), inputs(3, 30)
+    model = lstm_model()
+    x0 = starts(3)
+    w = inputs(3, 30)
     s = model.initial_state(3).double()
     with torch.no_grad():
         states, _, last = Rollout(model)(x0, w, s)
@@ -151,7 +154,8 @@ def test_heading_and_velocities_do_not_hang_on_positions(
     assert (model.innovation_filter is not None) == told
     x0 = torch.randn(5, 6, dtype=torch.float64)
     w = torch.randn(5, 20, 4 if wind else 2, dtype=torch.float64)
-    slopes, states = [], []
+    slopes = []
+    states = []
     for model.has_position in (True, False):
         held = w.clone().requires_grad_(True)
         x, _, _ = Rollout(model)(x0, held, model.initial_state(5).double())

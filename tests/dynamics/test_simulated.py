@@ -69,7 +69,8 @@ def run(model: Dynamics, start: Tensor, w: Tensor, s: Tensor | None = None) -> T
         return Rollout(model)(start, w, start[:, :0] if s is None else s)[0]
 
 
-START, SECONDS = [0.0, 0.0, 0.3, 1.2, -0.25, 0.3, 0.0], 4.0
+START = [0.0, 0.0, 0.3, 1.2, -0.25, 0.3, 0.0]
+SECONDS = 4.0
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +111,8 @@ def test_semi_implicit_euler_keeps_an_undamped_oscillation_bounded() -> None:
 
 
 def test_substeps_are_steps_under_one_command() -> None:
-    plant, random = load_vessel("wam_v_cal").build(), torch.Generator().manual_seed(0)
+    plant = load_vessel("wam_v_cal").build()
+    random = torch.Generator().manual_seed(0)
     w = torch.rand(2, 10, len(plant.input_names), generator=random, dtype=torch.float64)
     x0 = plant.make_initial_state(2)
     states = run(PlantDynamics(plant, 0.1, substeps=5), x0, w)
@@ -145,7 +147,8 @@ def test_in_an_ambient_current_it_moves_over_ground_as_a_hull_in_the_current() -
     )
     current = torch.tensor([[0.7, -0.4], [0.0, 1.0]], dtype=torch.float64)
     nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(2, -1)
-    steps, one = 600, torch.ones(2, dtype=torch.float64)
+    steps = 600
+    one = torch.ones(2, dtype=torch.float64)
     x, w = calm.straight_course(one)
     w[:, 0] = 0.01
     held = w.unsqueeze(1).expand(-1, steps, -1)
@@ -161,10 +164,8 @@ def test_in_an_ambient_current_it_moves_over_ground_as_a_hull_in_the_current() -
     y[:, [felt.state_column("u"), felt.state_column("v")]] += carried
     ground = run(felt.model(0.1), y, w.unsqueeze(1).expand(-1, steps, -1), nominal)
     for name in ("x", "y", "psi", "r", "p"):
-        found, wanted = (
-            water[:, -1, calm.state_column(name)],
-            ground[:, -1, felt.state_column(name)],
-        )
+        found = water[:, -1, calm.state_column(name)]
+        wanted = ground[:, -1, felt.state_column(name)]
         torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-6)
     assert float((water[:, -1, 0] - x[:, 0]).abs().min()) > 50.0
 
@@ -172,11 +173,14 @@ def test_in_an_ambient_current_it_moves_over_ground_as_a_hull_in_the_current() -
 def test_effect_and_time_of_a_varied_plant_are_gain_and_time_constant() -> None:
     plant = load_vessel("nomoto_oceanos").build()
     variation = torch.tensor([[0.8, 1.2, 0.02], [1.2, 0.8, -0.01]], dtype=torch.float64)
-    delta, steps, dt = 0.05, 200, 0.02
+    delta = 0.05
+    steps = 200
+    dt = 0.02
     w = torch.full((2, steps, 1), delta, dtype=torch.float64)
     states = run(VariedPlant(plant, dt), plant.make_initial_state(2), w, variation)
     for row, (effect, time, bias) in enumerate(variation.tolist()):
-        steady, constant = 3.47 * (effect * delta + bias), 3.94 * time
+        steady = 3.47 * (effect * delta + bias)
+        constant = 3.94 * time
         wanted = steady * (1 - math.exp(-steps * dt / constant))
         assert float(states[row, -1, plant.state_names.index("r")]) == pytest.approx(
             wanted, rel=1e-8
@@ -191,7 +195,8 @@ def test_no_variation_is_the_plant(name: str) -> None:
     w = torch.zeros(1, 60, len(plant.input_names), dtype=torch.float64)
     demand = torch.tensor([[1.0], [0.2]], dtype=torch.float64)
     w[:, :, : plant.n_commands] = plant.commands_for_demand(*demand).unsqueeze(1)
-    x, nominal = plant.make_initial_state(1), torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+    x = plant.make_initial_state(1)
+    nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
     mine = run(VariedPlant(plant, 0.1), x, w, nominal)
     torch.testing.assert_close(mine, run(PlantDynamics(plant, 0.1), x, w), rtol=0, atol=1e-12)
     assert mine[0, -1, plant.state_names.index("psi")] > 0.05
@@ -200,7 +205,8 @@ def test_no_variation_is_the_plant(name: str) -> None:
 def test_a_rudder_with_a_lag_moves_within_the_step_and_its_effect_is_varied() -> None:
     """Half of the effect at twice the angle turns the hull alike, while the gear moves on."""
     plant = load_vessel("mariner").build()
-    model, column = VariedPlant(plant, 0.5), plant.state_names.index("delta")
+    model = VariedPlant(plant, 0.5)
+    column = plant.state_names.index("delta")
     x, w = plant.make_initial_state(2), torch.zeros(2, len(plant.input_names), dtype=torch.float64)
     w[:, : plant.n_commands] = plant.commands_for_demand(torch.ones(2), torch.zeros(2)).double()
     x[:, column] = torch.tensor([0.1, 0.2], dtype=torch.float64)

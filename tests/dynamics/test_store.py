@@ -17,7 +17,8 @@ from residnet.dynamics.store import ModelSpec, load_model, model_names, rebuild_
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
-LOW, HIGH = [-0.1, -0.2, -0.3, -4.0, -5.0], [0.1, 0.2, 0.3, 4.0, 5.0]
+LOW = [-0.1, -0.2, -0.3, -4.0, -5.0]
+HIGH = [0.1, 0.2, 0.3, 4.0, 5.0]
 
 
 def spec(**changes: object) -> ModelSpec:
@@ -54,7 +55,8 @@ def edited(folder: Path, **changes: object) -> None:
 
 
 def test_round_trip(tmp_path: Path) -> None:
-    kept, model = spec(), spec().build()
+    kept = spec()
+    model = spec().build()
     theta: Any = model.baseline.theta
     with torch.no_grad():
         theta.copy_(torch.randn(3, 3, dtype=torch.float64))
@@ -82,7 +84,8 @@ def test_a_rebuilt_model_is_the_loaded_one_bit_for_bit(tmp_path: Path) -> None:
     save_model(tmp_path / "m", kept, model)
     _, loaded = load_model(tmp_path / "m")
     again = rebuild_module(kept, model)
-    theirs, rounded = dict(loaded.named_buffers()), dict(model.named_buffers())
+    theirs = dict(loaded.named_buffers())
+    rounded = dict(model.named_buffers())
     assert any(not torch.equal(theirs[name], rounded[name].double()) for name in theirs)
     for name, value in [*again.named_buffers(), *again.named_parameters()]:
         other = loaded.get_parameter(name) if name not in theirs else theirs[name]
@@ -131,7 +134,8 @@ def tamper(folder: Path) -> None:
 
 
 OTHER = RegressorsConfig(terms=("u", "1")).model_dump()
-WEIGHTS, JSON = r"model\.safetensors: .*run the fit again", r"model\.json: .* JSON.*run it again"
+WEIGHTS = r"model\.safetensors: .*run the fit again"
+JSON = r"model\.json: .* JSON.*run it again"
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,8 @@ def test_windows_are_the_first_that_fit_back_to_back() -> None:
         usable = ~(random_runs(count, rng, mean=15.0) & (rng.random(count) < 0.7))
         log = made(random_states(count, rng), STEP, usable=usable, piece=piece)
         windows = WindowProtocol(length=2.0, first=0.5, history=1.0).make_windows(log, 7, STEP)
-        expected, start = [], 5
+        expected = []
+        start = 5
         while start + 20 < count:
             inside = piece[start : start + 21]
             if log.usable[start] and (inside == inside[0]).all():
@@ -91,7 +92,8 @@ def test_whole_manoeuvres() -> None:
 
 def test_a_stretch_without_a_sample_to_score_is_no_window() -> None:
     """Its error would be the mean of nothing, and metrics.json holds no NaN."""
-    usable, piece = np.ones(200, dtype=bool), np.repeat([0, 1], 100)
+    usable = np.ones(200, dtype=bool)
+    piece = np.repeat([0, 1], 100)
     usable[4:100] = False
     windows = ManoeuvreProtocol(initial=0.4, shortest=3.0).make_windows(
         made(np.zeros((200, 6)), STEP, usable=usable, piece=piece), 0, STEP
@@ -140,7 +142,10 @@ def test_integrate_gives_a_circle() -> None:
     """Constant u, v, r: a circle of radius U / |r|; the trapezoidal rule on the chord is off by (r
     dt)^2 / 12 of the arc only.
     """
-    count, u, v, rate = 400, 2.0, 0.3, -0.2
+    count = 400
+    u = 2.0
+    v = 0.3
+    rate = -0.2
     nu = np.tile([u, v, rate], (count, 1))
     pose = integrate_pose(np.array([5.0, -3.0, 0.4]), nu, STEP)
     t = STEP * np.arange(count)
@@ -270,12 +275,14 @@ def test_the_plant_itself_predicts_its_own_noise_free_trial() -> None:
     """The candidate `plant`: what the measured state lacks (actuators, phi and p of a vessel that
     rolls) from the log, commands as inputs, no more known.
     """
-    plant, count = load_vessel("patrol_p06").build(), 200
+    plant = load_vessel("patrol_p06").build()
+    count = 200
     model = PlantDynamics(plant, STEP, 2)
     w = torch.zeros(1, count, len(plant.input_names), dtype=torch.float64)
     w[0, :, 0] = 0.1 * torch.sign(torch.sin(torch.arange(count) * 0.1))
     w[0, :, 1] = 1e5
-    x, states = plant.make_initial_state(1), []
+    x = plant.make_initial_state(1)
+    states = []
     with torch.no_grad():
         for k in range(count):
             states.append(x[0])
@@ -283,7 +290,8 @@ def test_the_plant_itself_predicts_its_own_noise_free_trial() -> None:
     channels = dict(zip(plant.state_names, torch.stack(states).numpy().T, strict=True))
     channels |= {name: w[0, :, i].numpy() for i, name in enumerate(plant.input_names[:2])}
     log = Log("trial", STEP * np.arange(count), channels)
-    motion, whole = log.stack(("x", "y", "psi", "u", "v", "r")), np.ones(count, dtype=bool)
+    motion = log.stack(("x", "y", "psi", "u", "v", "r"))
+    whole = np.ones(count, dtype=bool)
     trial = prepared(log, motion, np.zeros((count, 2)), whole, np.zeros(count, dtype=int))
     truth = Candidate(
         "plant",

@@ -62,7 +62,8 @@ def test_without_enough_samples_or_noise_there_is_no_measure() -> None:
 
 def test_pairs_tell_correlated_models_apart_that_their_own_intervals_do_not() -> None:
     shared = autoregressive(0.9, 1, 3000, seed=7)[0]
-    better, worse = 0.97 * shared, shared
+    better = 0.97 * shared
+    worse = shared
     found = paired_mae_difference([better], [worse], "worse")
     assert found["mae"] == pytest.approx(-0.03 * np.abs(shared).mean())
     assert found["ratio"] == pytest.approx(0.97)
@@ -133,7 +134,8 @@ def test_blocks_hold_the_mean_of_correlated_samples_and_single_samples_do_not() 
 
 def test_pieces_count_like_one_series_and_are_not_crossed() -> None:
     rows = autoregressive(0.8, 20, 200, seed=5)
-    pieces, joined = block_bootstrap_interval(list(rows)), block_bootstrap_interval([rows.ravel()])
+    pieces = block_bootstrap_interval(list(rows))
+    joined = block_bootstrap_interval([rows.ravel()])
     assert pieces.mean == pytest.approx(joined.mean)
     assert pieces.upper - pieces.lower == pytest.approx(joined.upper - joined.lower, rel=0.25)
     # constant pieces at different levels: a block that crossed would make values between
@@ -143,7 +145,8 @@ def test_pieces_count_like_one_series_and_are_not_crossed() -> None:
 
 def test_many_blocks_are_not_drawn_but_give_the_textbook_interval() -> None:
     x = autoregressive(0.0, 1, 20_000, seed=6)[0]
-    found, (low, high) = block_bootstrap_interval([x]), independent_confidence_interval(x)
+    found = block_bootstrap_interval([x])
+    (low, high) = independent_confidence_interval(x)
     expected = stats.t.interval(0.95, len(x) - 1, loc=x.mean(), scale=stats.sem(x))
     assert (low, high) == pytest.approx(expected)
     assert found.upper - found.lower == pytest.approx(high - low, rel=0.08)
@@ -175,14 +178,16 @@ def commands(seed: int, count: int) -> np.ndarray:
 
 def states(count: int, heading: float = 0.0) -> np.ndarray:
     """A straight run at 1 m/s."""
-    s, still = STEP * np.arange(1.0, count + 1), np.zeros(count)
+    s = STEP * np.arange(1.0, count + 1)
+    still = np.zeros(count)
     ahead = (s * np.cos(heading), s * np.sin(heading), still + heading, still + 1.0)
     return np.stack((*ahead, still, still), axis=1)
 
 
 def test_mismatch_equals_a_loop() -> None:
     rng = np.random.default_rng(0)
-    given, series = rng.normal(5, 2, (17, 2)), rng.normal(5, 2, (90, 2))
+    given = rng.normal(5, 2, (17, 2))
+    series = rng.normal(5, 2, (90, 2))
     plain = [np.sqrt(((series[k : k + 17] - given) ** 2).mean(0)).max() for k in range(90 - 17 + 1)]
     np.testing.assert_allclose(mismatch(given, series), plain, rtol=1e-9)
     assert mismatch(series, given).shape == (0,)

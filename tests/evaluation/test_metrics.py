@@ -71,7 +71,11 @@ def test_rows_equal_a_loop_over_windows() -> None:
     for row in table:
         wanted = members.get(row["manoeuvre"], {row["manoeuvre"]})
         chosen = [i for i, w in enumerate(run.windows) if logs[w.log_index].log.manoeuvre in wanted]
-        rmse, mae, position, heading, count = [], [], [], [], 0
+        rmse = []
+        mae = []
+        position = []
+        heading = []
+        count = 0
         for i in chosen:
             w, p = run.windows[i], run.predictions[row["model"]][i]
             error = p.states - logs[w.log_index].y[w.start : w.stop]
@@ -126,7 +130,9 @@ def test_differences_are_paired_by_window_and_kind() -> None:
         if row["model"] == "b":
             assert row["difference"] is None
             continue
-        found, one, other = row["difference"], errors["a"][chosen], errors["b"][chosen]
+        found = row["difference"]
+        one = errors["a"][chosen]
+        other = errors["b"][chosen]
         assert found["to"] == "b"
         assert found["nrmse_mean"] == pytest.approx(float((one - other).mean()))
         assert found["ratio"] == pytest.approx(one.mean() / other.mean())
@@ -209,7 +215,8 @@ def test_bands_are_thirds_of_the_windows() -> None:
     found = ProtocolEvaluation(
         run, [candidate("a", "b"), candidate("b")], logs, SCALES
     ).evaluate_by_class()
-    speeds, winds = ((1, 3), (4, 6), (7, 9)), ((1, 1), (2, 2), (3, 3))
+    speeds = ((1, 3), (4, 6), (7, 9))
+    winds = ((1, 1), (2, 2), (3, 3))
     assert [(band["by"], band["low"], band["high"], band["windows"]) for band in found] == [
         (by, low, high, 3)
         for by, ends in (("speed", speeds), ("wind", winds))
@@ -456,7 +463,9 @@ def test_worse_is_more_than_five_percent(factor: float, worse: bool) -> None:
 
 @pytest.mark.parametrize("logs", [3, 6])
 def test_intervals_hold_for_new_logs_of_the_column_that_looks_surest(logs: int) -> None:
-    random, held, windows = np.random.default_rng(3), [], 3
+    random = np.random.default_rng(3)
+    held = []
+    windows = 3
     numbers = np.repeat(np.arange(logs), windows)
     for _ in range(400):
         # a log has its size in common, half of it for all columns
@@ -484,7 +493,9 @@ def test_what_ran_away_or_is_exact_leaves_the_intervals_of_others() -> None:
 
 
 def test_a_log_without_an_error_widens_no_interval() -> None:
-    random, held, factors = np.random.default_rng(5), [], []
+    random = np.random.default_rng(5)
+    held = []
+    factors = []
     for _ in range(400):
         # one log in six goes straight, and nothing goes wrong in it
         seen, new = np.abs(random.normal(size=(2, 12, 2))) * (random.random((2, 12, 1)) > 1 / 6)

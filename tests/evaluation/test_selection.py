@@ -44,7 +44,8 @@ def chosen(*models: SelectionCandidate) -> Selection:
 
 
 def test_the_standard_error_is_that_of_paired_differences() -> None:
-    one, other = contender("a", "baseline", 0.5, spread=0.1), contender("b", "baseline", 0.4)
+    one = contender("a", "baseline", 0.5, spread=0.1)
+    other = contender("b", "baseline", 0.4)
     expected = (0.1 * JITTER).std(ddof=1) / np.sqrt(5)
     assert EVEN.standard_error(one.block_scores, other.block_scores) == pytest.approx(expected)
     assert log_error_ratio(one, other, EVEN) == pytest.approx((math.log(0.5 / 0.4), expected))

@@ -105,7 +105,8 @@ def findings(spec: ModelSpec, model: HybridDynamics) -> dict[str, SanityFinding]
 
 
 def twin(**change: tuple[float, float, float]) -> tuple[ModelSpec, HybridDynamics]:
-    low, high = (0.0, -0.4, -0.2, 0.0, 0.0), (2.0, 0.4, 0.2, 10.0, 10.0)
+    low = (0.0, -0.4, -0.2, 0.0, 0.0)
+    high = (2.0, 0.4, 0.2, 10.0, 10.0)
     return made({**TWIN, **change}, SIDES, low=low, high=high)
 
 
@@ -232,7 +233,8 @@ def test_symmetry_needs_to_know_what_steers() -> None:
 
 def test_wind_from_the_other_side_is_the_mirror_of_wind() -> None:
     wind = {"wind_u": (0.01, 0, 0), "wind_v": (0, 0.02, 0.01)}
-    low, high = (0.0, -0.4, -0.2, 0.0, -0.6, 0.0, -3.2), (2.0, 0.4, 0.2, 10.0, 0.6, 8.0, 3.2)
+    low = (0.0, -0.4, -0.2, 0.0, -0.6, 0.0, -3.2)
+    high = (2.0, 0.4, 0.2, 10.0, 0.6, 8.0, 3.2)
     names = ("wind_speed", "wind_dir")
     spec, model = made({**RUDDER, **wind}, exogenous=names, low=low, high=high)
     assert findings(spec, model)[SYMMETRY].ok is True
@@ -273,7 +275,8 @@ class Carried(ResidualHead):
 def test_what_looks_for_an_unknown_force_is_asked_without_a_past() -> None:
     spec, plain = made(RUDDER)
     model = HybridDynamics(plain.signals, plain.baseline, Carried(), STEP, "rk4")
-    low, high = spec.low[:3], spec.high[:3]
+    low = spec.low[:3]
+    high = spec.high[:3]
     for one in (model, MeanOfTrajectories([plain, model], low, high)):
         assert one.has_innovation
         found = findings(spec, one)

@@ -105,7 +105,8 @@ def test_every_name_begins_with_that_of_the_file(tmp_path: Path) -> None:
 
 
 def test_the_build_identity_is_of_the_model_and_the_version(tmp_path: Path) -> None:
-    first, second = vessel().build(), vessel(0.5).build()
+    first = vessel().build()
+    second = vessel(0.5).build()
     assert first == vessel().build()
     assert first["model_sha256"] != second["model_sha256"]
     assert first["identity"] == f"{__version__}+{first['model_sha256'][:16]}"
@@ -142,7 +143,8 @@ def test_stack_and_size_are_reported_before_the_file_is_written(
     heard = listened(tmp_path / "boat.c", vessel())
     assert len(heard) == 1
     card = json.loads((tmp_path / "boat.card.json").read_text())["size"]
-    stack, code = card["largest_stack_bytes"], card["code_bytes"]
+    stack = card["largest_stack_bytes"]
+    code = card["code_bytes"]
     for word in (f"{stack:,} bytes of stack", f"{code:,} bytes of code", "-fstack-usage", "size"):
         assert word in heard[0][0]
     assert not heard[0][1]

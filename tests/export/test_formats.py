@@ -125,7 +125,8 @@ def test_torchscript_is_the_model(variant: str, tmp_path: Path) -> None:
     for name, value in made.model.state_dict().items():
         torch.testing.assert_close(value, before[name], rtol=0, atol=0, equal_nan=True)
     check_bad_inputs(module, made.spec, made.to_precision(torch.float32), cases=100)
-    random, model = np.random.default_rng(1), made.to_precision(torch.float32)
+    random = np.random.default_rng(1)
+    model = made.to_precision(torch.float32)
     x = random.normal(size=(3, 6)) * [50, 50, 3, 0.5, 0.1, 0.1] + [0, 0, 0, 1, 0, 0]
     inputs = random.uniform(LOW[3:], HIGH[3:], size=(3, 30, 4))
     x0, w = (torch.from_numpy(part).float() for part in (x, inputs))
@@ -178,7 +179,8 @@ def test_the_card_says_what_a_controller_needs() -> None:
 def test_outside_flags_each_channel_beyond_its_range() -> None:
     made = exported("lstm")
     module: Any = made.build_module(torch.float32)
-    low, high = torch.tensor(LOW), torch.tensor(HIGH)
+    low = torch.tensor(LOW)
+    high = torch.tensor(HIGH)
     middle = 0.5 * (low + high)
     # rows: the middle, both corners, then each channel just below and just above its range
     own = torch.eye(len(LOW))
@@ -263,7 +265,8 @@ def test_what_single_precision_does_not_determine_is_written_in_double(
 ) -> None:
     """Large coefficients that cancel make a model round; here no difference at all is let pass."""
     monkeypatch.setattr(base, "SINGLE_TOLERANCE", -1.0)
-    made, file = exported("plsr"), tmp_path / f"boat.{name}"
+    made = exported("plsr")
+    file = tmp_path / f"boat.{name}"
     allowed = {torch.float32: -1.0, torch.float64: 1e-7}
     monkeypatch.setattr("residnet.export.onnx_file._TOLERANCES", allowed)
     card = get_exporter(name).export(made, file)
@@ -427,7 +430,8 @@ def test_half_widths_are_those_of_the_table_in_torchscript_and_in_c(
     tmp_path: Path, table: BandTable | None, signals: SignalsConfig
 ) -> None:
     spec = make_example_spec(None, signals).model_copy(update={"band": table})
-    exported, file = ExportedVessel(spec, make_example_model(spec)), tmp_path / "boat.c"
+    exported = ExportedVessel(spec, make_example_model(spec))
+    file = tmp_path / "boat.c"
     card = get_exporter("torchscript").export(exported, tmp_path / "model.pt")
     loaded = torch.jit.load(str(tmp_path / "model.pt"))
     get_exporter("c").export(exported, file)
@@ -468,7 +472,8 @@ def scripted(spec: ModelSpec, model: HybridDynamics) -> Any:
 @functools.cache
 def delayed() -> tuple[ModelSpec, HybridDynamics]:
     """A term that divides by revolutions of some steps ago."""
-    spec, known = make_example_spec(RATIO), make_example_samples()
+    spec = make_example_spec(RATIO)
+    known = make_example_samples()
     model = spec.build().eval()
     spec.baseline.fit_preferred(model.baseline, known)
     turning = known.z[known.z[:, 3] > 1.0]
@@ -549,7 +554,8 @@ def test_a_number_that_is_not_finite_is_refused(name: str, tmp_path: Path) -> No
 def test_a_format_writes_a_model_or_says_why_not(name: str, variant: str, tmp_path: Path) -> None:
     spec = spec_of(None)
     spec, model = (spec, spec.build()) if variant == "none" else built(variant)
-    file, said = tmp_path / f"boat{get_exporter(name).suffix}", ""
+    file = tmp_path / f"boat{get_exporter(name).suffix}"
+    said = ""
     try:
         get_exporter(name).export(ExportedVessel(spec, model), file)
     except ResidnetError as error:
@@ -569,7 +575,8 @@ def swept(spec: ModelSpec, model: HybridDynamics) -> float:
     """Return the share of the training range that the inputs of the free run sweep at most."""
     _, w, _ = ExportedVessel(spec, model).run_reference(torch.float64)
     n = spec.signals.dof.n_dynamic
-    low, high = torch.tensor(spec.low[n:]), torch.tensor(spec.high[n:])
+    low = torch.tensor(spec.low[n:])
+    high = torch.tensor(spec.high[n:])
     return float(((w[0].amax(dim=0) - w[0].amin(dim=0)) / (high - low)).max())
 
 

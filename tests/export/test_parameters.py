@@ -61,7 +61,9 @@ def compare(folder: Path, model: HybridDynamics, axes: slice = slice(3)) -> Any:
     card = json.loads((folder / "hull.parameters.json").read_text())
     mass, linear, quadratic = (np.array(card[name]) for name in ("M", "D", "D_n"))
     # m2c of MSS in three degrees of freedom takes the symmetric part
-    whole, dt, random = 0.5 * (mass + mass.T), 0.02, np.random.default_rng(0)
+    whole = 0.5 * (mass + mass.T)
+    dt = 0.02
+    random = np.random.default_rng(0)
     for nu, tau in zip(*random.uniform(-1, 1, size=(2, 20, 3)), strict=True):
         tau = tau * np.diag(mass)
         with torch.no_grad():

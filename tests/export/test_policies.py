@@ -114,7 +114,8 @@ def check_bad_measurements(
     Among good measurements, from `low` to `high` [k], stand bad ones, bad memories, and memories
     whose entries lie within their ranges [n] but do not belong together.
     """
-    cases, random = 200, torch.Generator().manual_seed(0)
+    cases = 200
+    random = torch.Generator().manual_seed(0)
     least, most = memory
 
     def between(a: Tensor, b: Tensor) -> Tensor:
@@ -123,7 +124,8 @@ def check_bad_measurements(
     s = initial_state(replace_entries(between(low, high), high, 0.2, random))
     assert_finite(s, "the memory at a bad measurement is not finite")
     for k in range(30):
-        y, given = between(low, high), s
+        y = between(low, high)
+        given = s
         if k % 5 == 1:
             y = replace_entries(y, high, 0.3, random)
         if k % 5 == 3:
@@ -278,7 +280,10 @@ def test_a_vessel_moves_as_the_model(tmp_path: Path) -> None:
 ROOT = Path(__file__).parents[2]
 NODE = ROOT / "examples" / "ros2_autopilot" / "src" / "steering_node.c"
 HARNESS = ROOT / "tests" / "support" / "rclc"
-STEPS, ASKED, LAST, AGAIN = 400, 60, 199, 301
+STEPS = 400
+ASKED = 60
+LAST = 199
+AGAIN = 301
 """A heading is asked for; odometry comes a last time, and again."""
 
 
@@ -317,13 +322,18 @@ def test_the_node_answers_as_the_policy(safe: Any, tmp_path: Path) -> None:
 
     module: Any = exported.build_controller(torch.float64)
     within = policy.PARITY_TOLERANCE * LIMIT
-    s, seen, age, asked = None, torch.zeros(1, 3).double(), 0.0, math.nan
+    s = None
+    seen = torch.zeros(1, 3).double()
+    age = 0.0
+    asked = math.nan
     for k in range(STEPS):
         if rows[k, 0]:
             heading = math.remainder(psi[k], 2.0 * math.pi)
-            seen, age = torch.tensor([[heading, SPEED, r[k]]]).double(), 0.0
+            seen = torch.tensor([[heading, SPEED, r[k]]]).double()
+            age = 0.0
             if s is None:
-                s, asked = module.initial_state(seen), heading
+                s = module.initial_state(seen)
+                asked = heading
         asked = rows[k, 8] if rows[k, 7] else asked
         if s is None:
             assert out[k].tolist() == [0.0, 1.0]

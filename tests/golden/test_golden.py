@@ -47,7 +47,8 @@ def files(part: str) -> list[Any]:
 @pytest.mark.parametrize("path", files("flown"))
 def test_trajectory(path: Path, seconds: float) -> None:
     """Every channel to 1e-6 of its range, unless its group says why not."""
-    frame, group = table(path), set_up(path.parent.name)
+    frame = table(path)
+    group = set_up(path.parent.name)
     frame = frame[frame["t"] <= seconds + 1e-9]
     channels = group.flown(path, seconds)
     step = channels.pop("step")
@@ -71,7 +72,9 @@ def test_rows(path: Path) -> None:
 
 def test_the_rounding_bound_has_a_floor_where_terms_cancel_exactly() -> None:
     """A column of zeros: 1e-17 of a thrust is rounding there, 1e-14 of it is a fault."""
-    parts, truth, thrust = np.array([[200.0, 0.0], [150.0, 0.0]]), np.zeros((2, 2)), 200.0
+    parts = np.array([[200.0, 0.0], [150.0, 0.0]])
+    truth = np.zeros((2, 2))
+    thrust = 200.0
     bound = rounding_bound(parts, truth, thrust)
     assert (1e-17 * thrust < bound[:, 1]).all()
     assert (bound[:, 1] < 1e-14 * thrust).all()

@@ -56,7 +56,8 @@ def test_guard_holds_features_at_the_widened_range() -> None:
     samples = made()
     features = Features(("r", "u"), NAMES, margin=0.25)
     features.calibrate(samples)
-    low, high = samples.z.amin(0)[[2, 0]], samples.z.amax(0)[[2, 0]]
+    low = samples.z.amin(0)[[2, 0]]
+    high = samples.z.amax(0)[[2, 0]]
     reach = 0.25 * (high - low)
     inside = samples.z[:5]
     assert torch.equal(features.select_clamped(inside), inside[:, [2, 0]])
@@ -102,7 +103,8 @@ def test_cross_validation_of_linear_heads_equals_explicit_refits(
     x, y = head.basis_functions(MIXED.z).numpy(), MIXED.target.numpy()
     error = np.zeros((len(settings), 3))
     for f in range(4):
-        own, rest = np.equal(FOLD, f), np.not_equal(FOLD, f)
+        own = np.equal(FOLD, f)
+        rest = np.not_equal(FOLD, f)
         for i, setting in enumerate(settings):
             predict = refitted(config, setting, x[rest], y[rest], rest.sum())
             error[i] += ((predict(x[own]) - y[own]) ** 2).sum(0) / len(x)
@@ -235,7 +237,8 @@ def kernel(form: RbfConfig | PolynomialConfig, *penalties: float, **settings: An
 
 def standardised(z: torch.Tensor, own: torch.Tensor = SAMPLES.z) -> np.ndarray:
     """Channels held at the widened range, and two terms of them."""
-    low, high = own.amin(0), own.amax(0)
+    low = own.amin(0)
+    high = own.amax(0)
     x, known = (part.clamp(2 * low - high, 2 * high - low).numpy() for part in (z, own))
     return (x - known.mean(0)) / known.std(0)  # type: ignore[no-any-return]
 
@@ -256,7 +259,8 @@ def test_kernel_ridge_equals_scikit_learn(
 ) -> None:
     head = calibrated(kernel(form, penalty))
     notes = head.fit_preferred(SAMPLES)
-    alpha, x = penalty * len(SAMPLES), standardised(SAMPLES.z)
+    alpha = penalty * len(SAMPLES)
+    x = standardised(SAMPLES.z)
     if isinstance(form, RbfConfig):
         gamma = 1 / (2 * form.sigma[0])
         truth = KernelRidge(kernel="rbf", gamma=gamma, alpha=alpha).fit(x, SAMPLES.target.numpy())
@@ -275,7 +279,8 @@ def test_kernel_ridge_equals_scikit_learn(
 def test_terms_are_features_too() -> None:
     head = calibrated(kernel(PolynomialConfig(), 1e-3, terms=("u|u|", "u v")))
     head.fit_preferred(SAMPLES)
-    low, high = SAMPLES.z.numpy().min(0), SAMPLES.z.numpy().max(0)
+    low = SAMPLES.z.numpy().min(0)
+    high = SAMPLES.z.numpy().max(0)
 
     def columns(z: torch.Tensor) -> np.ndarray:
         x = np.clip(z.numpy(), 2 * low - high, 2 * high - low)
@@ -312,7 +317,8 @@ def test_cross_validation_of_kernels_equals_explicit_refits(
     for i, found in enumerate(errors):
         error = np.zeros((3, 3))
         for f in range(4):
-            own, rest = np.equal(FOLD, f), np.not_equal(FOLD, f)
+            own = np.equal(FOLD, f)
+            rest = np.not_equal(FOLD, f)
             for j, penalty in enumerate(penalties):
                 predict = kernel_refitted(head, form, i, x[rest], y[rest], penalty * len(x))
                 error[j] += ((predict(x[own]) - y[own]) ** 2).sum(0)
@@ -336,7 +342,8 @@ def kernel_refitted(
         radial = KernelRidge(kernel="rbf", gamma=gamma, alpha=alpha)
         return radial.fit(x, y).predict  # type: ignore[no-any-return]
     points = head.kernel.points.numpy()
-    wide, own = rbf_kernel(x, points, gamma), rbf_kernel(points, gamma=gamma)
+    wide = rbf_kernel(x, points, gamma)
+    own = rbf_kernel(points, gamma=gamma)
     # min |y - wide c|^2 + alpha c' own c, stacked: the normal equations would lose half the digits
     values, vectors = np.linalg.eigh(own)
     root = np.sqrt(alpha * values.clip(0))[:, None] * vectors.T
@@ -393,20 +400,25 @@ def test_free_runs_are_offered_joint_settings_then_single_steps_around_the_best(
 
 def test_recursion_is_a_free_run_of_one_velocity() -> None:
     """Against a loop over single samples, with scikit-learn's own fits."""
-    random, step, names = np.random.default_rng(3), 0.2, ("u", "v", "r", "n")
+    random = np.random.default_rng(3)
+    step = 0.2
+    names = ("u", "v", "r", "n")
     a = np.array([[-0.3, 0, 0, 1], [0.2, -0.5, 0, 0], [0, 0.4, -1, 0]])
-    z, rates = np.zeros((60, 4)), np.zeros((60, 3))
+    z = np.zeros((60, 4))
+    rates = np.zeros((60, 3))
     z[:, 3] = random.normal(size=60)
     for k in range(59):
         rates[k] = a @ z[k] + 0.05 * random.normal(size=3)
         z[k + 1, :3] = z[k, :3] + step * rates[k]
     t = step * np.concatenate((np.arange(30), np.arange(30)))
     known = sampled(z, rates, names, groups=2, t=t)
-    sigmas, penalties = (2.0, 20.0), (1e-3, 1.0)
+    sigmas = (2.0, 20.0)
+    penalties = (1e-3, 1.0)
     settings = {"choose": "recursion", "folds": 2, "margin": 100.0}
     head = calibrated(kernel(RbfConfig(sigma=sigmas), *penalties, **settings), known)
     notes = head.fit_preferred(known)
-    mean, std = z.mean(0), z.std(0)
+    mean = z.mean(0)
+    std = z.std(0)
     error = np.zeros((2, 2, 3))
     for i, j, axis in np.ndindex(2, 2, 3):
         model = KernelRidge(kernel="rbf", gamma=1 / (2 * sigmas[i]), alpha=penalties[j] * 60)
@@ -444,7 +456,8 @@ def test_the_answers_of_a_pipeline_are_those_of_scikit_learn(pipeline: list[Any]
     config = validate_config({"pipeline": pipeline, "samples": 100}, SklearnConfig, "here")
     head = calibrated(config)
     head.fit_preferred(SAMPLES)
-    x, spread = head.features(SAMPLES.z).numpy(), head.residual_scale().numpy()
+    x = head.features(SAMPLES.z).numpy()
+    spread = head.residual_scale().numpy()
     rows = torch.linspace(0, len(x) - 1, 100).long()
     for axis in range(3):
         own = make_pipeline(*map(scikit.make_estimator, pipeline))

@@ -113,7 +113,8 @@ def test_a_free_run_is_the_true_ferrys(model: Any) -> None:
     x = torch.tensor([[0.0, 0.0, 0.0, 0.5, 0.1, 0.05]], dtype=torch.float64)
     w = torch.tensor([[100.0, -20.0, 30.0]], dtype=torch.float64)
     s, nu, h = x[:, :0], x[:, 3:].clone(), 0.01
-    inverse, none = torch.linalg.inv(true.mass), torch.zeros_like(nu)
+    inverse = torch.linalg.inv(true.mass)
+    none = torch.zeros_like(nu)
     with torch.no_grad():
         for k in range(500):
             if k % 10 == 0:
@@ -164,10 +165,8 @@ def test_a_mass_that_cannot_be_inverted_safely_fails_the_fit(config: Any) -> Non
 
 def test_only_the_solutions_that_run_forward_are_offered() -> None:
     """The least penalties find the negative mass; strong ones stay with the believed one."""
-    model, of = (
-        built(RidgeConfig(space="force", terms=TERMS, penalties=(1e-8, 100.0))),
-        samples(mass_sign=-1.0),
-    )
+    model = built(RidgeConfig(space="force", terms=TERMS, penalties=(1e-8, 100.0)))
+    of = samples(mass_sign=-1.0)
     with torch.no_grad():
         residual = model.head.residual_samples(of, model.baseline(of.z))
     model.head.calibrate(residual)
@@ -181,7 +180,8 @@ def force(**settings: Any) -> Any:
     return RidgeConfig(space="force", **settings).build(NAMES)
 
 
-ALONE, ONLY = "only be a term by itself", "only heads in force space"
+ALONE = "only be a term by itself"
+ONLY = "only heads in force space"
 
 
 @pytest.mark.parametrize(

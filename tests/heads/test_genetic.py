@@ -123,7 +123,8 @@ def truth(u: np.ndarray, v: np.ndarray, r: np.ndarray) -> np.ndarray:
 def test_tables_and_writing_say_the_same() -> None:
     algebra = Algebra(("u", "v", "r"), ExpressionLimits(nesting=3))
     meant = expression(algebra)
-    products, weights = list(meant), list(meant.values())
+    products = list(meant)
+    weights = list(meant.values())
     library = ExpressionLibrary(3)
     library.load_state_dict(build_library_state(algebra, products, 3))
     z = np.random.default_rng(0).normal(size=(30, 3))
@@ -144,7 +145,8 @@ def test_tables_and_writing_say_the_same() -> None:
 def test_terms_are_written_as_the_term_language_reads_them() -> None:
     algebra = Algebra(("u", "rpm", "nozzle"))
     u, rpm, nozzle = (algebra.make_channel(name) for name in algebra.channels)
-    multiply, apply = algebra.multiply, algebra.apply_function
+    multiply = algebra.multiply
+    apply = algebra.apply_function
     made: list[Sum] = [
         multiply(u, apply("abs", u)),
         multiply(multiply(rpm, rpm), apply("cos", nozzle)),

@@ -51,10 +51,8 @@ def stepped(head: Any, z: Tensor) -> Tensor:
 
 
 def test_an_lstm_equals_that_of_torch() -> None:
-    core, z = (
-        LSTMCell(4, 10, uses_softsign=False).double(),
-        torch.randn(5, 30, 4, dtype=torch.float64),
-    )
+    core = LSTMCell(4, 10, uses_softsign=False).double()
+    z = torch.randn(5, 30, 4, dtype=torch.float64)
     other = nn.LSTM(4, 10, batch_first=True).double()
     with torch.no_grad():
         core.bias.uniform_(-0.5, 0.5)
@@ -79,7 +77,8 @@ def logistic(x: np.ndarray) -> np.ndarray:
 
 def test_a_softsign_cell_equals_numpy() -> None:
     """Document 003 eq. (17): softsign in place of tanh, the gates stay logistic."""
-    core, z = LSTMCell(3, 6, uses_softsign=True).double(), torch.randn(2, 8, 3, dtype=torch.float64)
+    core = LSTMCell(3, 6, uses_softsign=True).double()
+    z = torch.randn(2, 8, 3, dtype=torch.float64)
     wi, wh, b = (
         part.detach().numpy() for part in (core.input_weight, core.hidden_weight, core.bias)
     )
@@ -107,14 +106,16 @@ def test_the_documents_network_has_axes_of_their_own() -> None:
     own, z = built(per_axis=True, axis_features=seen), windows()
     changed = z.clone()
     changed[..., 3] += 50.0
-    before, after = own.teacher_forced_residuals(z), own.teacher_forced_residuals(changed)
+    before = own.teacher_forced_residuals(z)
+    after = own.teacher_forced_residuals(changed)
     assert bool((before[..., 0] != after[..., 0]).any())
     assert torch.equal(before[..., 1:], after[..., 1:])
 
 
 @pytest.mark.parametrize("activation", ["tanh", "softsign"])
 def test_gradients_of_the_sequence_are_those_of_the_steps(activation: str) -> None:
-    head, z = built(activation=activation), windows(2, 10)
+    head = built(activation=activation)
+    z = windows(2, 10)
     weights = list(head.parameters())
     found, wanted = (
         torch.autograd.grad(out.square().sum(), weights)
@@ -125,7 +126,8 @@ def test_gradients_of_the_sequence_are_those_of_the_steps(activation: str) -> No
 
 
 def test_a_memory_of_chosen_features_ignores_the_others() -> None:
-    head, z = built(memory=(NAMES[-1],), readout=5), windows()
+    head = built(memory=(NAMES[-1],), readout=5)
+    z = windows()
     other = z.clone()
     other[:, :, : len(NAMES) - 1] += 0.1
     assert torch.equal(head.warmup(z), head.warmup(other))
@@ -171,7 +173,8 @@ def test_a_step_is_that_of_pytorch_and_no_network_sees_another() -> None:
     # torch orders reset, update, new; ours is update, reset, new
     order = torch.cat((torch.arange(5, 10), torch.arange(5), torch.arange(10, 15)))
     for k in range(3):
-        cell, rows = nn.GRUCell(8, 5, dtype=torch.float64), slice(2 * k, 2 * k + 2)
+        cell = nn.GRUCell(8, 5, dtype=torch.float64)
+        rows = slice(2 * k, 2 * k + 2)
         with torch.no_grad():
             cell.weight_ih.copy_(head.input_weight[k].T[order])
             cell.weight_hh.copy_(head.hidden_weight[k].T[order])
@@ -229,7 +232,8 @@ def test_a_measurement_starts_all_members_from_it() -> None:
 
 
 def test_a_coarse_store_holds_all_samples_and_the_means_of_inputs() -> None:
-    count, steps = 23, 4
+    count = 23
+    steps = 4
     label = torch.arange(count, dtype=torch.float64)
     rows = label[:, None]
     turning = torch.remainder(0.3 * rows + torch.pi, 2 * torch.pi) - torch.pi
@@ -325,9 +329,11 @@ def test_the_residual_in_the_mirror_is_the_mirror_of_the_residual(kind: str, sce
     z = torch.from_numpy(2.0 * np.random.default_rng(3).normal(size=(3, 20, len(names))))
     other = z[..., index] * torch.tensor(sign, dtype=z.dtype)
     with torch.no_grad():
-        here, there = head.teacher_forced_residuals(z), head.teacher_forced_residuals(other)
+        here = head.teacher_forced_residuals(z)
+        there = head.teacher_forced_residuals(other)
         torch.testing.assert_close(there, here * TURNED, rtol=0, atol=1e-15)
-        step_here, step_there = stepped(head, z), stepped(head, other)
+        step_here = stepped(head, z)
+        step_there = stepped(head, other)
         torch.testing.assert_close(step_there, step_here * TURNED, rtol=0, atol=1e-15)
         torch.testing.assert_close(step_here, here, rtol=0, atol=1e-12)
     smallest = float(here.abs().amax((0, 1)).min())
@@ -335,7 +341,8 @@ def test_the_residual_in_the_mirror_is_the_mirror_of_the_residual(kind: str, sce
 
 
 def test_scales_are_those_of_both_sides() -> None:
-    head, known = mirrored("mlp", RUDDER), one_sided(RUDDER)
+    head = mirrored("mlp", RUDDER)
+    known = one_sided(RUDDER)
     inner: Any = head.inner_head.features  # type: ignore[union-attr]
     sign = torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0], dtype=torch.float64)
     both = torch.cat((known.z, known.z * sign))

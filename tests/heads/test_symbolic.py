@@ -25,7 +25,8 @@ from residnet.heads.symbolic import SegmentedSamples, SymbolicConfig, SymbolicHe
 from residnet.physics.symmetry import compute_term_parity
 from residnet.preprocessing.derivatives import SavitzkyGolay
 
-FORCES, JETS = ("u", "v", "r", "tau_x", "tau_y", "tau_n"), ("u", "v", "r", "rpm", "nozzle")
+FORCES = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
+JETS = ("u", "v", "r", "rpm", "nozzle")
 FORCE: dict[str, Any] = {"candidates": {"input_degree": 2, "coupling": ["u", "v", "r"]}}
 JET: dict[str, Any] = {
     "candidates": {
@@ -198,13 +199,15 @@ def test_a_delay_is_found_inside_the_regression_and_remembered() -> None:
 
 @pytest.mark.parametrize("shift", [0, 3, 8])
 def test_errors_by_delay_are_those_of_refits_across_gaps(shift: int) -> None:
-    random, count = np.random.default_rng(shift), 400
+    random = np.random.default_rng(shift)
+    count = 400
     u, tau = random.normal(size=(2, count)) * [[1.0], [500.0]]
     late = np.roll(tau, shift)
     y = -u + 1e-3 * late + 1e-7 * u**2 * late * np.abs(late) + 0.3 * random.normal(size=count)
     stretch = np.repeat([0, 1, 2], [150, 50, 200])
     # one term twice does no harm
-    terms, index = ("u", "tau", "u^2 tau |tau|", "tau"), np.array([1])
+    terms = ("u", "tau", "u^2 tau |tau|", "tau")
+    index = np.array([1])
     past = SegmentedSamples(np.stack((u, tau), axis=1), y[:, None], stretch, 0.1)
     found, profile = find_best_delay(past, [terms], ("u", "tau"), index, 10)
     now = np.array([i for i in range(10, count) if stretch[i] == stretch[i - 10]])
@@ -290,7 +293,8 @@ def test_c_code_and_sympy_text_equal_the_head(tmp_path: Path) -> None:
     symbols = sympy.symbols("u v r tau_x", real=True)
     for axis, name in enumerate(ACCELERATION_NAMES):
         function = getattr(library, name)
-        function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double] * 4
+        function.restype = ctypes.c_double
+        function.argtypes = [ctypes.c_double] * 4
         np.testing.assert_allclose(
             [function(*row) for row in z.tolist()], rho[:, axis], rtol=1e-12, atol=1e-12
         )

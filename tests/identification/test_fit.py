@@ -249,7 +249,8 @@ def test_a_diverging_solution_never_beats_the_best_steady_one() -> None:
 
 
 def test_what_lies_around_the_best_is_tried_while_it_gains() -> None:
-    near, wide = at(0.0, alone=False), at(2.0, alone=False)
+    near = at(0.0, alone=False)
+    wide = at(2.0, alone=False)
     best, tried = chosen(lambda value: Score(0, abs(value - 4.2)), near, wide)
     assert best == 4.0
     # each once, up to the first neighbours that do not gain
@@ -289,7 +290,8 @@ def identified(forced_logs: PreparedSplits) -> IdentifiedModels:
 def test_accelerations_are_those_of_the_models_rate_at_the_sample(
     forced_logs: PreparedSplits, identified: IdentifiedModels
 ) -> None:
-    log, model = forced_logs["test"][0], identified["ridge"].model.double()
+    log = forced_logs["test"][0]
+    model = identified["ridge"].model.double()
     # inputs move on within a step: else one rule could not be told from the other
     assert np.abs(log.w - log.rate_inputs).max() > 1.0
     at = int(np.flatnonzero(log.trainable)[50])

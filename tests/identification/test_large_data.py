@@ -56,7 +56,8 @@ def test_a_fit_from_disk_is_the_fit_from_memory(few: None, monkeypatch: pytest.M
             )
     other = WindowStore.from_logs(held["train"])
     for part in dataclasses.fields(store):
-        one, another = getattr(store, part.name), getattr(other, part.name)
+        one = getattr(store, part.name)
+        another = getattr(other, part.name)
         assert one is another is None or torch.equal(one, another)
 
 
@@ -129,7 +130,8 @@ def test_chosen_rows_of_many_lie_in_a_file(few: None, monkeypatch: pytest.Monkey
     placed = Mock(wraps=paged.allocate_on_disk)
     monkeypatch.setattr(paged, "allocate_on_disk", placed)
     values = torch.arange(3000.0, dtype=torch.float64).reshape(1000, 3)
-    many, some = torch.arange(1000) % 4 > 0, torch.arange(1000) < 100
+    many = torch.arange(1000) % 4 > 0
+    some = torch.arange(1000) < 100
     assert torch.equal(paged.take_rows(values, many), values[many])
     assert torch.equal(paged.take_rows(values[:, 0], many), values[many][:, 0])
     assert torch.equal(paged.take_rows(values, some), values[some])
@@ -140,7 +142,8 @@ def test_chosen_rows_of_many_lie_in_a_file(few: None, monkeypatch: pytest.Monkey
 def test_a_look_at_each_item_holds_the_pages_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
     def most(items: list[np.ndarray]) -> int:
         paged.release_pages()
-        before, found = pages(), []
+        before = pages()
+        found = []
         for item in items:
             assert item[::512].sum() == 0.0
             found.append(pages() - before)

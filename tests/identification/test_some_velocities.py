@@ -22,7 +22,8 @@ STEP = 0.2
 
 def trial(number: int, *channels: str) -> Log:
     """Return a boat's speed and yaw rate by first-order lags, with what drives them."""
-    random, t = np.random.default_rng(number), np.arange(0.0, 80.0, STEP)
+    random = np.random.default_rng(number)
+    t = np.arange(0.0, 80.0, STEP)
     n, delta = (random.uniform(low, 1.0, 17)[(t / 5.0).astype(int)] for low in (0.2, -1.0))
     u, r = np.zeros(t.size), np.zeros(t.size)
     for k in range(t.size - 1):
@@ -71,9 +72,11 @@ def test_a_fit_is_of_what_the_logs_tell(
 
 def dive(number: int, *channels: str) -> Log:
     """Return a vehicle that dives by planes and a propeller, and rights itself in pitch."""
-    random, t = np.random.default_rng(number), np.arange(0.0, 60.0, STEP)
+    random = np.random.default_rng(number)
+    t = np.arange(0.0, 60.0, STEP)
     hold = (t / 5.0).astype(int)
-    n, planes = random.uniform(8.0, 16.0, 21)[hold], random.uniform(-0.2, 0.2, 21)[hold]
+    n = random.uniform(8.0, 16.0, 21)[hold]
+    planes = random.uniform(-0.2, 0.2, 21)[hold]
     x = np.zeros((t.size, 5))
     x[0] = 1.2, 0.0, 0.0, 0.0, 20.0
     for k in range(t.size - 1):
@@ -106,8 +109,10 @@ def slowly(made: Callable[..., Log]) -> Callable[..., Log]:
 
 def sink(number: int, *channels: str) -> Log:
     """Return a float that a thrust moves down and up."""
-    random, t = np.random.default_rng(number), np.arange(0.0, 100.0, STEP)
-    thrust, w = random.uniform(-10.0, 10.0, 13)[(t / 8.0).astype(int)], np.zeros(t.size)
+    random = np.random.default_rng(number)
+    t = np.arange(0.0, 100.0, STEP)
+    thrust = random.uniform(-10.0, 10.0, 13)[(t / 8.0).astype(int)]
+    w = np.zeros(t.size)
     for k in range(t.size - 1):
         w[k + 1] = w[k] + STEP * (0.01 * thrust[k] - 0.4 * w[k] * abs(w[k]) - 0.05 * w[k])
     z = STEP * np.cumsum(w) + 0.002 * random.normal(size=t.size)
@@ -119,7 +124,8 @@ def test_a_boat_over_a_bottom_does_not_dive() -> None:
     """Its echo sounder and the pitch that waves and trim give do not follow from one another."""
     logs = []
     for number in range(3):
-        random, log = np.random.default_rng(number), trial(number, "u", "n")
+        random = np.random.default_rng(number)
+        log = trial(number, "u", "n")
         z = 12.0 + 0.02 * np.cumsum(random.normal(size=len(log)))
         theta = 0.03 * np.sin(2.0 * log.t) + 0.02 * log["u"]
         logs.append(log.replace(channels={**log.channels, "z": z, "theta": theta}))

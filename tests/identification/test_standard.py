@@ -113,7 +113,8 @@ def test_bands_of_short_logs_come_from_fits_without_some_of_them(
     found = fit_models(logs, settings(effort=0.01))
     banded = {name: entry.bands["T8"] for name, entry in found.items() if entry.bands}
     assert list(banded) == ["constant_velocity", "baseline", "hull", "ensemble"]
-    hull, mean = banded["hull"], banded["ensemble"]
+    hull = banded["hull"]
+    mean = banded["ensemble"]
     assert hull.n_logs == len(logs["train"]) + len(logs["validation"])
     np.testing.assert_array_equal(mean.half_width, hull.half_width)
     assert "hull" in mean.cautions[0]
@@ -211,7 +212,8 @@ def short(names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def test_a_yaw_rate_of_noise_alone_tells_no_memory() -> None:
-    random, t = np.random.default_rng(1), np.arange(0.0, 200.0, 0.1)
+    random = np.random.default_rng(1)
+    t = np.arange(0.0, 200.0, 0.1)
     straight = Log("straight", t, {"u": np.sin(0.1 * t), "r": random.normal(size=t.size)})
     assert PreparationPlan.from_logs([straight], []).correlation_time > 5.0
 
@@ -249,7 +251,8 @@ def test_a_mirror_symmetric_model_has_no_asymmetry(known: Samples) -> None:
         [[0.1, -0.5, 0.0, 2.0, 2.0], [0.0, 0.0, 0.3, 0.1, -0.1], [0.0, 0.0, -1.0, 0.4, -0.4]]
     ).double()
     baseline.theta.data.copy_(theta)
-    pull, flat = baseline.symmetry_precision(known), theta.flatten()
+    pull = baseline.symmetry_precision(known)
+    flat = theta.flatten()
     assert float(flat @ pull @ flat) == pytest.approx(0.0, abs=1e-9)
     flat[-1] = 0.4
     assert float(flat @ pull @ flat) > 0.0
@@ -275,7 +278,8 @@ def test_a_bounded_model_comes_back_from_anywhere(known: Samples) -> None:
     config = RegressorsConfig(terms=TERMS, bounded=True)
     baseline = config.build(known.names)
     config.fit_preferred(baseline, known)
-    low, high = known.z.amin(0), known.z.amax(0)
+    low = known.z.amin(0)
+    high = known.z.amax(0)
     far = known.z[:1].clone()
     far[:, :3] = (high + 20.0 * (high - low))[:3]
     assert bool((baseline(far) < 0).all())
@@ -284,7 +288,8 @@ def test_a_bounded_model_comes_back_from_anywhere(known: Samples) -> None:
     torch.testing.assert_close(baseline(known.z), inside(known.z))
 
     def at(beyond: float) -> torch.Tensor:
-        z, place = known.z[:1].clone(), known.names.index("left")
+        z = known.z[:1].clone()
+        place = known.names.index("left")
         z[:, place] = (high + beyond * (high - low))[place]
         return baseline(z)
 

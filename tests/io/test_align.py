@@ -46,7 +46,8 @@ def test_align_to_grid_is_exact_for_lines() -> None:
 
 
 def test_align_to_grid_averages_with_boxcar_gain_and_zero_phase() -> None:
-    t, inner = 0.01 * np.arange(20001), slice(2, -2)
+    t = 0.01 * np.arange(20001)
+    inner = slice(2, -2)
     for frequency in (0.2, 0.9, 2.0):
         out = gridded(t, 0.5, u=np.sin(2.0 * np.pi * frequency * t + 0.7))
         wave = np.sin(2.0 * np.pi * frequency * out.t[inner] + 0.7)

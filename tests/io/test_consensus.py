@@ -17,7 +17,8 @@ from residnet.tasks.fit.config import FitConfig
 from residnet.tasks.registry import load_task
 
 # fleets that no limit was chosen on
-_SEED, _COUNT = 11, 3
+_SEED = 11
+_COUNT = 3
 
 
 @pytest.fixture(scope="module", params=["boat", "twin"])
@@ -174,7 +175,8 @@ def test_find_consensus_with_surge_only_flags_a_weak_propeller() -> None:
 
 
 def test_rank_hypotheses_with_linked_rudders_names_both() -> None:
-    fleet, logs = drawn("boat", _SEED, _COUNT)[0], []
+    fleet = drawn("boat", _SEED, _COUNT)[0]
+    logs = []
     for number, log in enumerate(fleet.logs):
         rudders = dict.fromkeys(
             ("delta", "delta_stbd"), log["delta"] * (-1.0 if number == 2 else 1.0)
@@ -189,7 +191,8 @@ def test_rank_hypotheses_with_linked_rudders_names_both() -> None:
 @pytest.mark.parametrize("name", ["azimuth", "delta"])
 def test_is_only_extrapolating_with_new_inputs_gives_a_note(name: str) -> None:
     """A thruster turns round once where it had not; a rudder stalls at angles not held before."""
-    random, t = np.random.default_rng(4), np.arange(0.0, 240.0, 0.5)
+    random = np.random.default_rng(4)
+    t = np.arange(0.0, 240.0, 0.5)
     logs = []
     for number in range(8):
         angle = np.repeat(random.uniform(-0.35, 0.35, t.size // 20), 20)
@@ -199,7 +202,8 @@ def test_is_only_extrapolating_with_new_inputs_gives_a_note(name: str) -> None:
         lift = np.sin(angle) if name == "azimuth" else np.minimum(angle, 0.4)
         u, v, r = motion = np.zeros((3, t.size))
         for k in range(t.size - 1):
-            thrust, drag = 0.02 * n[k] ** 2, np.hypot(u[k], v[k])
+            thrust = 0.02 * n[k] ** 2
+            drag = np.hypot(u[k], v[k])
             u[k + 1] = u[k] + thrust * np.cos(angle[k]) - 0.1 * u[k] * drag
             v[k + 1] = v[k] + thrust * lift[k] - 0.2 * v[k] * drag
             r[k + 1] = 0.9 * r[k] - 0.3 * thrust * lift[k]
@@ -213,7 +217,8 @@ def test_is_only_extrapolating_with_new_inputs_gives_a_note(name: str) -> None:
 
 def test_find_dead_steering_in_gusts_reports_nothing(fleets: list[Fleet]) -> None:
     fleet = fleets[0]
-    random, logs = np.random.default_rng(5), []
+    random = np.random.default_rng(5)
+    logs = []
     for log in fleet.logs:
         # the heading is kept by hand within some degrees of the course
         gusts = np.convolve(random.normal(size=len(log) + 200), np.ones(201) / 201.0, "valid")

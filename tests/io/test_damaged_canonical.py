@@ -46,7 +46,8 @@ def written(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_changed_file_is_a_log_or_one_line(seed: int, tmp_path: Path) -> None:
-    draw, path = random.Random(seed), tmp_path / "boat.parquet"
+    draw = random.Random(seed)
+    path = tmp_path / "boat.parquet"
     refused: list[str] = []
     for number in range(60):
         about, columns = written(path)
@@ -80,7 +81,8 @@ def test_a_changed_file_is_a_log_or_one_line(seed: int, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("place", ["column", "manoeuvre"])
 def test_a_name_that_is_no_utf8_text_is_a_log_or_one_line(place: str, tmp_path: Path) -> None:
-    path, t = tmp_path / "boat.parquet", 0.1 * np.arange(80)
+    path = tmp_path / "boat.parquet"
+    t = 0.1 * np.arange(80)
     channels = {name: np.sin(t) for name in ("x", "y", "psi", "voltage")}
     Log("boat", t, channels, {"voltage": "V"}, "zigzag20").save(path)
     name = {"column": b"voltage", "manoeuvre": b"zigzag20"}[place]

@@ -31,7 +31,8 @@ CASES: list[tuple[str, Callable[[Log, Path], Path]]] = [
 
 def damaged(whole: bytes, rng: np.random.Generator) -> bytes:
     """Bits flipped, a stretch zeroed, cut, repeated, noise put in, or lines shuffled."""
-    at, size = int(rng.integers(len(whole))), int(rng.integers(1, 400))
+    at = int(rng.integers(len(whole)))
+    size = int(rng.integers(1, 400))
     flipped = bytearray(whole)
     for i in rng.integers(len(whole), size=int(rng.choice([1, 5, 50]))):
         flipped[i] ^= 1 << int(rng.integers(8))

@@ -137,7 +137,9 @@ def test_another_parquet_gives_the_samples_as_written_or_one_clear_line(
 
 
 def test_damaged_parquet_gives_the_samples_as_written_or_one_clear_line(folder: Path) -> None:
-    table, path, rng = pa.Table.from_pandas(TABLE), folder / "table.parquet", random.Random(1)
+    table = pa.Table.from_pandas(TABLE)
+    path = folder / "table.parquet"
+    rng = random.Random(1)
     pq.write_table(table, path, write_page_checksum=True)
     whole = path.read_bytes()
     for damage in BYTE_DAMAGES * 12:

@@ -269,7 +269,8 @@ def test_inspect_log_refuses_unusable_logs(log: Log, inputs: Any, error: type, w
 def test_inspect_log_includes_remarks_and_downgrades_masked_samples() -> None:
     noted = {"level": "will mislead", "code": "latency", "text": "late", "figures": {"s": 0.9}}
     sick = changed(**held("x", "y")).replace(meta={"findings": [noted]})
-    plain, masked = inspect_log(sick), inspect_log(sick, masks=[FrozenMask()])
+    plain = inspect_log(sick)
+    masked = inspect_log(sick, masks=[FrozenMask()])
     assert one(plain, "latency").figures == {"s": 0.9}
     assert [one(report, "frozen").level for report in (plain, masked)] == ["will mislead", "note"]
     assert one(masked, "latency").level == "will mislead"
@@ -307,7 +308,8 @@ def test_finding_effects_measure_the_change_of_a_fit() -> None:
 def answering(delta: np.ndarray, late: float, gain: float = 0.3, time: float = 1.2) -> Log:
     """A first-order answer in yaw to a rudder [T] that was given `late` s before."""
     t = 0.1 * np.arange(delta.size)
-    acting, r = np.interp(t - late, t, delta), np.zeros(delta.size)
+    acting = np.interp(t - late, t, delta)
+    r = np.zeros(delta.size)
     for k in range(delta.size - 1):
         r[k + 1] = r[k] + 0.1 / time * (gain * acting[k] - r[k])
     noise = np.random.default_rng(5).normal(0.0, 2e-4, (2, delta.size))
@@ -371,7 +373,8 @@ def test_estimate_delay_of_a_periodic_manoeuvre_is_causal(period: float, late: f
 
 def twin(port: float, stbd: float, yaw: float, speed: float) -> Log:
     """A vessel with two propellers and no rudder at steady revolutions."""
-    noise, size = np.random.default_rng(0), 600
+    noise = np.random.default_rng(0)
+    size = 600
     u, r = speed + 0.01 * noise.normal(size=size), yaw + 0.002 * noise.normal(size=size)
     turns = {"n_port": np.full(size, port), "n_stbd": np.full(size, stbd)}
     return Log("twin", 0.1 * np.arange(size), {"u": u, "r": r, **turns})
@@ -412,7 +415,8 @@ def test_estimate_causes_of_pure_noise_finds_no_gain() -> None:
 
 
 def test_check_course_as_heading_ignores_noise_of_v() -> None:
-    random, t = np.random.default_rng(1), 0.1 * np.arange(400)
+    random = np.random.default_rng(1)
+    t = 0.1 * np.arange(400)
     noise = {"u": 0.005, "v": 0.005, "r": 0.002, "psi": 0.003}
     moving = {"x": 0.05 * t, "y": 0.0 * t, "u": 0.05 + 0.0 * t, "delta": np.sin(t)}
     told = {name: moving.get(name, 0.0 * t) for name in ("x", "y", "psi", "u", "v", "r", "delta")}
@@ -461,7 +465,8 @@ def test_find_clock_rate_errors_compares_time_with_dates(tmp_path: Path, *, epoc
 
 
 NOISY = changed(**{n: v + 1e-3 * RANDOM.standard_normal(2000) for n, v in LOG.channels.items()})
-WHOLE, PART = rows(NOISY, slice(None), "whole"), rows(NOISY, slice(700, 1200))
+WHOLE = rows(NOISY, slice(None), "whole")
+PART = rows(NOISY, slice(700, 1200))
 FIRST, SECOND = (
     rows(NOISY, part, name, 50.0)
     for name, part in (("first", slice(900)), ("second", slice(900, 2000)))
@@ -529,7 +534,9 @@ def test_summarize_inspection_counts_and_ranks_findings() -> None:
 def test_check_rudder_sign_uses_samples_with_known_speed(*, slow: float) -> None:
     """Where a speed fails the last one known is none: the rudder may seem to be reversed."""
     t = np.arange(0.0, 180.0, 0.2)
-    u, delta, r = np.where(t < 90.0, slow, 2.0), 0.2 * np.sign(np.sin(0.3 * t)), np.zeros(t.size)
+    u = np.where(t < 90.0, slow, 2.0)
+    delta = 0.2 * np.sign(np.sin(0.3 * t))
+    r = np.zeros(t.size)
     for k in range(t.size - 1):
         turn = 0.18 * u[k] ** 2 * delta[k] - 0.8 * u[k] * r[k] - 0.9 * r[k] * abs(r[k])
         r[k + 1] = r[k] + 0.2 * turn

@@ -68,7 +68,8 @@ def logs(ship_logs: list[Log]) -> list[Log]:
 
 @pytest.mark.parametrize("style", STYLES.values(), ids=STYLES.keys())
 def test_a_table_is_read_as_it_was(style: Style, logs: list[Log], tmp_path: Path) -> None:
-    files, marks = foreign_tables.write(logs, tmp_path, style), DraftNotes()
+    files = foreign_tables.write(logs, tmp_path, style)
+    marks = DraftNotes()
     content, _ = draft_tables(files, marks)
     reader = validate_config(content, ReaderConfig, "here").build()
     for file, log in zip(files, logs, strict=True):
@@ -273,7 +274,8 @@ def test_volts_are_no_sway_and_per_cents_neither_force_nor_revolutions(
     logs: list[Log], tmp_path: Path, volts: str, thrusters: tuple[str, str]
 ) -> None:
     """By the name where it says so, else by what position and heading tell."""
-    log, file = logs[0], tmp_path / "log.csv"
+    log = logs[0]
+    file = tmp_path / "log.csv"
     columns = {
         "t": log.t,
         "North [m]": log["x"],

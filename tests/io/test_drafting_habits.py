@@ -23,7 +23,8 @@ from residnet.io.drafting.tables import draft_tables
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 
 # radii of curvature of WGS 84 at 54.3 deg north, in m per degree
-MERIDIAN, PARALLEL = 111_302.6, 65_100.6
+MERIDIAN = 111_302.6
+PARALLEL = 65_100.6
 DEGREE = math.degrees(1.0)
 
 
@@ -37,9 +38,12 @@ def seen() -> pd.DataFrame:
     s["lat"], s["lon"], s["hdg"] = 54.3 + s.x / MERIDIAN, 10.15 + s.y / PARALLEL, s.psi * DEGREE
     s["hdg"], s["rudder"], s["rpm"] = s.hdg % 360.0, s.delta * DEGREE, 60.0 * s.n
     s["phi"], s["p"] = 0.1 * np.sin(s.t), 0.1 * np.cos(s.t)
-    s["cos"], s["sin"], ground = np.cos(s.psi), np.sin(s.psi), np.exp(1j * s.psi) * (s.u + 1j * s.v)
+    s["cos"] = np.cos(s.psi)
+    s["sin"] = np.sin(s.psi)
+    ground = np.exp(1j * s.psi) * (s.u + 1j * s.v)
     s["vn"], s["ve"] = ground.to_numpy().real, ground.to_numpy().imag
-    south, west = 108.6 - s.lat, 20.3 - s.lon
+    south = 108.6 - s.lat
+    west = 20.3 - s.lon
     for name, angle, side in (
         *(("lat_N", s.lat, "N"), ("lat_S", south, "S"), ("lon_O", s.lon, "O")),
         *(("lon_", s.lon, ""), ("lon_W", west, "W"), ("lon_O_west", west, "O")),
@@ -51,7 +55,8 @@ def seen() -> pd.DataFrame:
     s["wind_speed"], s["wind_dir"] = 6.0 + np.sin(0.3 * s.t), 1.0 + 0.05 * np.cos(0.2 * s.t)
     felt = (s.wind_speed * np.exp(1j * (s.wind_dir - s.psi)) + s.u + 1j * s.v).to_numpy()
     # attitudes with some roll, clockwise from north and anticlockwise from east, of either sign
-    sign, lean = np.where(np.sin(s.t) < 0, -1.0, 1.0), np.cos(0.05 * s.t) / 40.0
+    sign = np.where(np.sin(s.t) < 0, -1.0, 1.0)
+    lean = np.cos(0.05 * s.t) / 40.0
     for frame, yaw in (("ned", s.psi), ("enu", math.pi / 2 - s.psi)):
         turn = Rotation.from_euler("ZX", np.stack([yaw, lean], axis=1)).as_quat()
         for part, values in zip("xyzw", turn.T, strict=True):
@@ -324,7 +329,8 @@ def test_documents_of_json(seen: pd.DataFrame, tmp_path: Path) -> None:
 def test_a_wind_from_the_bow_by_cosine_and_sine_becomes_the_true_wind(
     seen: pd.DataFrame, tmp_path: Path, side: float, pose: bool
 ) -> None:
-    s, angle = seen, side * (seen.wind_dir - seen.psi)
+    s = seen
+    angle = side * (seen.wind_dir - seen.psi)
     columns = {"time": s.t, "u": s.u, "v": s.v, "r": s.r} | ({"psi": s.psi} if pose else {})
     columns |= {"Vw": s.wind_speed, "alpha_x": np.cos(angle), "alpha_y": np.sin(angle)}
     columns |= {"deltal": s.delta, "deltar": 0.9 * s.delta, "n": s.n}
@@ -365,7 +371,8 @@ def test_a_folder_of_messages_whose_values_come_in_turns(
 ) -> None:
     clock = "timestamp (seconds since 01/01/1970)"
     for number in range(2):
-        folder, t = tmp_path / f"20250614_10{number}005_auv", 1.75e9 + 900.0 * number + seen.t
+        folder = tmp_path / f"20250614_10{number}005_auv"
+        t = 1.75e9 + 900.0 * number + seen.t
         folder.mkdir()
         wrapped = (seen.psi + np.pi) % (2.0 * np.pi) - np.pi
         state = {clock: t, " system": "auv", " entity": "Navigation"}
@@ -384,7 +391,8 @@ def test_a_folder_of_messages_whose_values_come_in_turns(
         pd.DataFrame({clock: t, " value (V)": 25.0}).to_csv(folder / "Voltage.csv")
     logs = residnet.read_logs(tmp_path)
     assert len(logs) == 2
-    log, inner = logs[0], slice(20, -20)
+    log = logs[0]
+    inner = slice(20, -20)
     assert log.units["servo_1"] == log.units["servo_2"] == "rad"
     # what the folder that holds them is called says nothing of its messages
     (alone,) = residnet.read_logs(shutil.copytree(folder, tmp_path / "one" / folder.name).parent)
@@ -423,14 +431,17 @@ def test_logs_with_other_columns_beside_each_other_are_no_messages(
 
 @pytest.mark.parametrize("side", [1.0, -1.0], ids=["dives", "rises"])
 def test_planes_are_told_by_the_pitch_that_they_hold(tmp_path: Path, side: float) -> None:
-    random, t = np.random.default_rng(3), np.arange(0.0, 120.0, 0.1)
+    random = np.random.default_rng(3)
+    t = np.arange(0.0, 120.0, 0.1)
     planes = random.uniform(-0.2, 0.2, 31)[(t / 4.0).astype(int)]
-    theta, q = np.zeros(t.size), np.zeros(t.size)
+    theta = np.zeros(t.size)
+    q = np.zeros(t.size)
     for k in range(t.size - 1):
         # the pitch rate is gone by the end of most holds, the pitch is not
         turn = -1.5 * q[k] - 0.9 * np.sin(theta[k]) - 0.5 * planes[k]
         theta[k + 1], q[k + 1] = theta[k] + 0.1 * q[k], q[k] + 0.1 * turn
-    u, heave = 1.5 + 0.1 * np.sin(0.2 * t), -0.2 * q
+    u = 1.5 + 0.1 * np.sin(0.2 * t)
+    heave = -0.2 * q
     frame = pd.DataFrame(
         {
             "Zeit [s]": t,

@@ -16,7 +16,8 @@ from residnet.io.readers.tables import CsvConfig
 
 pytest.importorskip("pyproj")
 T = np.arange(0.0, 60.0, 0.2)
-NORTH, EAST = 30.0 * np.sin(0.05 * T), 2.0 * T
+NORTH = 30.0 * np.sin(0.05 * T)
+EAST = 2.0 * T
 # radii of curvature of WGS 84 at 54.3 deg north, in m per degree
 FIXES = pd.DataFrame({"t": T, "lat": 54.3 + NORTH / 111_302.6, "lon": 10.1 + EAST / 65_100.6})
 
@@ -29,7 +30,8 @@ def read(file: Path) -> Log:
 
 
 def test_fixes_become_metres_north_and_east_of_the_first(tmp_path: Path) -> None:
-    made, file = FIXES.copy(), tmp_path / "log.csv"
+    made = FIXES.copy()
+    file = tmp_path / "log.csv"
     made.loc[20, ["lat", "lon"]] = 0.0
     made.to_csv(file, index=False)
     log = read(file)

@@ -147,7 +147,8 @@ def test_a_shift_that_is_given_and_what_is_wrong(tmp_path: Path) -> None:
     pd.DataFrame({"t": t, "x": t, "y": -t}).to_csv(tmp_path / "pos1.csv", index=False)
     pd.DataFrame({"t": t + 7.0, "k": t**2}).to_csv(tmp_path / "cmd1.csv", index=False)
     reader = validate_config(reader_of(shift={"cmd": -7.0}), ReaderConfig, "here").build()
-    read, both = reader.read(tmp_path / "pos1.csv"), [tmp_path / "pos1.csv", tmp_path / "cmd1.csv"]
+    read = reader.read(tmp_path / "pos1.csv")
+    both = [tmp_path / "pos1.csv", tmp_path / "cmd1.csv"]
     np.testing.assert_array_equal(read["k"], t**2)
     assert reader.list_member_files(both[0]) == both
     assert read.meta["parts"] == {"pos": hash_files(both[:1]), "cmd": hash_files(both[1:])}

@@ -101,8 +101,10 @@ def hampel_by_loop(values: np.ndarray, sigmas: float, samples: int) -> np.ndarra
     """The rule of the Hampel mask, sample by sample, for finite values; odd reflection beyond the
     ends.
     """
-    half, size = samples // 2, values.size
-    left, right = values[2 * half : 0 : -1], values[-2 : -2 * half - 2 : -1]
+    half = samples // 2
+    size = values.size
+    left = values[2 * half : 0 : -1]
+    right = values[-2 : -2 * half - 2 : -1]
     wide = np.concatenate((2 * values[0] - left, values, 2 * values[-1] - right))
     bent = [
         wide[i] - np.median([(wide[i - k] + wide[i + k]) / 2 for k in range(1, 2 * half + 1)])

@@ -76,7 +76,9 @@ def test_the_copied_file_is_caught_and_the_published_split_passes(
 
 @pytest.mark.long
 def test_the_doctor_finds_the_known_illnesses(logs: dict[str, list[Log]]) -> None:
-    lags, gyro, freezes = [], {}, []
+    lags = []
+    gyro = {}
+    freezes = []
     for log in [log for part in logs.values() for log in part]:
         report = inspect_log(log)
         assert not any(finding.level == "fatal" for finding in report.findings), report.to_lines()

@@ -34,7 +34,9 @@ def measured(
 ) -> Log:
     """The log of a receiver and a compass, and of the rate sensors in `kept`."""
     random = np.random.default_rng(1)
-    c, s, size = np.cos(TRUTH["psi"]), np.sin(TRUTH["psi"]), len(TRUTH)
+    c = np.cos(TRUTH["psi"])
+    s = np.sin(TRUTH["psi"])
+    size = len(TRUTH)
     x = TRUTH["x"] + c * antenna[0] - s * antenna[1]
     y = TRUTH["y"] + s * antenna[0] + c * antenna[1]
     channels = {

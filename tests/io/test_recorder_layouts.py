@@ -28,7 +28,8 @@ from residnet.tasks.drafting import choose_inputs
 
 T = np.arange(0.0, 60.0, 0.2)
 PSI = 0.4 * np.sin(0.2 * T)
-NORTH, EAST = np.cumsum(0.4 * np.cos(PSI)), np.cumsum(0.4 * np.sin(PSI))
+NORTH = np.cumsum(0.4 * np.cos(PSI))
+EAST = np.cumsum(0.4 * np.sin(PSI))
 RUDDER = np.radians(20.0) * np.sign(np.cos(0.2 * T))
 TRUTH = {"x": NORTH, "psi": PSI, "delta": RUDDER, "n": (600.0 + T) / 60.0}
 COLUMNS = {
@@ -58,7 +59,8 @@ def with_units(names: tuple[str, ...]) -> list[str]:
     return [line.replace(".", ",") for line in lines]
 
 
-LINES, GERMAN = text(COLUMNS, ";", UNITS), with_units(("Zähler in Sekunden", *[*COLUMNS][1:]))
+LINES = text(COLUMNS, ";", UNITS)
+GERMAN = with_units(("Zähler in Sekunden", *[*COLUMNS][1:]))
 NOTE = "{} wind rises, sea 2; 300 rows, by JS"
 WRITTEN: dict[str, bytes] = {
     **{
@@ -151,7 +153,8 @@ def test_recordings_that_a_shell_of_windows_wrote(tmp_path: Path) -> None:
 
 
 def test_a_line_is_called_by_its_number_in_the_file(tmp_path: Path) -> None:
-    path, lines = tmp_path / "log.csv", ["recorder", "", *LINES]
+    path = tmp_path / "log.csv"
+    lines = ["recorder", "", *LINES]
     path.write_text("\n".join([*lines, ""]))
     _, content, _ = drafted(path)
     cells = lines[30].split(";")
@@ -251,7 +254,8 @@ def test_a_second_compass_is_no_input() -> None:
 
 def test_a_name_that_stands_twice(tmp_path: Path) -> None:
     """The first is taken, and said to be; either can be told by its number."""
-    path, lines = tmp_path / "log.csv", text(COLUMNS)
+    path = tmp_path / "log.csv"
+    lines = text(COLUMNS)
     path.write_text("\n".join([lines[0].replace("Ost", "Kurs"), *lines[1:]]))
     _, content, marks = drafted(path)
     assert any("more than once" in said for _, said in marks.guessed_values)

@@ -139,7 +139,8 @@ def test_order_of_rows() -> None:
     swapped = t.copy()
     swapped[[50, 51]] = swapped[[51, 50]]
     restarted = np.concatenate((t[:200], t[:100]))
-    doubled, values = np.repeat(t, 2), np.repeat(np.sin(t), 2)
+    doubled = np.repeat(t, 2)
+    values = np.repeat(np.sin(t), 2)
     shared = values + np.tile([0.0, 1.0], t.size)
     made = recording(
         topic("late", t, swapped),

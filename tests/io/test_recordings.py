@@ -59,7 +59,8 @@ def test_commands_hold_measurements_are_interpolated_gaps_stay_gaps(tmp_path: Pa
 T = 0.05 * np.arange(2400)
 PSI = 0.1 * T
 # a vessel on a circle of 20 m, bow along the track: u = 2 m/s, v = 0, r = 0.1 rad/s
-NORTH, EAST = 20.0 * np.sin(PSI), -20.0 * np.cos(PSI)
+NORTH = 20.0 * np.sin(PSI)
+EAST = -20.0 * np.cos(PSI)
 # an antenna 3 m ahead and 1 m to port
 ANTENNA = {"x": "3 m", "y": "-1 m"}
 
@@ -81,7 +82,8 @@ def test_lever_and_derived_velocities(tmp_path: Path) -> None:
     local = {"kind": "local", "topic": "fix", "north": "n", "east": "e", "antenna": ANTENNA}
     heading = {"kind": "quaternion", "topic": "heading", "field": "q", "frame": "ned"}
     config: dict[str, Any] = {"position": local, "heading": heading}
-    clock, window = {"kind": "uniform", "step": "0.1 s"}, {"kind": "derived", "window": "1 s"}
+    clock = {"kind": "uniform", "step": "0.1 s"}
+    window = {"kind": "derived", "window": "1 s"}
     derived = read(place, **config, velocity=window, clock=clock)
     assert len(derived) == 1200
     truth = {"u": 2.0, "v": 0.0, "r": 0.1, "x": NORTH[::2], "y": EAST[::2], "psi": PSI[::2]}
@@ -98,7 +100,8 @@ def test_velocity_of_an_antenna_in_earth_axes(kind: str, tmp_path: Path) -> None
     # u = 2, v = 0.3 at the centre
     u, v = 2.0 - 0.1 * -1.0, 0.3 + 0.1 * 3.0
     ground = (u + 1j * v) * np.exp(1j * PSI)
-    knots, course = np.abs(ground) * 3600 / 1852, np.degrees(np.angle(ground)) % 360
+    knots = np.abs(ground) * 3600 / 1852
+    course = np.degrees(np.angle(ground)) % 360
     fixes = {"n": ground.real, "e": ground.imag, "speed": knots, "course": course}
     place = folder(
         tmp_path,

@@ -27,7 +27,8 @@ from residnet.io.readers import ReaderConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.preprocessing.prepare import PrepareConfig, make_samples, prepare_log
 
-EXACT, WINDOW = 1e-9, 8
+EXACT = 1e-9
+WINDOW = 8
 # a failing case is one of few, and small already
 GENERATED = (Phase.explicit, Phase.generate)
 drawn = settings(max_examples=6, deadline=None, derandomize=True, phases=GENERATED)
@@ -133,7 +134,8 @@ def test_inspection_and_fit_are_invariant_to_equivalent_logs(
 def test_fit_of_a_split_log_equals_that_of_the_log(vessel: tuple[str, int], share: float) -> None:
     """Within half a window of an end, the derivative is that of the last whole window."""
     log = logs_of(vessel)[1]
-    inputs, at = inputs_of(log), round(share * len(log))
+    inputs = inputs_of(log)
+    at = round(share * len(log))
     whole = prepared([log], inputs)
     parts = prepared([log.select_rows(slice(0, at)), log.select_rows(slice(at, None))], inputs)
     assert len(parts.z) == len(whole.z) == len(log)
@@ -149,7 +151,8 @@ def test_readers_are_invariant_to_units_and_column_order(
     vessel: tuple[str, int], data: st.DataObject
 ) -> None:
     log = logs_of(vessel)[2]
-    table, channels = {"t": log.t - log.t[0]}, {}
+    table = {"t": log.t - log.t[0]}
+    channels = {}
     for name in data.draw(st.permutations([*log.channels])):
         alike = [unit for unit in unit_names() if si_unit(unit) == log.units[name]]
         unit = data.draw(st.sampled_from(alike))
@@ -172,7 +175,8 @@ def sailed(rows: int, helm: float) -> Log:
     """A boat that weaves at 10 Hz, its rate late by .6 s, with a jump and spikes in it; with a mean
     rudder angle `helm` in rad it turns round many times.
     """
-    random, t = np.random.default_rng(3), 0.1 * np.arange(rows)
+    random = np.random.default_rng(3)
+    t = 0.1 * np.arange(rows)
     delta = helm + 0.3 * np.sign(np.sin(0.11 * t) + 0.4 * np.sin(0.041 * t))
     r, u = np.zeros(rows), 4.0 + 0.5 * np.sin(0.013 * t)
     for k in range(rows - 1):
@@ -233,7 +237,8 @@ def test_finding_effects_of_a_repair_use_the_subsample(
     def repair(log: Log) -> Log:
         return log.replace(channels={**log.channels, "psi": log["psi"] - off})
 
-    finding, found = Finding("will mislead", "heading", "", repair=repair), []
+    finding = Finding("will mislead", "heading", "", repair=repair)
+    found = []
     for longest in (12_000, 30_000):
         monkeypatch.setattr(statistics, "_MAX_SUBSAMPLE", longest)
         effects = FindingEffects(statistics.LogStatistics(log, ["delta"]))

@@ -110,7 +110,9 @@ def test_currents_by_speed_and_direction_and_of_each_trial() -> None:
 
 
 def test_gusts_have_the_stated_spread_memory_and_spectrum() -> None:
-    step, time, lag = 0.5, 6.0, 12
+    step = 0.5
+    time = 6.0
+    lag = 12
     process = sample_ornstein_uhlenbeck(np.random.default_rng(0), (200, 2048, 1), step, time)[
         :, :, 0
     ]
@@ -167,7 +169,8 @@ def test_dead_time_needs_the_plants_own_step(tmp_path: Path) -> None:
 
 def test_white_noise_is_drawn_as_it_always_was() -> None:
     """After the forces of the same generator, three values per sample; nothing else moves."""
-    quiet, noisy = logs(seed=5), logs({"u": 0.1, "v": 0.2, "r": 0.05}, seed=5)
+    quiet = logs(seed=5)
+    noisy = logs({"u": 0.1, "v": 0.2, "r": 0.05}, seed=5)
     random = np.random.default_rng([5, 3])
     random.standard_normal((len(quiet), 200, 3))
     noise = random.standard_normal((len(quiet), 200, 3)) * [0.1, 0.2, 0.05]
@@ -184,7 +187,8 @@ def test_bias_noise_sampling_and_latency_of_single_channels() -> None:
         "y": {"latency": "250 ms"},
         "r": {"latency": "300 ms"},
     }
-    truth, seen = logs(), logs(CLEAN | {"sensors": sensors})
+    truth = logs()
+    seen = logs(CLEAN | {"sensors": sensors})
     errors = [np.degrees(b["psi"] - a["psi"]) for a, b in zip(truth, seen, strict=True)]
     assert np.std(errors) == pytest.approx(2.0, rel=0.1)
     assert np.mean(errors) == pytest.approx(-1.0, abs=0.3)
@@ -235,7 +239,8 @@ def test_what_cannot_be_is_one_line(
 
 def ship(disturbance: DisturbanceConfig) -> tuple[SimulatedVessel, TrialEnvironment]:
     plant = load_vessel("wam_v_cal").build()
-    dynamics, helm = PlantDynamics(plant, STEP, 1), Helm.from_plant(plant)
+    dynamics = PlantDynamics(plant, STEP, 1)
+    helm = Helm.from_plant(plant)
     craft = SimulatedVessel(
         "wam_v_cal", dynamics, helm, plant.n_commands, plant.make_initial_state(1)
     )

@@ -202,7 +202,8 @@ def copied(log: Log, start: int, stop: int, turns: int = 0) -> Log:
 
 
 def other(seed: int = 0) -> Log:
-    rng, names = np.random.default_rng(seed), ("x", "y", "psi", "u", "v", "r", "delta", "n")
+    rng = np.random.default_rng(seed)
+    names = ("x", "y", "psi", "u", "v", "r", "delta", "n")
     channels = {name: rng.normal(size=2000) for name in names}
     return Log(f"other{seed}", 0.1 * np.arange(2000), channels)
 

@@ -101,7 +101,9 @@ def test_from_logs_counts_remaining_and_elapsed_samples() -> None:
 
 
 def test_take_history_repeats_the_first_sample_of_a_short_segment() -> None:
-    starts, length, padded = STORE.find_starts(3), 6, 0
+    starts = STORE.find_starts(3)
+    length = 6
+    padded = 0
     y, w = STORE.take_history(starts, length)
     for i, row in enumerate(starts.tolist()):
         number, k = ROWS[row]

@@ -56,7 +56,9 @@ class Nomoto(Dynamics):
         self, gain: float = 0.4, time: float = 3.0, offset: float = 0.0, dt: float = 0.1
     ) -> None:
         super().__init__(dt, "euler")
-        self.gain, self.time, self.offset = gain, time, offset
+        self.gain = gain
+        self.time = time
+        self.offset = offset
         self.steps = 0
 
     def state_derivative(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
@@ -64,7 +66,8 @@ class Nomoto(Dynamics):
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         self.steps += 1
-        final, keep = self.gain * (w[:, 0] - self.offset), math.exp(-self.dt / self.time)
+        final = self.gain * (w[:, 0] - self.offset)
+        keep = math.exp(-self.dt / self.time)
         r = final + (x[:, 5] - final) * keep
         psi = x[:, 2] + final * self.dt + (x[:, 5] - final) * self.time * (1 - keep)
         out = x.clone()
@@ -229,14 +232,16 @@ def test_four_corner_course_of_the_ferry(vessel: str) -> None:
     began.
     """
     plant: Any = load_vessel(vessel).build()
-    mass, omega = plant.hull.mass.diagonal(), torch.tensor([0.26, 0.26, 0.4], dtype=torch.float64)
+    mass = plant.hull.mass.diagonal()
+    omega = torch.tensor([0.26, 0.26, 0.4], dtype=torch.float64)
     proportional, integral, derivative = (
         tuple(part.tolist()) for part in (mass * omega**2, 0.1 * mass * omega**3, 2 * mass * omega)
     )
     control = MotionPIDConfig(proportional=proportional, integral=integral, derivative=derivative)
     course = FourCorner(control=control)
     assert course.duration_within(10.0) == 720.0
-    model, helm = RecordedPlantDynamics(plant, 0.2, 2), Helm.from_plant(plant)
+    model = RecordedPlantDynamics(plant, 0.2, 2)
+    helm = Helm.from_plant(plant)
     craft = SimulatedVessel(vessel, model, helm, plant.n_commands, plant.make_initial_state(1))
     (flight,) = simulate_manoeuvres(
         craft, [course], TrialEnvironment(plant, DisturbanceConfig(), SensorsConfig(), 0), 10.0, 0.2

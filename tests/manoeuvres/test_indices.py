@@ -27,7 +27,8 @@ from residnet.manoeuvres.indices import (
     zigzag_indices,
 )
 
-DEG, HALF = math.pi / 180, math.pi / 2
+DEG = math.pi / 180
+HALF = math.pi / 2
 
 
 def motion(
@@ -35,7 +36,8 @@ def motion(
 ) -> Log:
     """A log whose track is the fine quadrature of its velocities."""
     v = np.broadcast_to(v, t.shape).copy()
-    north, east = u * np.cos(psi) - v * np.sin(psi), u * np.sin(psi) + v * np.cos(psi)
+    north = u * np.cos(psi) - v * np.sin(psi)
+    east = u * np.sin(psi) + v * np.cos(psi)
     x, y = (cumulative_trapezoid(rate, t, initial=0) for rate in (north, east))
     return Log("made", t, {"x": x, "y": y, "psi": psi, "u": u, "v": v, "r": r})
 
@@ -51,7 +53,10 @@ def test_circle(side: float, psi0: float) -> None:
     """Straight on at 2 m/s, then at once a circle of 1.5 m/s with 5 deg of drift: all in closed
     form.
     """
-    speed, rate, drift, start = 1.5, side * 0.06, 5 * DEG, 20.5
+    speed = 1.5
+    rate = side * 0.06
+    drift = 5 * DEG
+    start = 20.5
     t = np.arange(0.0, 240.0, 0.001)
     turning_now = t > start
     psi = psi0 + np.where(turning_now, rate * (t - start), 0.0)
@@ -88,7 +93,10 @@ def test_circle(side: float, psi0: float) -> None:
 def test_sinusoidal_heading(side: float) -> None:
     """psi = a sin(w t), sampled coarsely: every crossing and peak lies between samples."""
     cycle = 29.4
-    a, w, bound, psi0 = 0.37, 2 * math.pi / cycle, 0.2, -1.0
+    a = 0.37
+    w = 2 * math.pi / cycle
+    bound = 0.2
+    psi0 = -1.0
     t = np.arange(0.0, 130.0, 0.001)
     psi, r = psi0 + side * a * np.sin(w * t), side * a * w * np.cos(w * t)
     # a whole cycle comes before it is steered
@@ -192,10 +200,8 @@ def test_empty_samples_are_left_out() -> None:
     holes = log.replace(
         channels=log.channels | {"x": np.where(np.arange(t.size) % 5 == 0, log["x"], np.nan)}
     )
-    whole, few = (
-        zigzag_indices(log, 0.0, 1.0, 0.2, None),
-        zigzag_indices(holes, 0.0, 1.0, 0.2, None),
-    )
+    whole = zigzag_indices(log, 0.0, 1.0, 0.2, None)
+    few = zigzag_indices(holes, 0.0, 1.0, 0.2, None)
     assert few["period"] == pytest.approx(whole["period"], abs=1e-4)
     with pytest.raises(DataError, match="indices need"):
         SmoothTrack(log.replace(channels=log.channels | {"r": np.full(t.size, np.nan)}))
@@ -205,9 +211,13 @@ def steered(angle: float, heading: float, side: float, offset: float = 0.0) -> L
     """Nomoto's ship (K = .15, T = 8 s) steered in a zigzag (deg) from 4 s on, its rudder resting at
     `offset` before and turning about it by 15 deg/s.
     """
-    step, speed = 0.1, 15.0 * DEG
+    step = 0.1
+    speed = 15.0 * DEG
     t = np.arange(0, 120.0, step)
-    psi, r, delta, towards = 0.0, 0.0, offset * DEG, side
+    psi = 0.0
+    r = 0.0
+    delta = offset * DEG
+    towards = side
     out = np.zeros((t.size, 2))
     for k, now in enumerate(t):
         out[k] = psi, delta
@@ -245,7 +255,8 @@ def test_where_the_rudder_left_does_not_hang_on_the_grid(every: int) -> None:
     the first beyond the heading.
     """
     log = steered(20, 10, 1.0)
-    psi, size = log["psi"] - log["psi"][0], np.abs(log["delta"])
+    psi = log["psi"] - log["psi"][0]
+    size = np.abs(log["delta"])
     left = np.isclose(size[:-1], 20 * DEG) & (np.diff(size) < -1e-6)
     turns = np.flatnonzero(left & (np.arange(len(log) - 1) >= 60))
     assert len(turns) > 2

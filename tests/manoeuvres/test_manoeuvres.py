@@ -32,8 +32,10 @@ from residnet.manoeuvres.trials import SimulatedTrials
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 
-FAMILIES, MANOEUVRES = load_kinds(FamilyConfig), load_kinds(ManoeuvreConfig)
-DURATION, DT = 15.0, 0.1
+FAMILIES = load_kinds(FamilyConfig)
+MANOEUVRES = load_kinds(ManoeuvreConfig)
+DURATION = 15.0
+DT = 0.1
 # what a family cannot do without; one whose fields have defaults beyond these needs no line here
 NEEDS: dict[str, Any] = {
     "count": 5,
@@ -121,7 +123,9 @@ def test_kinds_side_by_side_equal_each_alone_within_bounds_and_with_indices(
 ) -> None:
     """Every kind reads its indices off its own flight: finite numbers with a unit."""
     groups = [pair(kind, tmp_path) for kind in FLOWN]
-    t, helm, model = times(), Helm.from_plant(plant), RecordedPlantDynamics(plant, DT)
+    t = times()
+    helm = Helm.from_plant(plant)
+    model = RecordedPlantDynamics(plant, DT)
     source = StackedSource([type(g[0]).build_source(g, helm, t) for g in groups], [2] * len(groups))
     zero = torch.zeros(2 * len(groups), dtype=torch.float64)
     states, inputs = fly(model, source, len(t), zero)
@@ -152,14 +156,16 @@ def test_zigzag_switches_at_its_bound(plant: Plant) -> None:
     zigzags = [
         Zigzag(drive=0.5, steer=0.4, start=4.0, heading=bound, first=first) for first, _ in cases
     ]
-    time, begun = times(40.0), torch.tensor([psi for _, psi in cases], dtype=torch.float64)
+    time = times(40.0)
+    begun = torch.tensor([psi for _, psi in cases], dtype=torch.float64)
     source = Zigzag.build_source(zigzags, Helm.from_plant(plant), time)
     states, commands = fly(RecordedPlantDynamics(plant, DT), source, len(time), begun)
     t = time.numpy()
     for row, (first, psi) in enumerate(cases):
         heading = states[row, :-1, 2].numpy() - psi
         side = np.sign((commands[row, :, 0] - commands[row, :, 1]).numpy())
-        expected, current = [], 1.0 if first == "starboard" else -1.0
+        expected = []
+        current = 1.0 if first == "starboard" else -1.0
         for k in range(len(t)):
             if current * heading[k] >= bound:
                 current = -current
@@ -193,11 +199,11 @@ def test_edges_fall_on_the_grid_point_they_name(
     edges = np.flatnonzero(np.diff(drive.numpy()) != 0) + 1
     np.testing.assert_array_equal(edges, np.rint(np.array(moments) / dt).astype(int))
     zigzag = Zigzag(drive=0.5, steer=0.4, start=start, heading=0.3)
-    source, x = (
-        Zigzag.build_source([zigzag], Helm.from_plant(plant), t),
-        plant.make_initial_state(1),
-    )
-    memory, first, w = source.initial(x), round(start / dt), torch.zeros(1, len(plant.input_names))
+    source = Zigzag.build_source([zigzag], Helm.from_plant(plant), t)
+    x = plant.make_initial_state(1)
+    memory = source.initial(x)
+    first = round(start / dt)
+    w = torch.zeros(1, len(plant.input_names))
     for k in range(first + 1):
         command, memory = source(x, w.double(), k, memory)
         assert bool(command[0, 0] != command[0, 1]) == (k == first)
@@ -273,7 +279,8 @@ def test_multi_sines_excite_the_sway_force_where_commands_are_forces() -> None:
     )
     source = MultiSine.build_source([wave], Helm.from_plant(load_vessel("odin_forces").build()), t)
     assert isinstance(source, ScheduleSource)
-    sway, moment = source.commands[0, :, 1], source.commands[0, :, 2]
+    sway = source.commands[0, :, 1]
+    moment = source.commands[0, :, 2]
     assert float(sway[:50].abs().max()) == 0.0
     assert 0.15 * 25e3 < float(sway.abs().max()) <= 0.3 * 25e3
     assert abs(float(torch.corrcoef(torch.stack((sway, moment)))[0, 1])) < 0.2

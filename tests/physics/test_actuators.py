@@ -28,8 +28,11 @@ def test_the_catamarans_curve_is_the_printed_one(twin: Thrusters) -> None:
     """
     rpm = np.linspace(-2380, 2380, 20_001)
     thrust = twin.thruster_forces.thrust_at(torch.from_numpy(rpm / 60)[:, None])[:, 0].numpy()
-    ahead, astern, dead = rpm >= 45, rpm <= -61, (rpm > -60) & (rpm < 44)
-    forward, reverse = [3.54e-5, 0.084, -3.798], [-1.189e-5, 0.0707, 4.331]
+    ahead = rpm >= 45
+    astern = rpm <= -61
+    dead = (rpm > -60) & (rpm < 44)
+    forward = [3.54e-5, 0.084, -3.798]
+    reverse = [-1.189e-5, 0.0707, 4.331]
     np.testing.assert_allclose(thrust[ahead], np.polyval(forward, rpm[ahead]), rtol=1e-4)
     np.testing.assert_allclose(thrust[astern], np.polyval(reverse, rpm[astern]), 1e-3, 1e-3)
     assert not thrust[dead].any()
@@ -39,12 +42,14 @@ def test_the_catamarans_curve_is_the_printed_one(twin: Thrusters) -> None:
 
 def test_revolutions_keep_to_their_rate(twin: Thrusters) -> None:
     """From rest to full in 2380 / 1500 = 1.59 s, a reversal in 3.17 s (correction W7)."""
-    full, n = 2380.0 / 60.0, torch.zeros(1, 2, dtype=torch.float64)
+    full = 2380.0 / 60.0
+    n = torch.zeros(1, 2, dtype=torch.float64)
     for sign, least in ((1.0, 159), (-1.0, 317)):
         command = sign * torch.tensor([[full, -full]], dtype=torch.float64)
         steps = 0
         while not torch.equal(n, command):
-            before, n = n, twin.advance_step(n, command, 0.01)
+            before = n
+            n = twin.advance_step(n, command, 0.01)
             assert bool(((n - before).abs() <= 0.25 + 1e-12).all())
             steps += 1
         assert steps - least in (0, int(sign < 0))
@@ -113,7 +118,8 @@ def test_a_rudder_in_the_flow_and_in_the_race_is_the_closed_form() -> None:
     """Behind an actuator disc at standstill U_R^2 = 2 T / (rho A_p); none of it outside the race or
     when backing.
     """
-    unit, behind = rudder(), rudder(rudder={"race_share": 1.0})
+    unit = rudder()
+    behind = rudder(rudder={"race_share": 1.0})
     pushed = [500.0, 0, 0]
     found = force(unit, 0.3, 10.0, (4.0, 0.0, 0.0))
     np.testing.assert_allclose(found, lift(0.3, 16.0) + pushed, rtol=1e-12)

@@ -50,7 +50,8 @@ def test_forms_of_the_spectrum() -> None:
     """Peak at the peak period; with gamma 1 m0 = H^2/16 and the ITTC's A = 173 H^2/T1^4, B =
     691/T1^4.
     """
-    height, period = 2.0, 7.0
+    height = 2.0
+    period = 7.0
     omega = np.linspace(0.05, 8, 20_000)
     form = JonswapSpectrumConfig(gamma=1.0)
     plain, raised = (
@@ -99,7 +100,9 @@ def test_the_response_is_the_pressure_on_the_hull(angle: float) -> None:
     waves = sea(direction=float(np.radians(angle)), frequencies=10)
     psi = torch.zeros(1, dtype=torch.float64)
     quadrature, yaw = waves.force_response(psi)
-    length, breadth, draught = 20.0, 5.0, 1.5
+    length = 20.0
+    breadth = 5.0
+    draught = 1.5
     rho_g = 1025.0 * GRAVITY
     nodes, weights = np.polynomial.legendre.leggauss(60)
     c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
@@ -134,8 +137,10 @@ def test_the_response_is_the_pressure_on_the_hull(angle: float) -> None:
 
 def test_a_moving_vessel_meets_waves_at_the_encounter_frequency() -> None:
     """(5.31): omega_e = omega - omega^2 U cos(chi) / g along a straight course at steady speed."""
-    waves, t = sea(direction=float(np.radians(40))), 12.0
-    speed, course = 6.0, np.radians(-100)
+    waves = sea(direction=float(np.radians(40)))
+    t = 12.0
+    speed = 6.0
+    course = np.radians(-100)
     north, east = (torch.tensor([speed * t * f(course)]).double() for f in (np.cos, np.sin))
     chi = np.radians(40) - course
     encounter = waves.omega - waves.omega**2 * speed / GRAVITY * np.cos(chi)

@@ -46,7 +46,9 @@ def test_matrices_of_a_hull_written_out() -> None:
     skewed = ("rigid_body.x_G", 0.4), ("added_mass.Y_rdot", -60), ("added_mass.N_vdot", -90)
     overrides = [f"{name}.value={value}" for name, value in skewed]
     vessel = load_config(find_vessel_files()["wam_v_cal"], overrides, VesselConfig)
-    body, added, damping = vessel.rigid_body, vessel.added_mass, vessel.damping
+    body = vessel.rigid_body
+    added = vessel.added_mass
+    damping = vessel.damping
     m, arm = body.m.value, body.m.value * body.x_G.value
     m11, m22 = m - added.X_udot.value, m - added.Y_vdot.value
     m23, m32 = arm - added.Y_rdot.value, arm - added.N_vdot.value
@@ -76,7 +78,8 @@ def test_matrices_of_a_hull_written_out() -> None:
 )
 def test_poles_of_sway_and_yaw(name: str, speed: float, pole: float, allowed: float) -> None:
     """Corrections J6 and H5: unstable above walking pace."""
-    hull, nu = plant_of(name).hull, torch.tensor([speed, 0.0, 0.0], dtype=torch.float64)
+    hull = plant_of(name).hull
+    nu = torch.tensor([speed, 0.0, 0.0], dtype=torch.float64)
     slope = torch.autograd.functional.jacobian(lambda x: hull(x, torch.zeros_like(x)), nu)
     largest = float(torch.linalg.eigvals(slope[1:, 1:]).real.max())
     assert largest == pytest.approx(pole, abs=allowed)
@@ -96,7 +99,8 @@ def test_jets_thrust_as_printed_saturate_and_turn_to_the_side_that_is_asked_for(
     assert thrust(1000, 22.9) > 0 > thrust(1000, 23.3)
     assert max(range(2001), key=lambda rpm: -thrust(rpm)) == 168
     actuators = config.build()
-    nu, turn = torch.zeros(2, 3, dtype=torch.float64), np.radians(27)
+    nu = torch.zeros(2, 3, dtype=torch.float64)
+    turn = np.radians(27)
     beyond, limits = torch.tensor(
         [[[50.0, 1.0], [-5.0, -1.0]], [[2000 / 60, turn], [0.0, -turn]]], dtype=torch.float64
     )
@@ -130,9 +134,11 @@ def test_froude_phases() -> None:
 def test_azimuth_thrusters_written_out() -> None:
     """(5.1), (5.2) in rpm."""
     rng = np.random.default_rng(0)
-    rpm, angle = rng.uniform(-5200, 5200, (100, 2)), rng.uniform(-3, 3, (100, 2))
+    rpm = rng.uniform(-5200, 5200, (100, 2))
+    angle = rng.uniform(-3, 3, (100, 2))
     thrust = polyval(rpm, [-1.07, 0.00478, 8.7e-6, 6.16e-9, -1.78e-13, -1.31e-16])
-    along, across = np.cos(angle) * thrust, np.sin(angle) * thrust
+    along = np.cos(angle) * thrust
+    across = np.sin(angle) * thrust
     wanted = np.stack([along.sum(1), across.sum(1), 1.8 * (across[:, 0] - across[:, 1])], axis=1)
     command = torch.from_numpy(np.concatenate([rpm / 60, angle], axis=1))
     got = plant_of("milliampere_azimuth").actuators.force(command[:, :0], command, command[:, :3])
@@ -144,7 +150,8 @@ def test_allocation_makes_the_wanted_forces_with_least_thrust() -> None:
     tau = torch.from_numpy(np.random.default_rng(0).normal(size=(200, 3)) * [150, 150, 150])
     command = thrusters.allocate(tau)
     torch.testing.assert_close(thrusters.force(tau[:, :0], command, tau), tau, rtol=1e-9, atol=1e-9)
-    thrust, angle = thrusters.thrust_at(command[:, :2]), command[:, 2:]
+    thrust = thrusters.thrust_at(command[:, :2])
+    angle = command[:, 2:]
     parts = torch.cat((thrust * torch.cos(angle), thrust * torch.sin(angle)), dim=1).numpy()
     rows = np.array([[1, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1.8, -1.8]])
     np.testing.assert_allclose(parts, tau.numpy() @ np.linalg.pinv(rows).T, atol=1e-9)
@@ -185,7 +192,8 @@ def test_rudders_at_rest() -> None:
     assert bool(torch.isfinite(slope).all())
 
 
-LENGTH, SERVICE = 160.93, 7.7175
+LENGTH = 160.93
+SERVICE = 7.7175
 
 
 def mariner(u: float, v: float, r: float, delta: float) -> np.ndarray:
@@ -231,7 +239,9 @@ def test_prime_and_si_are_the_same_vessel() -> None:
     """At the service speed, where the present speed does not scale the series."""
     prime = load_vessel("mariner")
     assert isinstance(prime, AbkowitzConfig)
-    force, length, speed = 0.5 * 1025 * LENGTH**2 * SERVICE**2, LENGTH, SERVICE
+    force = 0.5 * 1025 * LENGTH**2 * SERVICE**2
+    length = LENGTH
+    speed = SERVICE
     unit = {"du": 1 / speed, "v": 1 / speed, "r": length / speed, "delta": 1.0}
 
     def scaled(term: str, value: float, size: float) -> float:
@@ -246,7 +256,8 @@ def test_prime_and_si_are_the_same_vessel() -> None:
             "XYN", dict(prime.coefficients).values(), (force, force, force * length), strict=True
         )
     }
-    kilo, body = 0.5 * 1025 * length**3, prime.mass
+    kilo = 0.5 * 1025 * length**3
+    body = prime.mass
     mass = {
         "m": body.m * kilo, "I_z": body.I_z * kilo * length**2, "x_G": body.x_G * length,
         "X_udot": body.X_udot * kilo,
@@ -355,7 +366,8 @@ def test_the_exact_step_is_that_of_rk4(name: str) -> None:
     """Whole states under a rudder with a rate; RK4 and positions by Simpson's rule are of fourth
     order.
     """
-    plant, rudder = plant_of(name, "rudder.rate=5 deg/s"), commands(200, 0.05)
+    plant = plant_of(name, "rudder.rate=5 deg/s")
+    rudder = commands(200, 0.05)
     exact, stepped = (flown(kind(plant, 0.05), rudder) for kind in (NomotoDynamics, PlantDynamics))
     np.testing.assert_array_equal(exact[:, -1], stepped[:, -1])
     assert (np.abs(exact - stepped).max(0) <= 1e-7 * np.ptp(exact, axis=0)).all()

@@ -110,7 +110,8 @@ def test_port_and_starboard_are_mirror_images(name: str) -> None:
 @pytest.mark.parametrize("name", HULLS)
 def test_calm_water_held_forces_and_the_recorded_step_are_the_same_vessel(name: str) -> None:
     """To rounding, and at another batch size than recorded."""
-    full, calm = load_vessel(name).build(), load_vessel(name).build().without_environment()
+    full = load_vessel(name).build()
+    calm = load_vessel(name).build().without_environment()
     x, w = scene(full, 5)
     torch.testing.assert_close(
         full.derivative_prepared(x, full.prepare(x, w)), full.derivative(x, w)
@@ -137,7 +138,8 @@ def test_a_current_carries_and_a_force_in_earth_axes_turns(name: str) -> None:
         torch.zeros(7, len(plant.state_names), dtype=torch.float64),
         torch.linspace(-3, 3, 7).double(),
     )
-    column, place = plant.state_names.index, plant.input_names.index
+    column = plant.state_names.index
+    place = plant.input_names.index
     x[:, column("psi")] = psi
     x[:, column("u")] = 0.4 * torch.cos(psi) - 0.25 * torch.sin(psi)
     x[:, column("v")] = -0.4 * torch.sin(psi) - 0.25 * torch.cos(psi)
@@ -183,7 +185,8 @@ def test_energy_is_kept_without_damping_and_falls_with_it(
     vessel = load_config(find_vessel_files()[name], list(overrides), VesselConfig)
     plant = vessel.build().without_environment()
     assert isinstance(plant, HullPlant)
-    n, random = plant.n_dof, torch.Generator().manual_seed(3)
+    n = plant.n_dof
+    random = torch.Generator().manual_seed(3)
     x0 = torch.zeros(16, len(plant.state_names), dtype=torch.float64)
     sizes = {3: [1.5, 0.6, 0.4], 4: [6.0, 1.0, 0.2, 0.05], 6: [0.4, 0.05, 0.05, 0.6, 0.15, 0.15]}
     spread = torch.tensor(sizes[n], dtype=torch.float64)
@@ -193,15 +196,19 @@ def test_energy_is_kept_without_damping_and_falls_with_it(
         states, _, _ = Rollout(RecordedPlantDynamics(plant, 0.01, 2 if n == 6 else 1))(
             x0, w, x0[:, :0]
         )
-    nu, mass = states[..., n : 2 * n], 0.5 * (plant.hull.mass + plant.hull.mass.T)
+    nu = states[..., n : 2 * n]
+    mass = 0.5 * (plant.hull.mass + plant.hull.mass.T)
     energy = 0.5 * torch.einsum("bti,ij,btj->bt", nu, mass, nu)
     if n == 4:
         energy = energy + 0.5 * 1025 * 9.81 * 355.88 * states[..., 2] ** 2
     if isinstance(vessel, SubmergedHullConfig):
         # tumbles too: the mean energy is lifted, so that shares of it mean something
-        phi, theta = states[..., 3], states[..., 4]
-        body, water = vessel.rigid_body, vessel.buoyancy
-        weight, lift = body.m.value * 9.81, water.density.value * 9.81 * water.volume.value
+        phi = states[..., 3]
+        theta = states[..., 4]
+        body = vessel.rigid_body
+        water = vessel.buoyancy
+        weight = body.m.value * 9.81
+        lift = water.density.value * 9.81 * water.volume.value
         x, z = (
             weight * g.value - lift * b.value
             for g, b in ((body.x_G, water.x_B), (body.z_G, water.z_B))

@@ -62,7 +62,8 @@ def step_test(level: float, seed: int = 0, count: int = 300) -> Trial:
     """Times, commands and revolutions by the plant's own actuator, which hears commands 0.14 s
     late; 25 rpm of noise.
     """
-    dt, late = 0.02, 7
+    dt = 0.02
+    late = 7
     t = dt * np.arange(300)
     command = np.where(t < 1.35, 0.0, level) / 60
     n, out = torch.zeros(1, 2, dtype=torch.float64), []
@@ -98,7 +99,8 @@ def test_thrust_curves_of_both_directions() -> None:
     """Exact without noise; with 5 N on the tether the curve to 1.5 % of full thrust, and honest
     intervals.
     """
-    truths, held = (CONFIG.forward, CONFIG.reverse), []
+    truths = (CONFIG.forward, CONFIG.reverse)
+    held = []
     for fit, truth in zip(thrusts(bollard_test(noise=0.0)), truths, strict=True):
         np.testing.assert_allclose([c.value for c in fit.coefficients], truth, rtol=1e-9)
     for seed in SEEDS:

@@ -48,7 +48,8 @@ def test_relative_wind(
 
 
 def test_names_and_forces_are_the_vessels() -> None:
-    plain, forces = ("u", "v", "r", "n_port", "n_stbd"), ("tau_x", "tau_y", "tau_n")
+    plain = ("u", "v", "r", "n_port", "n_stbd")
+    forces = ("tau_x", "tau_y", "tau_n")
     assert build().names == plain
     signals = build(forces="wam_v_cal")
     assert signals.names == (*plain, *forces)

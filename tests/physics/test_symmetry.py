@@ -93,7 +93,8 @@ def test_channels_are_those_of_the_scene_in_the_mirror() -> None:
     w = torch.from_numpy(random.uniform([-20, -20, 0, -4], [30, 30, 12, 4], size=(40, 4)))
     x_there = x * torch.tensor([1, -1, -1, 1, -1, -1.0], dtype=x.dtype)
     w_there = w[:, [1, 0, 2, 3]] * torch.tensor([1, 1, 1, -1.0], dtype=x.dtype)
-    z, z_there = signals(x, signals.prepare(w)), signals(x_there, signals.prepare(w_there))
+    z = signals(x, signals.prepare(w))
+    z_there = signals(x_there, signals.prepare(w_there))
     found = mirror_channels(signals.names)
     assert found is not None
     mirrored = z[:, found[0]] * torch.tensor(found[1], dtype=z.dtype)

@@ -100,7 +100,8 @@ LIBRARIES: dict[str, tuple[list[str], list[np.ndarray]]] = {
 @pytest.mark.parametrize("name", LIBRARIES)
 def test_a_library_equals_numpy_with_its_derivatives(name: str) -> None:
     terms, truth = LIBRARIES[name]
-    z, wanted = torch.from_numpy(np.stack((U, V, R, N, D), axis=-1)), np.stack(truth, axis=-1)
+    z = torch.from_numpy(np.stack((U, V, R, N, D), axis=-1))
+    wanted = np.stack(truth, axis=-1)
     library = TermLibrary(terms, NAMES)
     assert library.n_terms == len(terms)
     for module in (library, torch.jit.script(library)):

@@ -108,7 +108,8 @@ def test_units_are_converted_at_the_door() -> None:
 
 
 def test_a_set_has_its_base_but_for_what_it_says() -> None:
-    hybrid, base = load_vessel("patrol_hyb"), load_vessel("patrol_p06")
+    hybrid = load_vessel("patrol_hyb")
+    base = load_vessel("patrol_p06")
     changed = {
         "name": "patrol_hyb",
         "description": hybrid.description,

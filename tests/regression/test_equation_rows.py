@@ -40,7 +40,8 @@ def test_windows_over_central_differences_are_integrals_by_parts() -> None:
     """Sum of w x_dot over a window equals minus the sum of the weights' own differences times x: no
     derivative of the record is left.
     """
-    step, size = 0.1, 30
+    step = 0.1
+    size = 30
     x = np.random.default_rng(1).normal(size=100)
     rate = (x[2:] - x[:-2]) / (2 * step)
     rows = WeakRows(window=size * step, every=1 / size).build_rows(

@@ -172,7 +172,8 @@ def test_settings_stay_as_they_were() -> None:
     for make in LINEAR.values():
         estimator = make(4, 2)
         estimator.fit(x.flip(0) ** 2, y.exp(), groups)
-        again, fresh = estimator.fit(x, y, groups)[0], make(4, 2).fit(x, y, groups)[0]
+        again = estimator.fit(x, y, groups)[0]
+        fresh = make(4, 2).fit(x, y, groups)[0]
         torch.testing.assert_close(again.coefficients, fresh.coefficients, rtol=1e-9, atol=1e-12)
 
 

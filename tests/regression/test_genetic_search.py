@@ -66,7 +66,9 @@ def grown(algebra: Algebra, seed: random.Random, depth: int) -> tuple[Sum, np.nd
 @pytest.mark.parametrize("expand", [True, False])
 def test_normal_form_keeps_the_values(expand: bool) -> None:
     limits = ExpressionLimits(terms=200, degree=16, nesting=5, expand=expand)
-    algebra, seed, tried = Algebra(NAMES, limits), random.Random(1), 0
+    algebra = Algebra(NAMES, limits)
+    seed = random.Random(1)
+    tried = 0
     while tried < 100:
         try:
             meant, truth = grown(algebra, seed, 4)
@@ -99,7 +101,8 @@ def test_equal_expressions_are_one() -> None:
     minus = algebra.add({}, a, -1.0)
     both = algebra.add(a, b)
     turned = algebra.add({}, both, -1.0)
-    apply, times = algebra.apply_function, algebra.multiply
+    apply = algebra.apply_function
+    times = algebra.multiply
     assert apply("abs", times(minus, b)) == times(apply("abs", a), apply("abs", b))
     assert times(apply("abs", a), apply("abs", a)) == times(a, a)
     assert apply("abs", times(a, a)) == times(a, a)
@@ -225,7 +228,8 @@ def test_early_stopping_and_elite() -> None:
 
 def test_bad_samples_are_told() -> None:
     pytest.importorskip("deap", reason="genetic programming needs the extra gp")
-    config, algebra = EvolutionConfig(population=10), Algebra(NAMES)
+    config = EvolutionConfig(population=10)
+    algebra = Algebra(NAMES)
     with pytest.raises(FitError, match="the target is not finite"):
         evolve(algebra, DATA, np.full(200, np.nan), TRAIN, config, 0)
     with pytest.raises(FitError, match="200 of 200 samples are for training"):

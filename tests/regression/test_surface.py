@@ -14,7 +14,9 @@ from residnet.regression.surface import compute_error_surface
 
 def data(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Correlated columns of different size, three outputs, fold of each row."""
-    random, columns, rows = np.random.default_rng(seed), 7, 240
+    random = np.random.default_rng(seed)
+    columns = 7
+    rows = 240
     x = random.normal(size=(rows, columns)) @ random.normal(size=(columns, columns))
     x = x * 10.0 ** random.uniform(-2, 2, columns) + 3.0
     noise = random.normal(size=(rows, 3)) * [0.5, 2.0, 8.0]
@@ -61,7 +63,9 @@ def test_equals_scikit_learn(judged: str) -> None:
         whole = rows
     else:
         found = compute_error_surface(moments(x, y, fold), test_folds=(2, 3))
-        fit, judge, whole = [rows[fold < 2]], [rows[fold >= 2]], rows[fold < 2]
+        fit = [rows[fold < 2]]
+        judge = [rows[fold >= 2]]
+        whole = rows[fold < 2]
     for k in range(3):
         expected = by_hand(x, y[:, k], fit, judge, whole)
         places = torch.isfinite(found.error[k]).nonzero().tolist()

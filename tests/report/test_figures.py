@@ -311,6 +311,7 @@ def test_a_browser_draws_every_panel_of_a_fit_and_the_controls_work(run: Path) -
         assert (found.overflow, found.broken) == (0, []), width
         assert found.smallest >= 11
         assert all(found.panels), "every panel is drawn"
-        near, whole = pytest.approx(0.5, abs=0.01), pytest.approx(1.0, abs=0.01)
+        near = pytest.approx(0.5, abs=0.01)
+        whole = pytest.approx(1.0, abs=0.01)
         done = dict.fromkeys(("focused", "hidden", "chosen"), True)
         assert found.used == {**done, "zoomed": near, "reset": whole}

@@ -42,7 +42,8 @@ def every_block(folder: Path) -> list[Section]:
     picture.parent.mkdir(parents=True, exist_ok=True)
     Image.new("RGB", (900, 300), "white").save(picture)
     case = Case("", [{"a": (np.arange(3.0), np.arange(3.0))}])
-    look, panel = {"a": GlyphStyle("a")}, [Panel("u [m/s]")]
+    look = {"a": GlyphStyle("a")}
+    panel = [Panel("u [m/s]")]
     figure = Figure("track", "Track", "Look out.", look, panel, [case], static_images=[picture])
     return [
         Section("Results of <all>", [Text(["First.", "", "Second."]), table()]),

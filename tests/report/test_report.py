@@ -257,7 +257,8 @@ def test_how_good_where_it_fails_and_what_limits_it(run: Path) -> None:
 
 
 def test_no_repeats_no_reference_and_no_interval_are_said(run: Path) -> None:
-    content, found = compared({}), limits_file()
+    content = compared({})
+    found = limits_file()
     none = dict.fromkeys(("difference", "ci95_blocks", "nrmse_mean_ci95"))
     for line in content["rows"]:
         line |= {**none, "rmse_ci95": dict.fromkeys("uvr")}

@@ -74,7 +74,8 @@ def made_autopilot(run: Path) -> Path:
     write_json(run / "metrics.json", {"run": "made", "floor": "net", "rows": rows})
     write_json(run / "controllers.json", {"controllers": {"pd": {"kp": 1.0}}})
     t = np.arange(0.0, 20.0, 0.5)
-    flights, names = [], ("settling", "overshoot", "iae", "travel", "energy")
+    flights = []
+    names = ("settling", "overshoot", "iae", "travel", "energy")
     for controller in ("net", "pd"):
         for effect, time in ((1.0, 1.0), (0.8, 1.2)):
             moves = {"t": t, "psi": 30 * DEG * (1 - np.exp(-effect * t / time / 4))}
@@ -105,7 +106,10 @@ def made_course(run: Path) -> Path:
     wide = {"split": "spread", "n": 4, "passed": 0.75, "finished": 1.0, "ratio": 1.04}
     wide |= {"ratio_worst": 1.2, "margin": 1.0, "margin_worst": -2.0}
     wide |= {"cross_track_rms": 0.9, "reference_time": 60.0}
-    rows, tracks, plans, drawn = [], [], [], []
+    rows = []
+    tracks = []
+    plans = []
+    drawn = []
     t = np.arange(0.0, 60.0)
     for protocol in ("enter", "sides"):
         base = {"model": "net", "kind": "policy", "guidance": "course", "protocol": protocol}

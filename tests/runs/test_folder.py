@@ -71,7 +71,8 @@ def test_a_folder_is_used_again_without_results_or_where_that_is_asked_for(tmp_p
 
 
 def test_what_is_no_run_is_left_alone(tmp_path: Path) -> None:
-    file, other = tmp_path / "file", tmp_path / "other"
+    file = tmp_path / "file"
+    other = tmp_path / "other"
     other.mkdir()
     for precious in (file, other / "notes.txt"):
         precious.write_text("precious")
@@ -179,7 +180,8 @@ def test_provenance_names_every_input_by_its_hash(
 
 
 def test_the_revision_is_that_of_git(monkeypatch: pytest.MonkeyPatch) -> None:
-    words, here = ["git", "rev-parse", "HEAD"], Path(folders.__file__).parent
+    words = ["git", "rev-parse", "HEAD"]
+    here = Path(folders.__file__).parent
     told = subprocess.run(words, cwd=here, capture_output=True, text=True, check=False)
     found = read_git_revision()
     expected = told.stdout.strip() if told.returncode == 0 else None
@@ -219,7 +221,8 @@ def as_folder(file: Path) -> None:
     file.mkdir()
 
 
-MODEL, SUMS = SEALED[-1], "checksums.json"
+MODEL = SEALED[-1]
+SUMS = "checksums.json"
 DAMAGES: list[tuple[str, Callable[[Path], object], str]] = [
     (MODEL, Path.unlink, f"{MODEL}.*run it again"),
     (MODEL, as_folder, f"{MODEL}.*run it again"),

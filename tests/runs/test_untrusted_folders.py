@@ -72,7 +72,8 @@ HOSTILE_VALUES: list[Any] = [
 def _edit_json(path: Path, rng: random.Random) -> None:
     """Replace, remove or add a value at a random place of a JSON file."""
     content = json.loads(path.read_text())
-    here, places = content, []
+    here = content
+    places = []
     while isinstance(here, dict | list) and here:
         key = rng.choice([*here] if isinstance(here, dict) else range(len(here)))
         places.append((here, key))
@@ -231,7 +232,8 @@ def fuzz(finished: Path, folder: Path, seeds: range) -> None:
     outside.mkdir()
     victim = outside / "victim.txt"
     victim.write_text("the user's thesis")
-    before, faults = _hashes(outside), []
+    before = _hashes(outside)
+    faults = []
     # what a report costs by itself is no hang
     shutil.copytree(finished, folder / "runs" / "stranger")
     begin = time.process_time()

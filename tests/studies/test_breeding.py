@@ -81,7 +81,8 @@ def test_a_grid_runs(tmp_path: Path, command: Command) -> None:
 
 def test_a_late_force_and_its_correction() -> None:
     """The force that acts and the one that the record tells move by themselves."""
-    plain, late = RecordConfig(length=30.0), RecordConfig(length=30.0, delay=0.5)
+    plain = RecordConfig(length=30.0)
+    late = RecordConfig(length=30.0, delay=0.5)
     told = RecordConfig(length=30.0, delay=0.5, corrected=0.5).simulate(10.0)
     record = late.simulate(10.0)
     np.testing.assert_array_equal(record["tau_x"], plain.simulate(10.0)["tau_x"])

@@ -10,8 +10,10 @@ from residnet.core.errors import ConfigError
 from residnet.tasks.registry import load_task
 
 STUDIES = Path(__file__).parents[2] / "configs" / "studies"
-FERRY, SEA = "jervan2020/operation", "jervan2020/measured"
-GRID, TRIAL = "halvorsen2019/table_5_2", "halvorsen2019/standard_model"
+FERRY = "jervan2020/operation"
+SEA = "jervan2020/measured"
+GRID = "halvorsen2019/table_5_2"
+TRIAL = "halvorsen2019/standard_model"
 FAST = "rows={key: head.evolution.crossover, values: [0.1, 0.9]}"
 REFUSED: tuple[tuple[str, tuple[str, ...], str], ...] = (
     (FERRY, ("true=wam_v_cal",), "actuators push in surge, sway and yaw"),

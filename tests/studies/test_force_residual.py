@@ -35,10 +35,12 @@ def motion(seed: int, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarra
     """t [T], nu and nu_dot [T, 3]: sums of slow sines, different for every seed."""
     random = np.random.default_rng(seed)
     t = STEP * np.arange(round(seconds / STEP))
-    omega, phase = random.uniform(0.1, 0.5, (3, 6)), random.uniform(0, 2 * np.pi, (3, 6))
+    omega = random.uniform(0.1, 0.5, (3, 6))
+    phase = random.uniform(0, 2 * np.pi, (3, 6))
     size = np.array([0.3, 0.15, 0.05])[:, None, None] / np.sqrt(6) * 1.4
     angle = omega[..., None] * t + phase[..., None]
-    nu, nu_dot = size * np.sin(angle), size * omega[..., None] * np.cos(angle)
+    nu = size * np.sin(angle)
+    nu_dot = size * omega[..., None] * np.cos(angle)
     return t, nu.sum(1).T, nu_dot.sum(1).T
 
 

@@ -66,8 +66,10 @@ def hull(name: str) -> Any:
 
 
 def test_the_lag_and_the_missing_half_are_found_and_flown(short: FerryStudy) -> None:
-    model, course = short.models["lag_ridge"], short.runs["course"]
-    before, after = course["believed"].tracking_metrics, course["lag_ridge"].tracking_metrics
+    model = short.models["lag_ridge"]
+    course = short.runs["course"]
+    before = course["believed"].tracking_metrics
+    after = course["lag_ridge"].tracking_metrics
     left = model.test_mse(short.record)
     assert model.lag is not None
     assert model.lag.frequency == pytest.approx(2.0, rel=0.01)
@@ -92,7 +94,8 @@ def test_a_fitted_model_runs_forward_as_the_true_ferry(short: FerryStudy) -> Non
     # along the half that identified: shortened segments leave the other half outside of what was
     # seen
     half = slice(0, len(short.believed_run.t) // 2)
-    nu, acting = short.believed_run.nu[half], short.believed_run.thruster_force[half]
+    nu = short.believed_run.nu[half]
+    acting = short.believed_run.thruster_force[half]
     with torch.no_grad():
         nu_dot = model(torch.cat((nu, acting), dim=-1))
     torch.testing.assert_close(nu_dot, short.believed_run.nu_dot[half], rtol=0, atol=2e-3)
@@ -155,7 +158,8 @@ def test_lag_and_no_residual_are_tried_with_every_order(short: FerryStudy) -> No
 
 
 def test_motions_to_port_tell_of_those_to_starboard(short: FerryStudy) -> None:
-    believed, record = ForceModel(hull("milliampere")), short.record
+    believed = ForceModel(hull("milliampere"))
+    record = short.record
     fit = {"fit": {"kind": "plsr"}}
     found = short.models["plsr"]
     assert found.fit.notes["mirror"]
@@ -180,7 +184,8 @@ def test_motions_to_port_tell_of_those_to_starboard(short: FerryStudy) -> None:
 
 def test_what_searches_its_settings_leaves_with_the_whole_course(short: FerryStudy) -> None:
     assert set(short.whole_course_models) == {"plsr"}
-    judged, leaves = short.models["plsr"], short.whole_course_models["plsr"]
+    judged = short.models["plsr"]
+    leaves = short.whole_course_models["plsr"]
     assert leaves.lag == judged.lag is not None
     assert [leaves.fit.notes[key] for key in ("order", "mirror")] == [
         judged.fit.notes[key] for key in ("order", "mirror")
@@ -247,7 +252,8 @@ def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
     short: FerryStudy, tmp_path: Path
 ) -> None:
     """Far from what identified it, a wild correction commands no more than 1.2 times the hull."""
-    model, most = short.models["lag_ridge"].force, torch.tensor([5.0] * 3 + [9.0] * 3)
+    model = short.models["lag_ridge"].force
+    most = torch.tensor([5.0] * 3 + [9.0] * 3)
     asked = loaded(
         RequiredForce(*model.split_corrections(), is_mirrored=False), -most, most, tmp_path
     )
@@ -255,17 +261,20 @@ def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
     torch.testing.assert_close(tau, model(short.believed_run.nu_dot, short.believed_run.nu))
     assert not outside.any()
     record = build_record(short.believed_run, 20.0, None)
-    believed, random = ForceModel(hull("milliampere")), torch.Generator().manual_seed(2)
+    believed = ForceModel(hull("milliampere"))
+    random = torch.Generator().manual_seed(2)
     wild = ForceCorrection(
         FERRY_TERMS,
         300.0 * torch.randn(30, 3, generator=random, dtype=torch.float64),
         torch.tensor([5.0, 20.0, 30.0], dtype=torch.float64),
     )
     motion = torch.cat((record.nu_dot, record.nu), dim=-1)[record.is_training]
-    low, high = motion.amin(0), motion.amax(0)
+    low = motion.amin(0)
+    high = motion.amax(0)
     force = RequiredForce(*believed.with_correction(wild).split_corrections(), is_mirrored=True)
     asked = loaded(force, low, high, tmp_path)
-    random, width = torch.Generator().manual_seed(3), high - low
+    random = torch.Generator().manual_seed(3)
+    width = high - low
     seen = low + (2.0 * torch.rand(2000, 6, generator=random, dtype=torch.float64) - 0.5) * width
     needed = believed(seen[:, :3], seen[:, 3:])
     tau, outside = asked(seen[:, :3], seen[:, 3:])
@@ -299,7 +308,10 @@ def test_a_model_is_identified_again_where_its_residual_has_grown_for_long() -> 
         random = torch.Generator().manual_seed(seed)
         return scale * torch.randn(600, 3, generator=random, dtype=torch.float64)
 
-    then, now, force, fold = noise(20.0), noise(20.0, 1), noise(100.0, 9), torch.arange(600) // 100
+    then = noise(20.0)
+    now = noise(20.0, 1)
+    force = noise(100.0, 9)
+    fold = torch.arange(600) // 100
     same = compare_residuals(then, now, force, fold)
     assert same["fits"]
     assert same["growth"] == pytest.approx([1.0] * 3, rel=0.3)
@@ -327,8 +339,11 @@ def test_constant_force_needs_a_vessel_that_turns() -> None:
 
 def test_the_course_is_the_filters_own_and_its_derivatives_are_consistent() -> None:
     wanted = config("operation").course
-    motion, filtered = sample_filtered_course(wanted, 0.02), wanted.build(0.02)
-    s, x, rows = torch.zeros(1, 9, dtype=torch.float64), torch.zeros(1, 6, dtype=torch.float64), []
+    motion = sample_filtered_course(wanted, 0.02)
+    filtered = wanted.build(0.02)
+    s = torch.zeros(1, 9, dtype=torch.float64)
+    x = torch.zeros(1, 6, dtype=torch.float64)
+    rows = []
     for k in range(1100):
         reference, s = filtered(x, k, s)
         rows.append(reference[0])

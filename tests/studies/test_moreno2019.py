@@ -55,10 +55,8 @@ def write(run: Path, split: str, models: tuple[str, ...]) -> None:
 
 
 def made(run: Path, models: tuple[str, ...] = MODELS) -> Path:
-    kinds, rmse = (
-        {"constant_velocity": "constant_velocity", "baseline": "baseline"},
-        dict.fromkeys("uvr", 1.0),
-    )
+    kinds = {"constant_velocity": "constant_velocity", "baseline": "baseline"}
+    rmse = dict.fromkeys("uvr", 1.0)
     about = {"split": "test", "protocol": "record", "rmse": rmse}
     rows = [{"model": model, "kind": kinds.get(model, "head"), **about} for model in models]
     (run / "metrics.json").write_text(json.dumps({"rows": rows, "run": "made"}))

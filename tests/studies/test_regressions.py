@@ -27,7 +27,8 @@ def made(n: int = 240, noise: float = 0.1, seed: int = 0) -> ForceRegressionData
     mixed = random.normal(size=(n, 4)) @ random.normal(size=(4, 6))
     x = (mixed + 0.3 * random.normal(size=(n, 6))) * size + [0, 3, 1, 0, -2, 0]
     y = x[:, :4] @ (random.normal(size=(4, 3)) / size[:4, None]) + [1, 2, 3]
-    y, fold = y + noise * random.normal(size=(n, 3)), torch.arange(n) * 6 // n
+    y = y + noise * random.normal(size=(n, 3))
+    fold = torch.arange(n) * 6 // n
     x_t, y_t = torch.from_numpy(x), torch.from_numpy(y)
     return ForceRegressionData(TERMS, x_t, y_t, x_t.std(0), fold, (x_t[:60], y_t[:60]))
 
@@ -78,12 +79,15 @@ def test_what_is_chosen_predicts_and_collinear_columns_make_no_garbage(
     kind: str, apart: float | None
 ) -> None:
     """Two more columns that are others, or all but: the coefficients keep their size."""
-    data, terms = made(noise=0.3), TERMS
-    x, plain = data.x, fitted(data, kind="ols")
+    data = made(noise=0.3)
+    terms = TERMS
+    x = data.x
+    plain = fitted(data, kind="ols")
     if apart is not None:
         noise = apart * torch.from_numpy(np.random.default_rng(1).normal(size=(len(x), 2)))
         more = torch.stack((x[:, 0], x[:, 1] / 10 - x[:, 2]), dim=1) + noise
-        x, terms = torch.cat((x, more), dim=1), (*TERMS, "a_again", "of_b_and_c")
+        x = torch.cat((x, more), dim=1)
+        terms = (*TERMS, "a_again", "of_b_and_c")
     found = fitted(ForceRegressionData(terms, x, data.y, x.std(0), data.fold), kind=kind)
     assert float(found.coefficients.abs().max()) < 5 * float(plain.coefficients.abs().max())
     left = (plain.predict(data.x) - data.y).std(0)
@@ -101,7 +105,8 @@ def test_the_documents_own_choice_is_at_least_as_good_on_the_half_that_it_saw() 
 
 def test_what_cannot_be_fitted_is_refused() -> None:
     data = made()
-    spoiled, double = data.x.clone(), data.x.clone()
+    spoiled = data.x.clone()
+    double = data.x.clone()
     spoiled[7, 2] = torch.nan
     with pytest.raises(FitError, match="'c' is not finite at sample 7"):
         ForceRegressionData(TERMS, spoiled, data.y, data.scale, data.fold)

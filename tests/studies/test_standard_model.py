@@ -51,7 +51,8 @@ def matrices(p: dict[str, float], nu: np.ndarray, tau: np.ndarray) -> np.ndarray
         inertia = np.diag([MASS, MASS, p["I_z"]]) - np.array(
             [[p["X_udot"], 0, 0], [0, p["Y_vdot"], p["Y_rdot"]], [0, p["N_vdot"], p["N_rdot"]]]
         )
-        top, side = -MASS * v + p["Y_vdot"] * v + p["Y_rdot"] * r, MASS * u - p["X_udot"] * u
+        top = -MASS * v + p["Y_vdot"] * v + p["Y_rdot"] * r
+        side = MASS * u - p["X_udot"] * u
         coriolis = np.array([[0, 0, top], [0, 0, side], [-top, -side, 0]])
         damping = -np.diag(
             [
@@ -109,7 +110,8 @@ def test_a_fit_recovers_what_is_determined_and_names_what_is_not() -> None:
 def test_standard_errors_are_those_of_repeated_noise() -> None:
     nu, tau = states(800)
     p = some(X_udot=-1500.0, Y_vdot=-2000.0, N_rdot=-6e3, X_u=-300.0, N_r=-2e3, Y_v=-700.0)
-    clean, away = matrices(p, nu, tau), []
+    clean = matrices(p, nu, tau)
+    away = []
     names = ("X_udot", "Y_vdot", "X_|u|u", "Y_|v|v", "N_v", "Y_r")
     for seed in range(30):
         noise = np.random.default_rng(seed).normal(size=clean.shape) * [0.05, 0.05, 0.02]
@@ -125,7 +127,8 @@ def test_preparation_is_the_documents() -> None:
     """Where no sample of the grid is missing the velocities are SciPy's zero-phase filter and the
     accelerations its differences.
     """
-    random, t = np.random.default_rng(0), 0.05 * np.arange(1200)
+    random = np.random.default_rng(0)
+    t = 0.05 * np.arange(1200)
     walks = np.cumsum(random.normal(size=(3, len(t))), axis=1) * 0.01 + 1.0
     channels = dict(zip("uvr", walks, strict=True))
     channels |= {"cmd_n": np.full(len(t), 12.0), "cmd_nozzle": 0.1 * np.sin(t)}
@@ -160,7 +163,8 @@ def test_a_short_trial_runs(tmp_path: Path) -> None:
     assert fitted["sums"]["I_z - N_rdot"][0] == pytest.approx(found["truth"]["I_z"], rel=0.1)
     assert fitted["values"]["X_|u|u"] == pytest.approx(found["truth"]["X_|u|u"], rel=0.2)
     rows = {(row["model"], row["on"], row["axis"]): row for row in found["rows"]["displacement"]}
-    own, plant = rows["standard", "displacement", "r_dot"], rows["plant", "plant", "r_dot"]
+    own = rows["standard", "displacement", "r_dot"]
+    plant = rows["plant", "plant", "r_dot"]
     assert own["rmse"] < 1.3 * plant["rmse"]
     page = plain(run / "report.html")
     assert all(f"Validation, {SET_NAMES[where]}" in page for where in found["rows"])

@@ -124,7 +124,8 @@ def test_figures_show_the_stored_numbers_of_the_typical_run(study: Path) -> None
     figures = {figure.name: figure for figure in woo2018.build_figures(RunFiles(study))}
     stored = pd.read_parquet(study / "rollouts" / "test" / "zigzag_03.parquet")
     # Figure 13: sway and yaw rate in the zigzag of the median error, errors below each
-    panels, shown = figures["13"].panels, figures["13"].cases[0].curves
+    panels = figures["13"].panels
+    shown = figures["13"].cases[0].curves
     assert panels[2].title == "zigzag_03"
     assert "deg/s" in panels[2].y_label
     for model in ("baseline", "nomoto"):

@@ -103,7 +103,8 @@ def header_lost(rows: list[Row], rng: random.Random) -> list[Row]:
 
 
 def other_delimiter(data: bytes, rng: random.Random) -> bytes:
-    sign, share = rng.choice([b";", b"\t", b" ", b"|", b", ", b",,"]), rng.choice([0.1, 1.0])
+    sign = rng.choice([b";", b"\t", b" ", b"|", b", ", b",,"])
+    share = rng.choice([0.1, 1.0])
     lines = data.split(b"\n")
     return b"\n".join(line.replace(b",", sign) if rng.random() < share else line for line in lines)
 

@@ -45,7 +45,8 @@ class NomotoDynamics(Dynamics):
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state after a step; the memory passes through."""
         plant = self.plant
-        speed, rudder = surge(x), x[:, plant.rudder_columns]
+        speed = surge(x)
+        rudder = x[:, plant.rudder_columns]
         start = torch.cat(
             (
                 heading(x).unsqueeze(-1),
@@ -54,12 +55,14 @@ class NomotoDynamics(Dynamics):
             ),
             dim=-1,
         )
-        middle, end = start @ self.to_middle.to(x.dtype), start @ self.to_end.to(x.dtype)
+        middle = start @ self.to_middle.to(x.dtype)
+        end = start @ self.to_end.to(x.dtype)
         # psi and v stand first in the linear system
         psi, v = torch.stack((start[:, :2], middle[:, :2], end[:, :2]), dim=1).unbind(-1)
         north, east = to_earth(speed.unsqueeze(-1), v, psi)
         simpson = self.simpson.to(x.dtype)
-        north, east = x[:, 0] + north @ simpson, x[:, 1] + east @ simpson
+        north = x[:, 0] + north @ simpson
+        east = x[:, 1] + east @ simpson
         after = torch.cat(
             (torch.stack((north, east, end[:, 0], speed), dim=-1), end[:, 1:], rudder), dim=-1
         )

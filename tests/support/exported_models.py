@@ -25,7 +25,8 @@ SIGNALS = SignalsConfig(
 ).with_thrusters()
 NAMES = SIGNALS.build().names
 FEATURES = ("u", "v", "r", "tau_x", "tau_n", "wind_u", "wind_v", "wind_mag")
-LOW, HIGH = (-0.5, -0.6, -0.4, -10.0, -12.0, 0.0, -3.0), (3.0, 0.6, 0.4, 30.0, 32.0, 9.0, 3.0)
+LOW = (-0.5, -0.6, -0.4, -10.0, -12.0, 0.0, -3.0)
+HIGH = (3.0, 0.6, 0.4, 30.0, 32.0, 9.0, 3.0)
 KINDS: dict[str, type[Any]] = load_kinds(HeadConfig)
 # smaller than the defaults, for the sake of time
 SIZES: dict[str, dict[str, Any]] = {
@@ -116,7 +117,8 @@ class AsTensors:
     """A loaded file of a vessel in any format as a module of batches, row by row."""
 
     def __init__(self, loaded: LoadedExport, exported: ExportedVessel) -> None:
-        self.loaded, self.exported = loaded, exported
+        self.loaded = loaded
+        self.exported = exported
         self.size = exported.model.n_state
         self.guard = exported.guard_model(torch.float32)
 
@@ -138,7 +140,9 @@ class AsTensors:
         ).float()
 
     def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        states, flags, x = [self.guard.state_ranges.replace_unaccepted(x0)], [], x0
+        states = [self.guard.state_ranges.replace_unaccepted(x0)]
+        flags = []
+        x = x0
         for k in range(w.shape[1]):
             x, s, outside = self.step(x, w[:, k], s)
             states.append(x)

@@ -10,7 +10,11 @@ import torch
 from residnet.autopilot.heading.controllers import ObservedPolicySpec, PtosConfig
 
 DEG = math.pi / 180
-DT, GAIN, TIME, SPEED, LIMIT = 0.02, 3.47, 3.94, 3.2, 5 * DEG
+DT = 0.02
+GAIN = 3.47
+TIME = 3.94
+SPEED = 3.2
+LIMIT = 5 * DEG
 LAW = PtosConfig(
     lag=0.3, steepness=37.0, share=0.65, damping=0.88, heading_rate=2.0, yaw_rate_rate=5.0,
     push_rate=1.0, cross_rate=0.3,

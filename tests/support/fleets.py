@@ -114,7 +114,8 @@ def _in(
     """Return what changes one log of a fleet, or a share of them."""
 
     def plant(fleet: Fleet, random: Random) -> Planted:
-        logs, count = list(fleet.logs), max(1, round(share * len(fleet.logs)))
+        logs = list(fleet.logs)
+        count = max(1, round(share * len(fleet.logs)))
         concerned = random.choice(len(logs), count, replace=False).tolist()
         for i in concerned:
             logs[i] = change(fleet, logs[i], random)

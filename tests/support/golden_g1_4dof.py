@@ -22,7 +22,9 @@ from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
-DT, EVERY, START = 0.01, 10, 5.0
+DT = 0.01
+EVERY = 10
+START = 5.0
 SETS = {"P06": "patrol_p06", "HYB": "patrol_hyb", "MSS": "patrol_mss"}
 RUDDERS = {"foil": "patrol_p06", "lin": "patrol_p06_linear"}
 COLUMNS = ("x", "y", "phi", "psi", "u", "v", "p", "r", "delta")

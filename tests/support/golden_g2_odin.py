@@ -26,7 +26,9 @@ from residnet.physics.actuators.rudders import WaterJetsConfig
 from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.vessel import load_vessel
 
-DT, EVERY, END = 0.01, 10, 300.0
+DT = 0.01
+EVERY = 10
+END = 300.0
 VESSELS = {"force": "odin_forces", "jet": "odin_jets"}
 # square waves change within steps, where each implementation has its own rounding
 # (golden/README.md)
@@ -183,7 +185,9 @@ def allowed(path: Path, name: str, frame: pd.DataFrame, usual: float) -> float:
 
 
 def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
-    plant, command, has_jets = plant_of(path), recorded(frame), "rpm" in frame
+    plant = plant_of(path)
+    command = recorded(frame)
+    has_jets = "rpm" in frame
     asked = torch.from_numpy(commands(path)(frame["t"].to_numpy()))
     jets = of_kind(load_vessel("odin_jets").actuators, WaterJetsConfig)
     if has_jets:

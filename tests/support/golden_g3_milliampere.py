@@ -35,7 +35,8 @@ from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.physics.hull import MassMatrixConfig
 from residnet.physics.plant import HullPlant
 
-DT, OPEN_DT = 0.02, 0.01
+DT = 0.02
+OPEN_DT = 0.01
 EVERY = {"closed": 5, "open": 10}
 # Table 4.1, row 4 as correction J12 has it; rows 13 to 24 repeat these
 TABLE = (
@@ -52,7 +53,8 @@ STATE = ("x", "y", "psi", "u", "v", "r", "tau_u", "tau_v", "tau_r")
 
 def pid(feedback: bool) -> MotionPIDConfig:
     """Gains by correction J10, or none."""
-    mass, w = np.array([2389.657, 2533.911, 5068.910]), np.array([0.4, 0.4, 0.6])
+    mass = np.array([2389.657, 2533.911, 5068.910])
+    w = np.array([0.4, 0.4, 0.6])
     p = 0.5 * mass * w**2
     return MotionPIDConfig(
         proportional=tuple(feedback * p),
@@ -129,10 +131,13 @@ def flights(folder: Path, scale: float, disturbed: bool, seconds: float) -> dict
     loop = ClosedLoop(controller, guidance)
     states, inputs = run(RecordedPlantDynamics(plant, DT), x0, w, loop)
     every = range(0, steps, EVERY["closed"])
-    reference, waypoint = torch.stack(guidance.asked), torch.stack(guidance.waypoints)
+    reference = torch.stack(guidance.asked)
+    waypoint = torch.stack(guidance.waypoints)
     out = {}
     for i, path in enumerate(files):
-        x, command, desired = states[i, every], inputs[i, every, :3], reference[:, i]
+        x = states[i, every]
+        command = inputs[i, every, :3]
+        desired = reference[:, i]
         forward = believed(desired[:, 6:9], desired[:, 3:6])
         rate = plant.derivative(x, w[i, every])[:, 3:6]
         columns = (x[:, :9], rate, command, forward, command - forward, desired, waypoint[:, i])
@@ -152,7 +157,9 @@ class Watched(Reference):
 
     def __init__(self, guidance: ReferenceFilter, every: int) -> None:
         super().__init__()
-        self.guidance, self.every, self.n_state = guidance, every, guidance.n_state
+        self.guidance = guidance
+        self.every = every
+        self.n_state = guidance.n_state
         self.asked: list[Tensor] = []
         self.waypoints: list[Tensor] = []
 
@@ -213,7 +220,8 @@ def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
     tau = tau + case.disturbed * torch.from_numpy(push)
     yield accelerations(vessel(case.scale).hull, nu, tau, frame)
     believed = vessel(1.0).hull
-    nu_d, nu_dot_d = tensor(frame, "ud", "vd", "rd"), tensor(frame, "dud", "dvd", "drd")
+    nu_d = tensor(frame, "ud", "vd", "rd")
+    nu_dot_d = tensor(frame, "dud", "dvd", "drd")
     water = believed.terms(nu_d).abs() @ believed.coefficients.abs()
     size = ((nu_dot_d @ believed.mass.T).abs() + water).numpy()
     forward = frame[["ff_u", "ff_v", "ff_r"]].to_numpy()
@@ -225,7 +233,8 @@ def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
 def described(case: Flight | OpenLoop) -> Any:
     if isinstance(case, OpenLoop):
         return case.force
-    frequency, laps = case.guidance.frequency[0], case.guidance.duration / 720.0
+    frequency = case.guidance.frequency[0]
+    laps = case.guidance.duration / 720.0
     return case.scale, case.disturbed, frequency, case.feedback, laps
 
 

@@ -29,7 +29,8 @@ from residnet.physics.plant import HullPlant
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
-DT, EVERY = 0.01, 5
+DT = 0.01
+EVERY = 5
 VESSELS = {"CAL": "wam_v_cal", "VRXNEW": "wam_v_vrx"}
 
 
@@ -106,11 +107,10 @@ def by_row(path: Path, frame: pd.DataFrame) -> Iterator[Row]:
     if is_linear(path):
         return
     plant = of_kind(load_vessel(case_of(path).vessel).build(), HullPlant)
-    forces, n = (
-        of_kind(plant.actuators, Thrusters).thruster_forces,
-        tensor(frame, "n_port", "n_stbd") / 60,
-    )
-    thrust, truth = forces.thrust_at(n).numpy(), frame[["T_port", "T_stbd"]].to_numpy()
+    forces = of_kind(plant.actuators, Thrusters).thruster_forces
+    n = tensor(frame, "n_port", "n_stbd") / 60
+    thrust = forces.thrust_at(n).numpy()
+    truth = frame[["T_port", "T_stbd"]].to_numpy()
     # the printed polynomial cancels near zero thrust, where only its largest term bounds the
     # rounding
     yield "thrust", thrust, truth, 1e-12 * (np.abs(truth) + 3.8)

@@ -36,7 +36,8 @@ from residnet.physics.nomoto import NomotoConfig, NomotoVessel
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 
-GAIN, TIME = 3.47, 3.94
+GAIN = 3.47
+TIME = 3.94
 LIMIT = float(np.radians(5.0))
 PATROL = {"P06": "patrol_p06", "HYB": "patrol_hyb", "MSS": "patrol_mss"}
 THRUST = 1960 * 7.71**2
@@ -131,7 +132,8 @@ def time_optimal(heading: str | None = None) -> Case:
 
 
 def patrol_document(spacing: float, parameters: str, horizon: str, tau: str | None) -> Case:
-    plant, h = patrol(parameters), float(horizon)
+    plant = patrol(parameters)
+    h = float(horizon)
     # whole steps of at most 0.25 s make both the spacing of the rows and the horizon
     dt = min(spacing / np.ceil(spacing / 0.25 - 1e-9), h)
     model = RecordedPlantDynamics(plant, dt)

@@ -54,7 +54,8 @@ def draw(
     late = z[delay:].copy()
     late[:, 3:] = z[: len(z) - delay, 3:]
     values = TermLibrary(terms, CHANNELS)(torch.from_numpy(late)).numpy()
-    targets, truth = [], []
+    targets = []
+    truth = []
     for kind in ("product", "magnitude", "ratio"):
         chosen, y = _equation(random, terms, values, kind, noise)
         weight = np.linalg.lstsq(values[:, chosen], y, rcond=None)[0]
@@ -119,7 +120,8 @@ def draw_ship(
     random = np.random.default_rng(seed)
     z = record(random, count, step, astern=True)
     z[:, 3] += 7.0 * ratios
-    targets, truth = [], []
+    targets = []
+    truth = []
     for groups, over in zip(SHIP, OVER, strict=True):
         if ratios:
             told = [tuple(term for term in group if "|n|" not in term) for group in groups]
@@ -164,7 +166,8 @@ def record(
 def _sines(random: np.random.Generator, count: int, step: float) -> np.ndarray:
     t = np.arange(count) * step
     period = np.exp(random.uniform(np.log(3.0), np.log(60.0), 6))
-    phase, share = random.uniform(0, 2 * np.pi, 6), random.uniform(0.3, 1.0, 6)
+    phase = random.uniform(0, 2 * np.pi, 6)
+    share = random.uniform(0.3, 1.0, 6)
     wave = np.asarray((share * np.sin(2 * np.pi * t[:, None] / period + phase)).sum(axis=1))
     return wave / wave.std()
 

@@ -52,10 +52,12 @@ def random_states(count: int, rng: np.random.Generator) -> np.ndarray:
 
 def random_runs(count: int, rng: np.random.Generator, mean: float) -> np.ndarray:
     """[T] bool in runs of random length."""
-    out, value = np.zeros(count, dtype=bool), bool(rng.random() < 0.5)
+    out = np.zeros(count, dtype=bool)
+    value = bool(rng.random() < 0.5)
     k = 0
     while k < count:
         length = 1 + int(rng.exponential(mean))
         out[k : k + length] = value
-        value, k = not value, k + length
+        value = not value
+        k = k + length
     return out

@@ -10,7 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 A, R = (6244.15, -178.46, 0.881043), (85.8316, -1.7935, 0.00533)
-KNOTS, SURGE, YAW, LEVER = 1.94, 2.026e-4, 4.78e-5, -3.82
+KNOTS = 1.94
+SURGE = 2.026e-4
+YAW = 4.78e-5
+LEVER = -3.82
 FORCE_TRUTH = {
     "u_dot": {"tau_x": SURGE, "v r": 1.0, "u": -0.0101, "u |u|": -0.0492},
     "v_dot": {"tau_y": SURGE, "u r": -1.0, "v": -0.045, "v |v|": -0.4052},
@@ -51,9 +54,11 @@ def force_rate(z: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def jet_rate(z: Mapping[str, np.ndarray]) -> np.ndarray:
     """Accelerations [3, T]."""
-    speed, rpm = KNOTS * z["u"], z["rpm"]
+    speed = KNOTS * z["u"]
+    rpm = z["rpm"]
     thrust = (A[0] + A[1] * speed + A[2] * speed**2) * (R[0] + R[1] * rpm + R[2] * rpm**2) / 4530
-    along, across = 2 * thrust * np.cos(z["nozzle"]), 2 * thrust * np.sin(z["nozzle"])
+    along = 2 * thrust * np.cos(z["nozzle"])
+    across = 2 * thrust * np.sin(z["nozzle"])
     return force_rate({**z, "tau_x": along, "tau_y": across, "tau_n": LEVER * across})
 
 
@@ -82,7 +87,8 @@ def simulate(
     known = {
         name: np.stack([design[name](stage) for design in designs], axis=-1) for name in designs[0]
     }
-    x, path = np.zeros((len(states), len(designs))), []
+    x = np.zeros((len(states), len(designs)))
+    path = []
 
     def f(x: np.ndarray, k: int, s: int) -> np.ndarray:
         return rate(
@@ -122,7 +128,8 @@ def multisine(
 ) -> Callable[[np.ndarray], np.ndarray]:
     """A sum of sines with random periods (in s), phases and shares."""
     period = np.exp(seed.uniform(np.log(periods[0]), np.log(periods[1]), count))
-    phase, share = seed.uniform(0, 2 * np.pi, count), seed.dirichlet(np.full(count, 3.0))
+    phase = seed.uniform(0, 2 * np.pi, count)
+    share = seed.dirichlet(np.full(count, 3.0))
     return lambda t: (
         mean
         + amplitude

@@ -184,6 +184,8 @@ def made_run(run: Path, *, split: str = "test") -> Path:
 
 def write_fit_page(run: RunFiles) -> Path:
     """Write `report.html` of a fit or an evaluation with the figures that stand in its folder."""
-    title, said = str(run.metrics.get("run") or run.path.name), verdict.verdict_sentences(run)
-    level, sections = verdict.verdict_level(run), fit_sections(run)
+    title = str(run.metrics.get("run") or run.path.name)
+    said = verdict.verdict_sentences(run)
+    level = verdict.verdict_level(run)
+    sections = fit_sections(run)
     return write_page(run.path, title, run.description, said, sections, level=level)

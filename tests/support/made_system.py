@@ -80,7 +80,8 @@ def trials(
     steps = round(seconds / STEP)
     w = inputs(count, steps, seed)
     with torch.no_grad():
-        start, memory = torch.zeros(count, 6, dtype=torch.float64), torch.zeros(count, 0)
+        start = torch.zeros(count, 6, dtype=torch.float64)
+        memory = torch.zeros(count, 0)
         states = Rollout(truth())(start, w, memory)[0][:, :-1].numpy()
     states[:, :, 3:] += noise * np.random.default_rng([seed, 1]).standard_normal((count, steps, 3))
     config = PrepareConfig.model_validate(
@@ -111,7 +112,8 @@ def free_run_error(model: HybridDynamics, seed: int = 99, seconds: float = 30.0)
     units of the scales.
     """
     w = inputs(6, round(seconds / STEP), seed)
-    own, theirs = truth(), model.double().eval()
+    own = truth()
+    theirs = model.double().eval()
     x0 = torch.zeros(6, 6, dtype=torch.float64)
     with torch.no_grad():
         a = Rollout(own)(x0, w, torch.zeros(6, 0))[0]

@@ -66,8 +66,10 @@ def edited(root: Any, rng: random.Random) -> str:
     if not every:
         return "nothing to edit"
     try:
-        keys, how = rng.choice(every), rng.randrange(10)
-        parent, key = at(root, keys[:-1]), keys[-1]
+        keys = rng.choice(every)
+        how = rng.randrange(10)
+        parent = at(root, keys[:-1])
+        key = keys[-1]
         if how < 2:
             del parent[key]
         elif how == 2 and isinstance(key, str) and key:
@@ -77,7 +79,8 @@ def edited(root: Any, rng: random.Random) -> str:
         else:
             kind, change = rng.choice(CHANGES)
             fit = [k for k in every if isinstance(at(root, k), kind)] or every
-            keys, other = rng.choice(fit), rng.choice(fit)
+            keys = rng.choice(fit)
+            other = rng.choice(fit)
             put(root, keys, copy.deepcopy(change(at(root, keys), at(root, other), rng)))
     except (IndexError, KeyError, TypeError, OverflowError):
         # a value has gone into itself or is no number any more
@@ -151,7 +154,8 @@ def mutated_folder(run: Path, foreign: Sequence[Path], rng: random.Random) -> st
     if how == "edit" and path.suffix in (".json", ".yaml"):
         # any JSON is YAML
         content = yaml.safe_load(path.read_text())
-        told, as_json = edited(content, rng), path.suffix == ".json"
+        told = edited(content, rng)
+        as_json = path.suffix == ".json"
         text = json.dumps(content) if as_json else yaml.safe_dump(content, sort_keys=False)
         path.write_text(text, errors="surrogatepass")
         return f"{name}: {told}"
@@ -178,7 +182,8 @@ def _edited_table(path: Path, rng: random.Random) -> str:
     import pandas as pd
 
     table = pd.read_parquet(path)
-    column, how = str(rng.choice(list(table))), rng.randrange(5)
+    column = str(rng.choice(list(table)))
+    how = rng.randrange(5)
     changes: list[Callable[[], pd.DataFrame]] = [
         lambda: table.drop(columns=[column]),
         lambda: table.iloc[:0],

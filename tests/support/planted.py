@@ -256,7 +256,8 @@ def _nan(ship: Ship, log: Log, random: Random) -> Log:
 def _spiky(ship: Ship, log: Log, random: Random) -> Log:
     size = {"x": 3.0, "y": 3.0, "psi": 0.3, "u": 0.8, "v": 0.8, "r": 0.08}
     name = str(random.choice(list(size)))
-    values, count = log[name].copy(), max(len(log) // 200, 5)
+    values = log[name].copy()
+    count = max(len(log) // 200, 5)
     at = random.choice(np.arange(10, len(log) - 10), count, replace=False)
     values[at] += size[name] * random.choice([-1.0, 1.0], count) * random.uniform(1.0, 2.0, count)
     return changed(log, **{name: values})
@@ -361,7 +362,8 @@ def _rudder_clipped(ship: Ship, log: Log, random: Random) -> Log:
 @fault("15 s interpolated", "interpolated", ships=())
 def _interpolated(ship: Ship, log: Log, random: Random) -> Log:
     count = max(round(15.0 / step_of(log)), 30)
-    start, at = int(random.integers(len(log) // 5, len(log) - count - 10)), np.arange(len(log))
+    start = int(random.integers(len(log) // 5, len(log) - count - 10))
+    at = np.arange(len(log))
     out = (at <= start) | (at >= start + count)
     return changed(log, **{n: np.interp(at, at[out], log[n][out]) for n in _MOTION})
 
@@ -405,7 +407,8 @@ def _one_cell(name: str, value: Callable[[Random, float, float], float]) -> None
         # a wind may come from anywhere at any moment
         names = [n for n in log.channels if float(np.ptp(log[n])) > 1e-6 and n != "wind_dir"]
         channel = str(random.choice(names))
-        values, at = log[channel].copy(), int(random.integers(20, len(log) - 20))
+        values = log[channel].copy()
+        at = int(random.integers(20, len(log) - 20))
         low, high = np.nanquantile(values, (0.01, 0.99))
         values[at] = value(random, values[at], float(high - low))
         return changed(log, **{channel: values})
@@ -457,7 +460,8 @@ def _steady(ship: Ship, logs: list[Log], random: Random) -> list[Log]:
     noise = {"x": 0.03, "y": 0.03, "psi": 0.003, "u": 0.03, "v": 0.03, "r": np.radians(0.05)}
     out = []
     for log in logs:
-        speed, count = float(np.nanmax(log["u"])), len(log)
+        speed = float(np.nanmax(log["u"]))
+        count = len(log)
         level = dict.fromkeys(_MOTION, 0.0) | {"x": speed * log.t, "u": speed}
         channels = {n: np.full(count, float(np.median(v))) for n, v in log.channels.items()}
         channels |= {n: level[n] + noise[n] * random.standard_normal(count) for n in _MOTION}

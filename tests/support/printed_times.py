@@ -12,7 +12,8 @@ EPOCH = 1_700_000_000
 
 def printed(ns: np.ndarray, style: str) -> np.ndarray:
     """Dates of ns since 1970, with fractions of a second as a source would print them."""
-    seconds, rest = ns // 10**9, ns % 10**9
+    seconds = ns // 10**9
+    rest = ns % 10**9
     styles: dict[str, Callable[[int], str]] = {
         "padded": lambda k: f"{k:09d}",
         "unpadded": str,

@@ -141,10 +141,15 @@ def fly(
     x, y, psi, u, v, r = (np.zeros(count) for _ in range(6))
     psi = random.uniform(-3.0, 3.0, count)
     u = np.full(count, 0.7)
-    side, drive = np.zeros(count), np.full(count, 0.8)
-    turn, power = np.zeros(count), np.full(count, 0.8)
-    course, until, powered = psi.copy(), np.zeros(count), np.zeros(count)
-    angle, limit = random.uniform(0.17, 0.52, count), random.uniform(0.17, 0.4, count)
+    side = np.zeros(count)
+    drive = np.full(count, 0.8)
+    turn = np.zeros(count)
+    power = np.full(count, 0.8)
+    course = psi.copy()
+    until = np.zeros(count)
+    powered = np.zeros(count)
+    angle = random.uniform(0.17, 0.52, count)
+    limit = random.uniform(0.17, 0.4, count)
     sign = random.choice([-1.0, 1.0], count)
     gusts = np.zeros((3, count))
     out = {
@@ -207,7 +212,8 @@ def log_of(
     noisy: float = 1.0,
 ) -> Log:
     count = len(flight["x"])
-    length, speed = float(vessels.length[i]), float(vessels.speed[i])
+    length = float(vessels.length[i])
+    speed = float(vessels.speed[i])
     scale = {"x": length, "y": length, "psi": 1.0, "u": speed, "v": speed, "r": speed / length}
     accuracy = noisy * random.uniform(0.3, 1.5)
     noise = {"x": 0.005, "y": 0.005, "psi": 0.003, "u": 0.01, "v": 0.01, "r": 0.005}
@@ -215,7 +221,9 @@ def log_of(
         name: size * (flight[name][:, i] + accuracy * noise[name] * random.standard_normal(count))
         for name, size in scale.items()
     }
-    side, drive, most = flight["side"][:, i], flight["drive"][:, i], float(vessels.revolutions[i])
+    side = flight["side"][:, i]
+    drive = flight["drive"][:, i]
+    most = float(vessels.revolutions[i])
     if kind == "twin":
         channels |= {"n_port": most * drive * (1.0 + side), "n_stbd": most * drive * (1.0 - side)}
     else:

@@ -154,7 +154,8 @@ def topics(log: Log, folder: Path) -> Path:
 
 def bag1(log: Log, folder: Path) -> Path:
     """ROS 1 bag."""
-    path, store = folder / "trial.bag", get_typestore(Stores.ROS1_NOETIC)
+    path = folder / "trial.bag"
+    store = get_typestore(Stores.ROS1_NOETIC)
     with Writer1(path) as writer:
         _messages(log, writer, store, store.serialize_ros1)
     return path
@@ -187,12 +188,15 @@ def _messages(log: Log, writer: Any, store: Any, serialize: Callable[[Any, str],
     """Odometry by REP-103 with header stamps, commands as std_msgs/Float64 at the arrival of the
     odometry.
     """
-    odometry, number = "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"
+    odometry = "nav_msgs/msg/Odometry"
+    number = "std_msgs/msg/Float64"
     kinds = {"odometry": odometry, **dict.fromkeys(COMMANDS, number)}
     to = {n: writer.add_connection(f"/{n}", kind, typestore=store) for n, kind in kinds.items()}
     types = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
     qx, qy, qz, qw = _quaternion(log)
-    vector, none, clock = types["Vector3"], np.zeros(36), store.types["builtin_interfaces/msg/Time"]
+    vector = types["Vector3"]
+    none = np.zeros(36)
+    clock = store.types["builtin_interfaces/msg/Time"]
     for i, at in enumerate(_stamps(log).tolist()):
         time = clock(sec=at // 10**9, nanosec=at % 10**9)
         extra = {"seq": i} if "seq" in types["Header"].__dataclass_fields__ else {}

@@ -54,10 +54,8 @@ def nmea(log: Log, folder: Path) -> Path:
     for i, t in enumerate(log.t.tolist()):
         clock = 9 * 3600 + 15 * 60 + 45 + t
         moment = f"{int(clock // 3600):02d}{int(clock // 60 % 60):02d}{clock % 60:05.2f}"
-        speed, course = (
-            np.hypot(north[i], east[i]) * 3600 / 1852,
-            np.degrees(np.arctan2(east[i], north[i])) % 360,
-        )
+        speed = np.hypot(north[i], east[i]) * 3600 / 1852
+        course = np.degrees(np.arctan2(east[i], north[i])) % 360
         fix = f"{_degrees(latitude[i], 2)},N,{_degrees(longitude[i], 3)},E"
         sentences = [
             f"GPRMC,{moment},A,{fix},{speed:.6f},{course:.6f},110425,,,A",

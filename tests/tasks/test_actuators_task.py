@@ -82,7 +82,8 @@ def test_a_clock_that_stands_still_and_a_pull_one_way_only_are_refused(
 ) -> None:
     table = pd.read_csv(tmp_path / "bollard.csv")
     table[table["rpm"] > 0].to_csv(tmp_path / "bollard.csv", index=False)
-    file, run = write_yaml(tmp_path / "a.yaml", config), tmp_path / "run"
+    file = write_yaml(tmp_path / "a.yaml", config)
+    run = tmp_path / "run"
     said = command("run", file, "--out", run)
     assert said.code == 1
     assert "bollard pull astern: 0 points" in said.err

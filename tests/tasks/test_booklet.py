@@ -68,7 +68,8 @@ def test_pages_hold_values_with_intervals_and_limits_beside_measured_ones(
     booklet = read_json(run / "booklet.json")
     pages = {page["name"]: page for page in booklet["pages"]}
     assert booklet["draws"] == 20
-    circle, zigzag = pages["circle"]["indices"], pages["ten_ten"]["indices"]
+    circle = pages["circle"]["indices"]
+    zigzag = pages["ten_ten"]["indices"]
     for found in (*circle.values(), *zigzag.values()):
         low, high = found["interval"]
         assert low <= high

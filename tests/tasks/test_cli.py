@@ -79,7 +79,8 @@ def test_a_finished_run_is_exported(
 def test_a_fit_to_csv_is_evaluated_and_exported(
     csv: Path, tmp_path: Path, command: Command
 ) -> None:
-    out, external = tmp_path / "run", tmp_path / "external"
+    out = tmp_path / "run"
+    external = tmp_path / "external"
     assert command("run", csv, "--out", out, "-s", "export.models=[selected]").code == 0
     content = read_json(out / "metrics.json")
     assert {row["split"] for row in content["rows"]} == {"train", "validation", "test"}
@@ -121,7 +122,8 @@ def test_inspect_tells_what_misleads_and_drafts_a_channel_map(
     assert said.code == 0
     assert "log_5" in said.out
     assert "regressors of baseline over these logs: 5 move, condition number" in said.out
-    path, found = tmp_path / "logs" / "log_0.csv", tmp_path / "found.json"
+    path = tmp_path / "logs" / "log_0.csv"
+    found = tmp_path / "found.json"
     table = pd.read_csv(path)
     table.assign(psi=-table["psi"]).to_csv(path, index=False)
     said = command("inspect", path, "--config", csv, "--out", found)

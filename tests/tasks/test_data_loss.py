@@ -177,7 +177,8 @@ def test_report_deletes_only_figures_that_it_recorded(
 def test_links_lead_no_command_out_of_the_run(
     name: str, tiny_run: Path, tmp_path: Path, command: Command
 ) -> None:
-    run, outside = tmp_path / "run", tmp_path / "outside"
+    run = tmp_path / "run"
+    outside = tmp_path / "outside"
     shutil.copytree(tiny_run, run)
     if (run / name).is_dir():
         shutil.move(run / name, outside)

@@ -49,7 +49,8 @@ def test_the_folder_holds_models_as_plain_numbers_and_what_was_found(tiny_run: P
 def test_the_card_of_an_export_holds_what_the_run_says(tiny_run: Path) -> None:
     extra = {"card.json": ""}
     torch.jit.load(str(tiny_run / "exports" / "lstm.pt"), _extra_files=extra)
-    card, doctor = json.loads(extra["card.json"]), read_json(tiny_run / "doctor.json")
+    card = json.loads(extra["card.json"])
+    doctor = read_json(tiny_run / "doctor.json")
     summary = read_json(tiny_run / "summary.json")
     assert card["level"] in LEVEL_TEXTS
     assert all(sentence.strip() for sentence in card["verdict"])

@@ -76,7 +76,8 @@ def test_the_length_of_the_test_logs_enters_no_choice() -> None:
 
 
 def test_free_runs_are_as_short_as_gaps_ask_for(tmp_path: Path, logs: list[Log]) -> None:
-    random, (log, *_) = np.random.default_rng(1), logs
+    random = np.random.default_rng(1)
+    (log, *_) = logs
     holes = {
         name: np.where(random.random(len(log)) < 0.5, np.nan, values)
         for name, values in log.channels.items()

@@ -63,7 +63,8 @@ def test_a_refit_leaves_the_old_run_alone_and_can_be_exported(
     run: Path, tmp_path: Path, command: Command
 ) -> None:
     before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file()}
-    logs, out = new_logs(tmp_path / "logs", 0.2), tmp_path / "refit"
+    logs = new_logs(tmp_path / "logs", 0.2)
+    out = tmp_path / "refit"
     given = ["monitor", run, *logs, "--model", "baseline", "--window", "5 s", "--refit", out]
     said = command(*given, "--out", tmp_path / "page")
     assert said.code == 1
@@ -102,7 +103,8 @@ def test_a_refit_leaves_the_old_run_alone_and_can_be_exported(
 
 
 def test_clean_logs_are_not_refitted(run: Path, tmp_path: Path, command: Command) -> None:
-    logs, out = new_logs(tmp_path / "logs", 0.0), tmp_path / "refit"
+    logs = new_logs(tmp_path / "logs", 0.0)
+    out = tmp_path / "refit"
     given = [*logs, "--model", "baseline", "--window", "5 s", "--refit", out]
     said = command("monitor", run, *given)
     assert said.code == 0

@@ -113,7 +113,9 @@ def test_a_model_flies_beside_its_vessel_and_alone(tiny_run: Path, tmp_path: Pat
     assert names == {"three_two_one_one_01", "random_steps_01"}
     assert set(both) == {f"{place}/{name}" for place in ("logs", "model_logs") for name in names}
     for name in names:
-        log, other, true = both[f"model_logs/{name}"], alone[f"logs/{name}"], both[f"logs/{name}"]
+        log = both[f"model_logs/{name}"]
+        other = alone[f"logs/{name}"]
+        true = both[f"logs/{name}"]
         for channel in log.channels:
             np.testing.assert_array_equal(log[channel], other[channel])
         np.testing.assert_array_equal(log["cmd_port"], true["cmd_port"])
@@ -136,7 +138,8 @@ def test_a_manoeuvre_that_never_ends_is_an_error_where_it_is_listed(
 ) -> None:
     """Its log says it too; of those that are drawn it is a line."""
     lazy = ZIGZAG | {"steer": 0.0, "heading": "20 deg", "reversals": 2, "duration": 8}
-    run, programme = tmp_path / "run", VESSEL | {"manoeuvres": [lazy, PATTERN]}
+    run = tmp_path / "run"
+    programme = VESSEL | {"manoeuvres": [lazy, PATTERN]}
     said = command("run", of(run, programme=programme), "--out", run)
     assert said.code == 1
     [error] = [line for line in said.err.splitlines() if line.startswith("residnet:")]
@@ -159,7 +162,8 @@ def test_a_replay_gives_the_log_again(ship: Path, tmp_path: Path) -> None:
     replay = [{"kind": "replay", "log": str(ship / "logs" / f"{name}.parquet")} for name in names]
     logs = flown(tmp_path / "run", programme=VESSEL | {"manoeuvres": replay, "families": []})
     for name, source in zip(("replay_01", "replay_02"), names, strict=True):
-        mine, log = logs[f"logs/{name}"], Log.load(ship / "logs" / f"{source}.parquet")
+        mine = logs[f"logs/{name}"]
+        log = Log.load(ship / "logs" / f"{source}.parquet")
         assert len(log) - len(mine) in (0, 1)
         for channel in log.channels:
             np.testing.assert_allclose(mine[channel], log[channel][: len(mine)], atol=1e-9)

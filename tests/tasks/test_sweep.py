@@ -55,7 +55,8 @@ def test_a_grid_is_searched_whole_and_resumed(
     sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
     out = tmp_path / "out"
-    real, begun = running.run_sweep_trial, []
+    real = running.run_sweep_trial
+    begun = []
 
     def killed(*words: Any) -> Any:
         begun.append(words[3])
@@ -126,7 +127,8 @@ def test_a_poor_trial_is_ended_early(sweep: Path, tmp_path: Path) -> None:
         for epoch in (1, 2):
             told(Progress("training ridge", epoch, 2, score=level / epoch))
         trials.study.tell(number, level)
-    good, poor = heard(3), heard(4)
+    good = heard(3)
+    poor = heard(4)
     good(Progress("training ridge", 1, 2, score=1.5))
     good(Progress("training other", 1, 2, score=9.0))
     with pytest.raises(optuna.TrialPruned):

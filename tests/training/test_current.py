@@ -157,7 +157,8 @@ def test_a_log_without_samples_is_named() -> None:
 def test_standard_errors_hold_where_the_regressors_are_not_the_true_ones() -> None:
     """Lines in every channel cannot be this hull; the halves of the logs disagree, and say so."""
     logs, truth = sailed(drifting=True)
-    logs, truth = logs[:12], truth[:12]
+    logs = logs[:12]
+    truth = truth[:12]
     signals = SIGNALS.build()
     linear = LINEAR.build(signals.names)
     found, table = estimate_currents(linear, signals, logs[3:], CurrentConfig(), logs[:3])

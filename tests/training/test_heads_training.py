@@ -77,7 +77,8 @@ A = np.array([[-0.4, 0.1, 0.0], [0.0, -0.9, -0.2], [0.05, 0.1, -0.8]])
 B = np.array([[1.0, 0.0], [0.0, 0.1], [0.0, 1.0]])
 C = np.array([0.02, -0.01, 0.03])
 THETA = torch.from_numpy(np.concatenate((C[:, None], A, B), axis=1))
-BATCH, STEPS = 5, 12
+BATCH = 5
+STEPS = 12
 RANDOM = np.random.default_rng(0)
 Y = torch.from_numpy(RANDOM.normal(size=(BATCH, STEPS, 6)))
 W = inputs(BATCH, STEPS, 1)
@@ -123,7 +124,8 @@ def euler() -> Rollout:
 def test_one_step_loss_is_the_mean_square_over_what_counts() -> None:
     model = with_mlp()
     first, last = layers(model)
-    total, count = 0.0, 0
+    total = 0.0
+    count = 0
     for b in range(BATCH):
         for k in range(STEPS):
             if COUNTED[b, k]:
@@ -131,14 +133,18 @@ def test_one_step_loss_is_the_mean_square_over_what_counts() -> None:
                 hidden = np.tanh(first.weight.detach().numpy() @ z + first.bias.detach().numpy())
                 rho = last.weight.detach().numpy() @ hidden + last.bias.detach().numpy()
                 error = NU_DOT[b, k].numpy() - A @ z[:3] - B @ z[3:] - C - rho
-                total, count = total + float(np.sum((error / UNITS.numpy()) ** 2)), count + 3
+                total = total + float(np.sum((error / UNITS.numpy()) ** 2))
+                count = count + 3
     assert 0 < count < 3 * BATCH * STEPS
     assert one_step(model, NU_DOT, COUNTED).item() == pytest.approx(total / count, rel=1e-12)
 
 
 @pytest.mark.parametrize("robust", [0.0, 0.1])
 def test_what_does_not_count_does_not_matter(robust: float) -> None:
-    model, bad, wild, y = with_mlp(), ~COUNTED, NU_DOT.clone(), Y.clone()
+    model = with_mlp()
+    bad = ~COUNTED
+    wild = NU_DOT.clone()
+    y = Y.clone()
     wild[bad] = y[bad] = 1e6
     assert one_step(model, wild, COUNTED).item() == one_step(model, NU_DOT, COUNTED).item()
     masked, same = (
@@ -180,7 +186,8 @@ def test_a_rollout_that_runs_away_counts_by_its_error() -> None:
 
 
 def test_robust_loss_is_the_mean_of_window_errors() -> None:
-    nu, robust = Y[:, :, 3:].numpy(), 0.05
+    nu = Y[:, :, 3:].numpy()
+    robust = 0.05
     error = (by_euler() - nu) / UNITS.numpy()
     expected = np.mean(
         [np.sqrt(np.mean(error[b][COUNTED[b].numpy()] ** 2) + robust**2) for b in range(BATCH)]
@@ -413,7 +420,8 @@ def test_rollouts_start_from_the_measured_past(logs: Sequence[PreparedLog]) -> N
 
     @torch.no_grad()
     def by_hand(first: int, past: int, x: Tensor) -> float:
-        rows, total = slice(first - past, first), 0.0
+        rows = slice(first - past, first)
+        total = 0.0
         s = plain.model.warmup(y[:, rows], w[:, rows])
         for k in range(first, first + 5):
             x, s = plain.model.step(x, w[:, k], s)

@@ -94,7 +94,9 @@ def windy(
             baseline.theta[axis, baseline.library.terms.index(name)] = -0.7
     model = HybridDynamics(signals, baseline, ZeroHead(signals.names), STEP, integrator)
     active = torch.nonzero(baseline.term_mask.flatten() > 0).squeeze(1)
-    batch, steps, count = 5, 25, len(active)
+    batch = 5
+    steps = 25
+    count = len(active)
     wind = torch.from_numpy(random.uniform([2, -3], [6, 3], size=(batch, 1, 2))).expand(
         -1, steps, -1
     )
@@ -140,7 +142,8 @@ def test_sensitivities_are_those_of_the_rollout(integrator: Integrator) -> None:
     """Central differences of the one time loop, heading included: the wind makes it matter."""
     model, problem = windy(integrator, ROLLS)
     assert isinstance(model.baseline, RegressorBaseline)
-    theta, count = model.baseline.theta.data.view(-1), len(problem.free)
+    theta = model.baseline.theta.data.view(-1)
+    count = len(problem.free)
     memory = model.initial_state(len(problem.x0)).double()
 
     def rolled(place: int, change: float) -> Tensor:
@@ -172,7 +175,8 @@ def test_sensitivities_are_those_of_the_rollout(integrator: Integrator) -> None:
 
 def test_noisy_starts_teach_no_damping_where_they_are_estimated() -> None:
     """Free runs from exact starts, of models refitted to free runs from noisy ones."""
-    logs, off = trials(count=8, noise=0.06), {}
+    logs = trials(count=8, noise=0.06)
+    off = {}
     for starts in ("measured", "estimated"):
         model, known, store = fitted(QUADRATIC, logs)
         content = {"horizon": 4.0, "every": 4.0, "prior": 0.0, "starts": starts}
@@ -308,7 +312,8 @@ def test_one_step_goes_where_a_refit_without_the_logs_goes() -> None:
     logs = trials()[:4]
     config = RefitConfig(horizon=4.0, every=4.0, iterations=4, prior=1e-4)
     model = model_of(LINEAR)
-    known, store = make_samples(logs, model.signals), WindowStore.from_logs(logs, torch.float64)
+    known = make_samples(logs, model.signals)
+    store = WindowStore.from_logs(logs, torch.float64)
     RegressorsConfig(terms=tuple(LINEAR)).fit_preferred(model.baseline, known)
     assert isinstance(model.baseline, ParametricBaseline)
     first = model.baseline.theta.detach().clone()
@@ -319,7 +324,8 @@ def test_one_step_goes_where_a_refit_without_the_logs_goes() -> None:
     found = estimate_leave_one_out(model, known, store, config, SCALES, fold)
     assert len(found) == 2
     torch.testing.assert_close(model.baseline.theta.detach(), whole)
-    apart, moved = 0.0, 0.0
+    apart = 0.0
+    moved = 0.0
     for k, theta in enumerate(found):
         kept = [log for i, log in enumerate(logs) if i % 2 != k]
         other = copy.deepcopy(model)

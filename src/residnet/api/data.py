@@ -403,7 +403,8 @@ def prepare(
                 section[key] = value
         signals_config = validate_config(to_builtin(signals), SignalsConfig, "prepare")
         preparation = validate_config(to_builtin(preparation_settings), PrepareConfig, "prepare")
-        prepared, step = _prepare_splits(splits, signals_config, preparation), preparation.grid.step
+        prepared = _prepare_splits(splits, signals_config, preparation)
+        step = preparation.grid.step
         durations = {
             split: [longest_segment_length(log) * step for log in members]
             for split, members in prepared.items()
@@ -421,7 +422,8 @@ def prepare(
 def _prepare_splits(
     splits: Mapping[str, Sequence[Log]], signals: SignalsConfig, config: PrepareConfig
 ) -> dict[str, list[PreparedLog]]:
-    n_done, total = 0, sum(map(len, splits.values()))
+    n_done = 0
+    total = sum(map(len, splits.values()))
     prepared: dict[str, list[PreparedLog]] = {}
     for split, members in splits.items():
         prepared[split] = paged.PageReleasingList()

@@ -80,7 +80,8 @@ class FreeRuns:
     @cached_property
     def windows(self) -> list[StoredWindow]:
         """All windows, in the form that `RunFiles` reads from a run folder."""
-        logs, tables = self.evaluation.logs, self.table.groupby("log", sort=False)
+        logs = self.evaluation.logs
+        tables = self.table.groupby("log", sort=False)
         kinds = {log.log.name: log.log.manoeuvre for log in logs}
         return [
             window
@@ -235,7 +236,8 @@ def free_run(
                 f" prepare them with step={model.dt:g}"
             )
     split = split or ("test" if "test" in data.splits else next(iter(data.splits)))
-    spec, divergence = model_list[0].spec, data.evaluation.divergence
+    spec = model_list[0].spec
+    divergence = data.evaluation.divergence
     velocity_bounds = compute_velocity_limits(
         np.array(spec.low), np.array(spec.high), divergence, spec.signals.dof
     )
@@ -265,7 +267,8 @@ class Models(dict[str, Model]):
 
     def __init__(self, identified: IdentifiedModels, data: Dataset) -> None:
         super().__init__({name: Model(fitted_model) for name, fitted_model in identified.items()})
-        self.identified, self.data = identified, data
+        self.identified = identified
+        self.data = data
         self.settings: FitSettings = identified.settings
 
     @cached_property

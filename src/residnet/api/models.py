@@ -71,17 +71,14 @@ class Model:
     """
 
     def __init__(self, fitted_model: FittedModel) -> None:
-        self.fitted_model, self.name, self.module = (
-            fitted_model,
-            fitted_model.name,
-            fitted_model.model,
-        )
+        self.fitted_model = fitted_model
+        self.name = fitted_model.name
+        self.module = fitted_model.model
         self.spec: ModelSpec = fitted_model.spec
-        self.role, self.dt = str(self.spec.role), self.spec.dt
-        self.states, self.inputs = (
-            self.spec.signals.dof.state_names,
-            self.spec.signals.input_columns,
-        )
+        self.role = str(self.spec.role)
+        self.dt = self.spec.dt
+        self.states = self.spec.signals.dof.state_names
+        self.inputs = self.spec.signals.input_columns
         self.units = self.spec.signals.channel_units()
         self.notes = dict(fitted_model.notes)
 
@@ -279,7 +276,8 @@ def load(folder: PathLikeArg, name: str | None = None, *, trust: bool = False) -
         verify_checksums(model_folder)
         spec, module = load_model(model_folder)
         # a model saved outside of a run has neither notes nor bands
-        notes, bands = model_folder / "fit.json", model_folder.parent.parent / "bands.json"
+        notes = model_folder / "fit.json"
+        bands = model_folder.parent.parent / "bands.json"
         return Model(
             FittedModel(
                 spec,
@@ -421,7 +419,8 @@ class Monitor:
         change_detector = ChangeDetector.from_logs(
             model.spec, copy.deepcopy(model.module), logs, config
         )
-        self._model, self._detector = model, OnlineChangeDetector(change_detector)
+        self._model = model
+        self._detector = OnlineChangeDetector(change_detector)
         self.verdict: MonitorVerdict | None = None
 
     @property

@@ -212,7 +212,8 @@ def simulate(
         name: value for name, value in programme_settings.items() if value is not None
     }
     programme: Programme = validate_config(to_builtin(settings_without_none), Programme, "simulate")
-    flights, rows = [], []
+    flights = []
+    rows = []
     with forward_progress(progress):
         for craft, sea in programme.build_crafts():
             craft_flights = programme.simulate_all(craft, sea)
@@ -236,7 +237,8 @@ class RunResult:
     def __init__(
         self, folder: Path, temporary_folder: tempfile.TemporaryDirectory[str] | None
     ) -> None:
-        self.folder, self._temporary_folder = folder, temporary_folder
+        self.folder = folder
+        self._temporary_folder = temporary_folder
 
     @cached_property
     def summary(self) -> dict[str, Any]:
@@ -347,7 +349,9 @@ def run(
         result = residnet.run("quickstart.yaml", overrides={"seed": 3}); result.metrics
     """
     with trusting(trust):
-        override_texts, source, task = _parse_overrides(overrides), None, config
+        override_texts = _parse_overrides(overrides)
+        source = None
+        task = config
         if isinstance(config, Task | Mapping) and override_texts:
             raise UsageError("run: overrides are for a file; change the mapping itself")
         if isinstance(config, Mapping):

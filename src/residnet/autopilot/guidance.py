@@ -236,7 +236,8 @@ class WaypointGuidance(Reference):
         )
         leg_vector = target - leg_start
         direction = torch.atan2(leg_vector[:, 1], leg_vector[:, 0])
-        north, east = target[:, 0] - x[:, self.x], target[:, 1] - x[:, self.y]
+        north = target[:, 0] - x[:, self.x]
+        east = target[:, 1] - x[:, self.y]
         remaining_distance = north * torch.cos(direction) + east * torch.sin(direction)
         return (
             direction,
@@ -538,7 +539,8 @@ class CourseGuidance(Reference):
     def track_error(self, x: Tensor, arc_length: Tensor) -> tuple[Tensor, Tensor]:
         """Return along-track and cross-track error [B] in m from a point of the course."""
         planned = self.plan_at(arc_length)
-        north, east = x[:, self.x] - planned[:, 0], x[:, self.y] - planned[:, 1]
+        north = x[:, self.x] - planned[:, 0]
+        east = x[:, self.y] - planned[:, 1]
         c, s = torch.cos(planned[:, 2]), torch.sin(planned[:, 2])
         return c * north + s * east, c * east - s * north
 

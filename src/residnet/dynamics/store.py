@@ -93,7 +93,8 @@ class BandTable(Config):
         return tuple(getattr(self, name) or () for name in self.channels)
 
 
-_DESCRIPTION, _WEIGHTS = "model.json", "model.safetensors"
+_DESCRIPTION = "model.json"
+_WEIGHTS = "model.safetensors"
 
 _CHECKSUM_KEY = "description_sha256"
 

@@ -60,7 +60,8 @@ class Tables:
     """The constant arrays of a file, each written once."""
 
     def __init__(self, prefix: str) -> None:
-        self.prefix, self.lines = prefix, dict[str, str]()
+        self.prefix = prefix
+        self.lines = dict[str, str]()
         self._names: dict[tuple[str, tuple[str, ...]], str] = {}
 
     def table_name(self, texts: Sequence[str], c_type: str) -> str:
@@ -130,7 +131,9 @@ class FunctionWriter:
         return write_literal(value)
 
     def __init__(self, function: ca.Function, tables: Tables, what: str) -> None:
-        self.function, self.tables, self.what = function, tables, what
+        self.function = function
+        self.tables = tables
+        self.what = what
         self.names = [function.name_in(i) for i in range(function.n_in())]
         self.lines: list[tuple[str, str]] = []
         self.results = [list[str]() for _ in range(function.n_out())]
@@ -141,7 +144,8 @@ class FunctionWriter:
         columns: dict[int, _CColumn] = {}
         for k in range(function.n_instructions()):
             op = function.instruction_id(k)
-            inputs, outputs = function.instruction_input(k), function.instruction_output(k)
+            inputs = function.instruction_input(k)
+            outputs = function.instruction_output(k)
             if op == ca.OP_CONST:
                 columns[outputs[0]] = self.write_constant(k)
             elif op == ca.OP_INPUT:
@@ -418,7 +422,8 @@ class FunctionWriter:
         a, b = self.as_array(left), self.as_array(right)
         if rows == columns == 1:
             # eight sums side by side, which compilers vectorise
-            name, n_unrolled = self.new_name(), inner - inner % 8
+            name = self.new_name()
+            n_unrolled = inner - inner % 8
             text = (
                 f"REAL {name} = {start.cells[0]}; {{ REAL p[8] = {{ZERO}};"
                 f" for (i = 0; i < {n_unrolled}; i += 8) for (j = 0; j < 8; j++)"

@@ -220,14 +220,16 @@ class _LaneWriter(FunctionWriter):
             the statements that compute them.
     """
 
-    REAL, FLAG = "V", "I"
+    REAL = "V"
+    FLAG = "I"
     max_unrolled_length = math.inf
     logical: Mapping[int, str] = {
         ca.OP_NOT: "~{0}", ca.OP_AND: "{0} & {1}", ca.OP_OR: "{0} | {1}"
     }  # fmt: skip
 
     def __init__(self, function: ca.Function, strides: Mapping[str, str], calls: Calls) -> None:
-        self.strides, self.calls = strides, calls
+        self.strides = strides
+        self.calls = calls
         self.n_outputs = list(function.name_out())
         super().__init__(function, Tables(""), _LABEL)
 
@@ -245,7 +247,8 @@ class _LaneWriter(FunctionWriter):
 
     def store_result(self, result: int, column: Any) -> None:
         super().store_result(result, column)
-        name, expressions = self.n_outputs[result], self.results[result]
+        name = self.n_outputs[result]
+        expressions = self.results[result]
         if name in self.calls and len(expressions) == self.function.numel_out(result):
             stores = [
                 f"*{self.matrix_index(name, i)} = {cell};" for i, cell in enumerate(expressions)
@@ -366,12 +369,11 @@ def _write_source(
     def calls(function_name: str, start: str, suffix: str) -> Calls:
         statements: dict[str, list[tuple[str, str]]] = {}
         for k, product in products.items():
-            source, target = start.format(k), suffix.format(k)
+            source = start.format(k)
+            target = suffix.format(k)
             source = shared_slopes.get(source, source)
-            n_source, n_target = (
-                sizes_by_name[source] // product.n_repeats,
-                sizes_by_name[target] // product.n_repeats,
-            )
+            n_source = sizes_by_name[source] // product.n_repeats
+            n_target = sizes_by_name[target] // product.n_repeats
             text = "".join(
                 f"{function_name}(tables + {table_offsets[k]}, {n_source}, {n_target},"
                 f" {source} + {r * n_source} * LANES,"
@@ -386,8 +388,11 @@ def _write_source(
             statements.setdefault(source, []).append((target, text))
         return statements
 
-    forward_storage, backward_storage = dict[str, slice](), dict[str, slice]()
-    stored_pointers, shared_slopes, backward = dict[str, str](), dict[str, str](), list[str]()
+    forward_storage = dict[str, slice]()
+    backward_storage = dict[str, slice]()
+    stored_pointers = dict[str, str]()
+    shared_slopes = dict[str, str]()
+    backward = list[str]()
     if trained_indices is not None:
         single_products = [k for k in matrices if products[k].n_repeats == 1]
         slope_function, shared_slopes = _vector_jacobian_function(
@@ -523,7 +528,8 @@ def _vector_jacobian_function(
     n_arguments = len(_STEP_ARGUMENTS) + n_products
     x, _, s, q, _, theta, *product_values = symbols[:n_arguments]
     outputs = step.call(symbols)
-    factors, results = outputs[:n_products], outputs[n_products : n_products + len(_CARRIED) + 1]
+    factors = outputs[:n_products]
+    results = outputs[n_products : n_products + len(_CARRIED) + 1]
     slopes = [ca.SX.sym(f"{name}_slope", sizes[name]) for name in (*_CARRIED, "a")]
     factor_slopes = [ca.SX.sym(f"factor_{k}_slope", part.numel()) for k, part in enumerate(factors)]
     variables = [*product_values, x, s, q, theta[list(trained_indices)]]
@@ -544,7 +550,8 @@ def _vector_jacobian_function(
     slope_of_name = dict(
         zip((names[k] for k in order), ca.cse([parts[k] for k in order]), strict=True)
     )
-    representative, name_of_hash = dict[str, str](), dict[tuple[int, ...], str]()
+    representative = dict[str, str]()
+    name_of_hash = dict[tuple[int, ...], str]()
     for name in (names[k] for k in order if k in single_products):
         hashes = tuple(cell.element_hash() for cell in slope_of_name[name].elements())
         representative[name] = name_of_hash.setdefault(hashes, name)
@@ -655,7 +662,8 @@ class CompiledRollout:
         self.trained_indices: list[int] | None = None
         if is_trained:
             # entries of theta that depend on no trained parameter have no gradient
-            self.trained_indices, offset = [], 0
+            self.trained_indices = []
+            offset = 0
             with torch.enable_grad():
                 prepared = self.parts.prepare(*(tensors[name] for name in self.shared_names))
             for part in (prepared[k] for k in self.parts.theta_indices):
@@ -811,14 +819,17 @@ class _CompiledRun(torch.autograd.Function):
         *tensors, compiled = arguments
         result: tuple[Tensor, Tensor, Tensor]
         result, history = compiled.run_forward(*tensors, keep_history=True)
-        ctx.loop, ctx.n_repeats = compiled, len(result[0])
+        ctx.loop = compiled
+        ctx.n_repeats = len(result[0])
         ctx.save_for_backward(*history)
         return result
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradient of theta, tables, x and s."""
-        history, compiled, n_rows = ctx.saved_tensors, ctx.loop, ctx.n_repeats
+        history = ctx.saved_tensors
+        compiled = ctx.loop
+        n_rows = ctx.n_repeats
         n_steps, _, n_padded = history[4].shape
         cotangents = []
         for grad in (grads[0], grads[1], grads[2][:, None]):
@@ -826,7 +837,8 @@ class _CompiledRun(torch.autograd.Function):
             padded[:, :, :n_rows] = grad.permute(1, 2, 0)
             cotangents.append(padded)
         # each row is summed by itself, so that the sum does not depend on the number of threads
-        n_blocks, n_theta = n_padded // compiled.n_lanes, len(compiled.trained_indices)
+        n_blocks = n_padded // compiled.n_lanes
+        n_theta = len(compiled.trained_indices)
         backward_storage = compiled.allocate(n_blocks, n_steps, compiled.backward_storage)
         products = [
             (k, product)
@@ -859,10 +871,8 @@ class _CompiledRun(torch.autograd.Function):
                 ordered_products, lambda p: layout[f"product_{p[0]}_slope"].start
             ):
                 group_products = [*group]
-                (k, product), last_factor = (
-                    group_products[0],
-                    compiled.forward_storage[f"factor_{group_products[-1][0]}"],
-                )
+                (k, product) = group_products[0]
+                last_factor = compiled.forward_storage[f"factor_{group_products[-1][0]}"]
                 factor_range = slice(
                     compiled.forward_storage[f"factor_{k}"].start, last_factor.stop
                 )

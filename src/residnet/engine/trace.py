@@ -318,8 +318,10 @@ def split_step(
         if (shared_matrix := shared_matrix_of(node)) is not None:
             bias, a, b = (None, *args) if len(args) == 2 else args
             example = a.example @ b.example
-            (n_repeats, n_inputs), n_outputs = a.example.shape[-2:], b.example.shape[-1]
-            first, count = len(products), b.example.numel() // (n_inputs * n_outputs)
+            (n_repeats, n_inputs) = a.example.shape[-2:]
+            n_outputs = b.example.shape[-1]
+            first = len(products)
+            count = b.example.numel() // (n_inputs * n_outputs)
             for member in range(count):
                 product = RowProduct(
                     n_repeats, n_inputs, n_outputs, boundary.index(shared_matrix), member
@@ -420,7 +422,8 @@ def _extract_subgraph(
         results: nodes that become results.
         constant: values of nodes that become buffers.
     """
-    subgraph, owner = Graph(), nn.Module()
+    subgraph = Graph()
+    owner = nn.Module()
     copies: dict[Node, Node] = {}
 
     def copy_node(node: Node) -> Node:
@@ -727,14 +730,13 @@ def _lower_extremum(
 ) -> list[_TracedValue]:
     """Return the largest or smallest entries along a dimension, and their positions."""
     rows, size = _reduction_rows(value, dim)
-    extremum, position = _select(value.column, rows[:, 0]), ca.MX(ca.DM.zeros(len(rows), 1))
+    extremum = _select(value.column, rows[:, 0])
+    position = ca.MX(ca.DM.zeros(len(rows), 1))
     for k in range(1, size):
         candidate = _select(value.column, rows[:, k])
         is_better = candidate > extremum if name == "max" else candidate < extremum
-        extremum, position = (
-            ca.if_else(is_better, candidate, extremum),
-            ca.if_else(is_better, k, position),
-        )
+        extremum = ca.if_else(is_better, candidate, extremum)
+        position = ca.if_else(is_better, k, position)
     return [_TracedValue(example[0], extremum), _TracedValue(example[1], position)]
 
 
@@ -776,7 +778,8 @@ def _lower_clamp(
 
 def _lower_cast(example: Tensor, value: _TracedValue, *_: Any, **_settings: Any) -> _TracedValue:
     """Return a value cast to another type; floating-point precisions are not distinguished."""
-    source_dtype, target_dtype = value.example.dtype, example.dtype
+    source_dtype = value.example.dtype
+    target_dtype = example.dtype
     if target_dtype == torch.bool and source_dtype != torch.bool:
         return _lower_elementwise("ne", example, value, 0.0)
     if source_dtype.is_floating_point and not target_dtype.is_floating_point:
@@ -873,7 +876,8 @@ def _lower_index(
 def _lower_gather(
     example: Tensor, value: _TracedValue, dim: int, index: _TracedValue, **_: Any
 ) -> _TracedValue:
-    table_indices, index_positions = value.indices.movedim(dim, -1), index.indices.movedim(dim, -1)
+    table_indices = value.indices.movedim(dim, -1)
+    index_positions = index.indices.movedim(dim, -1)
     table_indices = table_indices[
         tuple(slice(size) for size in index_positions.shape[:-1])
     ].reshape(-1, table_indices.shape[-1])

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 def band_channels(states: np.ndarray, position_radius: np.ndarray) -> np.ndarray:
     """Return what has bands [L, 2 + n] of states [L, 3 + n], with the radius [L] of position."""
-    velocities, heading = states[:, VELOCITIES], states[:, HEADING]
+    velocities = states[:, VELOCITIES]
+    heading = states[:, HEADING]
     return np.column_stack((velocities, heading, position_radius, states[:, EXTRA_STATES]))
 
 
@@ -168,10 +169,8 @@ def effective_sample_size(
     log_weights = np.bincount(log_indices, weights * is_scored, n_logs)
     covered_weights = np.bincount(log_indices, weights * np.where(is_scored, coverage, 0.0), n_logs)
     has_weight = log_weights > 0
-    log_coverage, log_shares = (
-        covered_weights[has_weight] / log_weights[has_weight],
-        log_weights[has_weight] / log_weights.sum(),
-    )
+    log_coverage = covered_weights[has_weight] / log_weights[has_weight]
+    log_shares = log_weights[has_weight] / log_weights.sum()
     if len(log_coverage) < 2:
         return 1.0
     mean_coverage = float((log_shares * log_coverage).sum())
@@ -319,7 +318,8 @@ class Band:
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Band:
         """Return the band from what `to_json` gave."""
-        channels, intensity = tuple(content["half_width"]), content["activity"]
+        channels = tuple(content["half_width"])
+        intensity = content["activity"]
 
         def table(by_channel: Mapping[str, Any]) -> np.ndarray:
             return np.array([by_channel[channel] for channel in channels]).T

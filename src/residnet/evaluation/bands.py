@@ -243,11 +243,9 @@ def calibrate_band(
         score_unit: that scores are given in, [c].
     """
     all_errors = _to_calibration_runs(runs, step)
-    names, weights, channels = (
-        all_errors.names,
-        all_errors.weights,
-        runs[0].dof.layout.band_channels,
-    )
+    names = all_errors.names
+    weights = all_errors.weights
+    channels = runs[0].dof.layout.band_channels
     unexplained_errors = all_errors
     typical_spread: np.ndarray | None = None
     run_spreads = [run.spread for run in runs if run.spread is not None]
@@ -399,10 +397,8 @@ def _to_calibration_runs(runs: Sequence[RunErrors], step: float) -> _Calibration
     weights = compute_run_weights(names)
     mean_squares_of_runs = [running_mean_squares(run.states, step) for run in runs]
     intensity = MotionIntensity.from_runs(mean_squares_of_runs, weights)
-    errors, intensities = (
-        _sample_at_horizons([run.error for run in runs], steps),
-        _sample_at_horizons(mean_squares_of_runs, steps),
-    )
+    errors = _sample_at_horizons([run.error for run in runs], steps)
+    intensities = _sample_at_horizons(mean_squares_of_runs, steps)
     intensities = np.nan_to_num(intensity.standardize(intensities))
     return _CalibrationRuns(names, weights, steps, errors, intensities, intensity)
 
@@ -447,23 +443,17 @@ def _fit_slopes(
     """
     slopes = initial_slopes.copy()
     horizon_stride = slice(None, None, _HORIZON_STRIDE)
-    errors, intensities, rms_shape = (
-        runs.errors[:, horizon_stride],
-        runs.intensities[:, horizon_stride],
-        rms_shape[horizon_stride],
-    )
+    errors = runs.errors[:, horizon_stride]
+    intensities = runs.intensities[:, horizon_stride]
+    rms_shape = rms_shape[horizon_stride]
     run_weights = runs.weights[:, None] / errors.shape[1]
-    ridge, flat_intensities = (
-        _SLOPE_RIDGE * np.eye(intensities.shape[2]),
-        intensities.reshape(-1, intensities.shape[2]),
-    )
+    ridge = _SLOPE_RIDGE * np.eye(intensities.shape[2])
+    flat_intensities = intensities.reshape(-1, intensities.shape[2])
     for channel in range(errors.shape[2]):
         normalized_errors = errors[:, :, channel] / rms_shape[:, channel]
         is_scored = np.isfinite(normalized_errors)
-        y, sample_weights = (
-            np.where(is_scored, normalized_errors, 0.0),
-            np.where(is_scored, run_weights, 0.0),
-        )
+        y = np.where(is_scored, normalized_errors, 0.0)
+        sample_weights = np.where(is_scored, run_weights, 0.0)
         if not is_scored.any():
             continue
         coefficients = slopes[:, channel].copy()

@@ -133,7 +133,8 @@ class FreeRunErrors:
         error = predicted - measured
         # a turn too many is no error of where the vessel points
         error[:, HEADING] = wrap_angle_array(error[:, HEADING])
-        dof, attitude_error = logs[windows[0].log_index].dof, None
+        dof = logs[windows[0].log_index].dof
+        attitude_error = None
         if dof.is_six_dof:
             roll_column = dof.state_names.index("phi")
             error[:, roll_column] = wrap_angle_array(error[:, roll_column])
@@ -195,10 +196,8 @@ class FreeRunErrors:
             if sample_indices is None
             else sample_indices
         )
-        state_errors, attitude_errors = (
-            self.error[last_samples],
-            None if self.attitude_error is None else self.attitude_error[last_samples],
-        )
+        state_errors = self.error[last_samples]
+        attitude_errors = None if self.attitude_error is None else self.attitude_error[last_samples]
         return pose_error_sizes(state_errors, self.dof, attitude_errors)
 
     @property
@@ -422,7 +421,8 @@ def _to_prediction(
     """Return states [L, 3 + n] or what moves [L, n] with its pose; of `constant_velocity` if it ran
     away.
     """
-    log, window_slice = logs[window.log_index], slice(window.start, window.stop)
+    log = logs[window.log_index]
+    window_slice = slice(window.start, window.stop)
     velocities = simulated[:, -log.dof.n_dynamic :]
     measured_speeds = np.abs(log.y[window_slice, log.dof.dynamic_columns][log.usable[window_slice]])
     # short training logs may hold far less than the window, and then it is the vessel that exceeds

@@ -18,7 +18,9 @@ from residnet.evaluation.protocol import ProtocolConfig, Window
 from residnet.evaluation.records import GoodnessFile
 from residnet.preprocessing.prepare import PreparedLog
 
-_COMMAND_TOLERANCE, _START_TOLERANCE, _SEARCH_INTERVAL = 0.05, 0.25, 0.5
+_COMMAND_TOLERANCE = 0.05
+_START_TOLERANCE = 0.25
+_SEARCH_INTERVAL = 0.5
 """How much two runs of a pair differ at most: in commands, share of their range, and at the start,
 in scales. Starts are tried every `_SEARCH_INTERVAL` seconds. Chosen by hand: closer ones leave few
 pairs.
@@ -169,7 +171,8 @@ def mismatch(reference_commands: np.ndarray, series: np.ndarray) -> np.ndarray:
     """
     if len(series) < len(reference_commands):
         return np.zeros(0)
-    length, column_mismatches = len(reference_commands), []
+    length = len(reference_commands)
+    column_mismatches = []
     column_means = series.mean(0)
     for reference_column, series_column in zip(
         (reference_commands - column_means).T, (series - column_means).T, strict=True
@@ -191,7 +194,8 @@ def _pair_differences(pair: RepeatedPair, logs: Sequence[PreparedLog]) -> list[f
     Root mean squares of u, v (samples usable in both) and the other velocities, then position and
     heading at the end.
     """
-    reference_log, repeat_log = logs[pair.window.log_index], logs[pair.repeat_log]
+    reference_log = logs[pair.window.log_index]
+    repeat_log = logs[pair.repeat_log]
     reference_slice = slice(pair.window.start, pair.window.stop)
     repeat_slice = slice(
         pair.repeat_start, pair.repeat_start + reference_slice.stop - reference_slice.start
@@ -202,10 +206,8 @@ def _pair_differences(pair: RepeatedPair, logs: Sequence[PreparedLog]) -> list[f
         - repeat_log.y[repeat_slice, velocity_columns]
     )
     is_usable = reference_log.usable[reference_slice] & repeat_log.usable[repeat_slice]
-    reference_end, repeat_end = (
-        _final_relative_pose(reference_log.y[reference_slice]),
-        _final_relative_pose(repeat_log.y[repeat_slice]),
-    )
+    reference_end = _final_relative_pose(reference_log.y[reference_slice])
+    repeat_end = _final_relative_pose(repeat_log.y[repeat_slice])
     difference_columns = (*velocity_differences[is_usable, :2].T, *velocity_differences[:, 2:].T)
     rms = [
         float(np.sqrt(np.mean(difference_column**2))) for difference_column in difference_columns
@@ -221,7 +223,8 @@ def _pair_differences(pair: RepeatedPair, logs: Sequence[PreparedLog]) -> list[f
 def _final_relative_pose(y: np.ndarray) -> np.ndarray:
     """The pose [3] at the end of a run [T, 3 + n] in the axes of its start."""
     north, east, heading_change = y[-1, POSE] - y[0, POSE]
-    cos_heading, sin_heading = np.cos(y[0, HEADING]), np.sin(y[0, HEADING])
+    cos_heading = np.cos(y[0, HEADING])
+    sin_heading = np.sin(y[0, HEADING])
     return np.array(
         [
             cos_heading * north + sin_heading * east,
@@ -292,7 +295,8 @@ def compute_autocovariance(segments: Segments, max_lag: int) -> np.ndarray:
     Products are within pieces, over the number n of all samples.
     """
     pooled = np.concatenate(list(segments))
-    mean, covariances = pooled.mean(), np.zeros(max_lag + 1)
+    mean = pooled.mean()
+    covariances = np.zeros(max_lag + 1)
     for segment in segments:
         centred = segment - mean
         spectrum = np.abs(np.fft.rfft(centred, 2 * len(centred))) ** 2
@@ -363,10 +367,8 @@ def block_bootstrap_interval(segments: Segments) -> BlockBootstrapInterval:
         return BlockBootstrapInterval(mean, mean, mean, dependence.block_length, n_blocks)
     if n_blocks < 2:
         return BlockBootstrapInterval(mean, -math.inf, math.inf, dependence.block_length, n_blocks)
-    tail_probability, n_drawn = (
-        bootstrap_tail_probability(max(math.floor(n_blocks), 2)),
-        math.ceil(n_blocks),
-    )
+    tail_probability = bootstrap_tail_probability(max(math.floor(n_blocks), 2))
+    n_drawn = math.ceil(n_blocks)
     if n_blocks > _NORMAL_APPROXIMATION_BLOCKS:
         # of a ratio of sums, by its linear part
         standard_error = float(
@@ -398,7 +400,8 @@ def block_bootstrap_interval(segments: Segments) -> BlockBootstrapInterval:
 
 def _block_sums(segments: Segments, max_block_length: int) -> tuple[np.ndarray, np.ndarray]:
     """Sums and lengths of all blocks of `max_block_length` samples; a shorter piece is a block."""
-    sums, lengths = [], []
+    sums = []
+    lengths = []
     for segment in segments:
         block_length = min(max_block_length, len(segment))
         cumulative_sum = np.concatenate(([0.0], np.cumsum(segment)))
@@ -480,7 +483,8 @@ def goodness_of_fit_measures(
         rmse, r2, r2_adjusted, cp, aic, bic; None if the target is constant, the noise is zero, or m
         does not exceed d + 1.
     """
-    n_samples, rss = len(residuals), float(residuals @ residuals)
+    n_samples = len(residuals)
+    rss = float(residuals @ residuals)
     total_sum_of_squares = float(((measured - measured.mean()) ** 2).sum())
     r2 = 1 - rss / total_sum_of_squares if total_sum_of_squares > 0 else None
     has_noise = noise_variance > 0

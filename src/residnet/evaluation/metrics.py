@@ -32,7 +32,9 @@ CONFIDENCE_LEVEL = 0.95
 """Of all intervals."""
 _N_RESAMPLES = 10_000
 """Of the blocks: their 2.5 % tail then holds 250."""
-MIN_LOGS_AS_BLOCKS, TARGET_BLOCKS, _MIN_BLOCKS = 5, 8, 5
+MIN_LOGS_AS_BLOCKS = 5
+TARGET_BLOCKS = 8
+_MIN_BLOCKS = 5
 """Logs from which each log is a block; target and smallest number of blocks for fewer logs.
 
 Chosen by hand: fewer blocks estimate the variance poorly, and smaller ones are correlated.
@@ -83,7 +85,8 @@ def make_resampling_blocks(log_indices: Sequence[int] | np.ndarray) -> Resamplin
         < TARGET_BLOCKS
     ):
         block_length -= 1
-    block_indices, n_blocks = np.zeros(len(log_numbers), dtype=int), 0
+    block_indices = np.zeros(len(log_numbers), dtype=int)
+    n_blocks = 0
     for log_number, n_windows in zip(unique_logs, windows_per_log, strict=True):
         for consecutive_windows in np.array_split(
             np.flatnonzero(log_numbers == log_number), math.ceil(n_windows / block_length)
@@ -223,7 +226,9 @@ def paired_difference(
 
 SCHEMA = "residnet.metrics/1"
 LIMITS_SCHEMA = "residnet.limits/1"
-_N_WORST_WINDOWS, _N_SPEED_CLASSES, _MIN_CLASS_WINDOWS = 3, 3, 3
+_N_WORST_WINDOWS = 3
+_N_SPEED_CLASSES = 3
+_MIN_CLASS_WINDOWS = 3
 """Reported worst windows, classes of speed, windows needed per class; chosen by hand."""
 _WIND_CHANNEL = "wind_speed"
 _HORIZONS = (10.0, 30.0, 100.0)
@@ -248,7 +253,9 @@ class ProtocolEvaluation:
         # reports of finished runs read this module and do not wait for PyTorch
         from residnet.evaluation.freerun import FreeRunErrors
 
-        self.free_run, self.candidates, self.logs = free_run, candidates, logs
+        self.free_run = free_run
+        self.candidates = candidates
+        self.logs = logs
         self.dof = logs[0].dof
         self.state_scales = np.array([scales.get(name, 1.0) for name in self.dof.dynamic_states])
         self.log_slices = [(logs[w.log_index], slice(w.start, w.stop)) for w in free_run.windows]
@@ -338,15 +345,15 @@ class ProtocolEvaluation:
         return metric_rows
 
     def _summarize_windows(self, model_name: str, window_mask: np.ndarray) -> dict[str, Any]:
-        errors, resampling_blocks = (
-            self.errors[model_name],
-            make_resampling_blocks(self.log_indices[window_mask]),
-        )
-        dof, pose_errors = self.dof, errors.final_pose_errors()
+        errors = self.errors[model_name]
+        resampling_blocks = make_resampling_blocks(self.log_indices[window_mask])
+        dof = self.dof
+        pose_errors = errors.final_pose_errors()
         errors_by_window = np.column_stack(
             (errors.rmse, self.nrmse_by_window[model_name], *pose_errors.values())
         )[window_mask]
-        rmse, mae = errors_by_window[:, : dof.n_dynamic].mean(0), errors.mae[window_mask].mean(0)
+        rmse = errors_by_window[:, : dof.n_dynamic].mean(0)
+        mae = errors.mae[window_mask].mean(0)
         nrmse = rmse / self.state_scales
         confidence_intervals = bootstrap_intervals(errors_by_window, resampling_blocks)
         n_usable = errors.n_usable[window_mask]
@@ -400,7 +407,8 @@ class ProtocolEvaluation:
         """
         from residnet.evaluation.freerun import compute_integration_errors
 
-        any_errors, mean_speeds = next(iter(self.errors.values())), self._mean_speeds()
+        any_errors = next(iter(self.errors.values()))
+        mean_speeds = self._mean_speeds()
         max_steps = int(any_errors.window_lengths.max()) - 1
         horizon_steps = [round(seconds / dt) for seconds in _HORIZONS]
         entries = []
@@ -536,11 +544,9 @@ class ProtocolEvaluation:
         Entries have the fields of `records.WorstWindow`; the pose error is the first one that the
         velocities of the model determine.
         """
-        errors, nrmse, pose_error_name = (
-            self.errors[model_name],
-            self.nrmse_by_window[model_name],
-            self.dof.pose_error_names[0],
-        )
+        errors = self.errors[model_name]
+        nrmse = self.nrmse_by_window[model_name]
+        pose_error_name = self.dof.pose_error_names[0]
         pose_errors = errors.final_pose_errors()[pose_error_name]
         return [
             {
@@ -722,10 +728,8 @@ INPUT_PREFIX = "input_"
 
 def state_column_names(dof: DegreesOfFreedom) -> tuple[str, ...]:
     """Return column names of states: u, v, r, heading and position, then roll or dive states."""
-    planar, non_planar_states = (
-        dof.dynamic_states[: PLANAR_LAYOUT.n_dof],
-        dof.dynamic_states[PLANAR_LAYOUT.n_dof :],
-    )
+    planar = dof.dynamic_states[: PLANAR_LAYOUT.n_dof]
+    non_planar_states = dof.dynamic_states[PLANAR_LAYOUT.n_dof :]
     return (*planar, "psi", "x", "y", *non_planar_states)
 
 
@@ -762,10 +766,10 @@ def iterate_rollout_columns(
             for model, predictions in run.predictions.items():
                 band = bands_by_model.get(model, {}).get(run.protocol)
                 for window_number, window_index in enumerate(window_indices):
-                    window_slice, prediction = (
-                        slice(run.windows[window_index].start, run.windows[window_index].stop),
-                        predictions[window_index],
+                    window_slice = slice(
+                        run.windows[window_index].start, run.windows[window_index].stop
                     )
+                    prediction = predictions[window_index]
                     label_columns = {
                         "protocol": run.protocol,
                         "model": model,

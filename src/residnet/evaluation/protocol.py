@@ -74,7 +74,9 @@ class WindowProtocol(Config):
     def _place_windows(
         self, log: PreparedLog, log_index: int, dt: float, interval: float
     ) -> list[Window]:
-        n_steps, start, windows = round(self.length / dt), round(self.first / dt), []
+        n_steps = round(self.length / dt)
+        start = round(self.first / dt)
+        windows = []
         start_stride = max(round(interval / dt), 1)
         _, segment_ends = find_run_bounds(log.segment)
         while start + n_steps < len(log):
@@ -122,7 +124,8 @@ class ManoeuvreProtocol(Config):
 
     def make_windows(self, log: PreparedLog, log_index: int, dt: float) -> list[Window]:
         """Return one window per stretch."""
-        n_initial, windows = max(round(self.initial / dt), 1), []
+        n_initial = max(round(self.initial / dt), 1)
+        windows = []
         _, segment_ends = find_run_bounds(log.segment)
         segment_start = 0
         while segment_start < len(log):

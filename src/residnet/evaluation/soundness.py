@@ -55,15 +55,21 @@ _MAX_ASYMMETRY = 0.1
 """Uneven part of the acceleration, share of its spread, beyond which sides differ; by choice."""
 _LONG_RUN_DURATION = 300.0
 """Time in s that inputs are held at least: within it a disturbance doubles that counts."""
-_MEMORY_SETTLING_TIME, _STEADY_TOLERANCE = 10.0, 1e-4
-_SPEED_FRACTIONS, _CRUISE_FRACTION = (0.0, 0.25, 0.5, 0.67, 1.0, 1.5), 0.67
+_MEMORY_SETTLING_TIME = 10.0
+_STEADY_TOLERANCE = 1e-4
+_SPEED_FRACTIONS = (0.0, 0.25, 0.5, 0.67, 1.0, 1.5)
+_CRUISE_FRACTION = 0.67
 """Speeds of straight running, in the largest of the training data."""
 _MAX_CORNERS = 64
 """Corners of the inputs' ranges: all of up to six inputs."""
-_CONSTANT_INPUT_TOLERANCE, _MIN_CONSTANT_DURATION = 0.02, 5.0
+_CONSTANT_INPUT_TOLERANCE = 0.02
+_MIN_CONSTANT_DURATION = 5.0
 """Share of an input's range within which it is held, and for how long in s at least."""
-_MIN_MODEL_GROWTH, _MAX_MEASURED_GROWTH, _MIN_MEASURED_DECAY = 20.0, 3.0, 3.0
-_MAX_STEADY_RUNS, _SETTLING_SHARE = 20, 0.25
+_MIN_MODEL_GROWTH = 20.0
+_MAX_MEASURED_GROWTH = 3.0
+_MIN_MEASURED_DECAY = 3.0
+_MAX_STEADY_RUNS = 20
+_SETTLING_SHARE = 0.25
 """Steady runs that are looked at, and the share of each that settles; chosen by hand."""
 _DISTURBANCE_SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
 
@@ -196,17 +202,13 @@ def find_steady_runs(logs: Sequence[PreparedLog], dt: float) -> list[SteadyRun]:
             log, tolerance, round(_MIN_CONSTANT_DURATION / dt)
         ):
             settled_slice = slice(run_start + int(_SETTLING_SHARE * (run_end - run_start)), run_end)
-            settled_states, lateral_velocities = (
-                log.smoothed[settled_slice],
-                log.smoothed[settled_slice, LATERAL],
-            )
+            settled_states = log.smoothed[settled_slice]
+            lateral_velocities = log.smoothed[settled_slice, LATERAL]
             mean_state = settled_states.mean(0)
             mean_state[POSE] = 0.0
             third_length = max(len(lateral_velocities) // 3, 1)
-            first_mean, last_mean = (
-                lateral_velocities[:third_length].mean(0),
-                lateral_velocities[-third_length:].mean(0),
-            )
+            first_mean = lateral_velocities[:third_length].mean(0)
+            last_mean = lateral_velocities[-third_length:].mean(0)
             entry_velocities = log.smoothed[
                 run_start : run_start + max(third_length // 10, 1), LATERAL
             ]
@@ -221,7 +223,8 @@ def find_steady_runs(logs: Sequence[PreparedLog], dt: float) -> list[SteadyRun]:
             )
             decay = float((initial_deviation / np.maximum(final_deviation, 1e-9)).max())
             growth = float((late_deviation / np.maximum(early_deviation, 1e-9)).max())
-            inputs, lateral_std = log.w[settled_slice].mean(0), lateral_velocities.std(0)
+            inputs = log.w[settled_slice].mean(0)
+            lateral_std = lateral_velocities.std(0)
             runs.append(
                 SteadyRun(
                     log.log.name,
@@ -338,10 +341,8 @@ def check_damping(
         ],
         axis=1,
     )
-    median_slopes, typical_sizes = (
-        np.median(damping_slopes, axis=0),
-        np.quantile(np.abs(damping_slopes), 0.9, axis=0),
-    )
+    median_slopes = np.median(damping_slopes, axis=0)
+    typical_sizes = np.quantile(np.abs(damping_slopes), 0.9, axis=0)
     wrong_signs = [
         f"d{name}′/d{name} {median_slopes[i]:+.2g} 1/s, positive at"
         f" {(damping_slopes[:, i] > 0).mean():.0%} of it"
@@ -493,7 +494,8 @@ def compute_growth_rate(model: HybridDynamics, x: Tensor, w: Tensor) -> float:
     """
     memory = settle_memory(model, x[None], w[None])
     perturbed_variables = torch.cat((x[SWAY:], memory[0])).detach()
-    n_variables, n_velocities = perturbed_variables.numel(), len(x) - SWAY
+    n_variables = perturbed_variables.numel()
+    n_velocities = len(x) - SWAY
     variables = perturbed_variables.expand(n_variables, n_variables).clone().requires_grad_()
     states = torch.cat((x[:SWAY].expand(n_variables, SWAY), variables[:, :n_velocities]), dim=1)
     next_states, next_memory = model.step(
@@ -566,12 +568,15 @@ def mirror_inputs(input_names: Sequence[str], w: Tensor) -> Tensor | None:
 
     Rudders change sign, port and starboard change places, wind comes from the other side.
     """
-    mirror_partners, parity_by_name = get_partners(input_names), {"wind_speed": 1, "wind_dir": -1}
-    mirrored_columns, has_steering = [], False
+    mirror_partners = get_partners(input_names)
+    parity_by_name = {"wind_speed": 1, "wind_dir": -1}
+    mirrored_columns = []
+    has_steering = False
     for column, name in enumerate(input_names):
         parity = parity_by_name.get(name, get_channel_parity(name))
         if name in mirror_partners:
-            parity, column = get_pair_parity(name), input_names.index(mirror_partners[name])
+            parity = get_pair_parity(name)
+            column = input_names.index(mirror_partners[name])
         if parity is None:
             return None
         has_steering |= name in mirror_partners or (parity < 0 and name not in parity_by_name)
@@ -583,7 +588,9 @@ def check_symmetry(
     spec: ModelSpec, model: HybridDynamics, training_points: TrainingPoints
 ) -> SanityFinding:
     """Check that mirrored states and inputs give the mirrored acceleration, at recorded points."""
-    input_names, x, w = spec.signals.input_columns, training_points.x, training_points.w
+    input_names = spec.signals.input_columns
+    x = training_points.x
+    w = training_points.w
     mirror_image = mirror_inputs(input_names, w)
     if mirror_image is None:
         text = (
@@ -610,10 +617,8 @@ def check_symmetry(
     mirrored_accelerations = mirrored_accelerations * parity
     asymmetry = 0.5 * (accelerations - mirrored_accelerations).abs()
     acceleration_std = torch.cat((accelerations, mirrored_accelerations)).std(0).clamp(min=1e-12)
-    rms_asymmetry, max_asymmetry = (
-        asymmetry.square().mean(0).sqrt() / acceleration_std,
-        asymmetry.amax(0) / acceleration_std,
-    )
+    rms_asymmetry = asymmetry.square().mean(0).sqrt() / acceleration_std
+    max_asymmetry = asymmetry.amax(0) / acceleration_std
     # the torque of a lone propeller heels the vessel to one side
     roll_excluded = {"p"} if find_heeling_propellers(model.signals.names) else set()
     checked_velocities = [name for name in dof.velocities if name not in roll_excluded]
@@ -669,16 +674,15 @@ def check_boundedness(
         (training_points.x, training_points.x.new_zeros(len(corners), training_points.x.shape[1]))
     )
     w = torch.cat((training_points.w, corners))
-    memory, previous_velocities = model.initial_state(len(x)).double(), all_but_pose(x)
+    memory = model.initial_state(len(x)).double()
+    previous_velocities = all_but_pose(x)
     chunk_steps = max(round(_MEMORY_SETTLING_TIME / model.dt), 1)
     # where the vessel is says nothing of how fast it is
     model_without_pose = copy.deepcopy(model)
     model_without_pose.has_position = False
     n_steps = round(max(_LONG_RUN_DURATION, training_points.longest_duration) / model.dt)
-    rollout, constant_inputs = (
-        compile_rollout(Rollout(model_without_pose), n_steps),
-        w.unsqueeze(1).expand(-1, chunk_steps, -1),
-    )
+    rollout = compile_rollout(Rollout(model_without_pose), n_steps)
+    constant_inputs = w.unsqueeze(1).expand(-1, chunk_steps, -1)
     divergence_time = torch.zeros(len(x))
     with torch.no_grad():
         for k in range(chunk_steps, n_steps + 1, chunk_steps):

@@ -86,7 +86,8 @@ _MIN_WINDOWS = 5
 """Windows below which nothing is said of how good a model is."""
 MIN_LOGS_FOR_INTERVAL = 3
 """Logs below which there is no interval, and so nothing is said either."""
-_MAX_DISTANCE_SHARE, _MAX_ANGLE_ERROR = 0.10, math.radians(10.0)
+_MAX_DISTANCE_SHARE = 0.10
+_MAX_ANGLE_ERROR = math.radians(10.0)
 """Largest errors of a good model: share of the distance travelled, and heading error in rad.
 
 They apply to the upper limit of the prediction interval; twice the noise floor is allowed in any
@@ -147,10 +148,8 @@ def known_horizons(evidence: VerdictEvidence) -> list[JsonObject]:
     entry_by_time: dict[float, dict[str, Any]] = {}
     for protocol in sorted(evidence.limits_by_protocol, key=lambda name: name != evidence.protocol):
         for horizon_entry in evidence.limits_by_protocol[protocol].get("horizons") or []:
-            seconds, has_selected_model = (
-                horizon_entry["seconds"],
-                evidence.selected in horizon_entry["models"],
-            )
+            seconds = horizon_entry["seconds"]
+            has_selected_model = evidence.selected in horizon_entry["models"]
             if seconds in entry_by_time:
                 has_selected_model &= horizon_entry["windows"] > entry_by_time[seconds]["windows"]
             elif protocol != evidence.protocol:
@@ -174,7 +173,8 @@ def _protocol_limits(evidence: VerdictEvidence) -> JsonObject:
 
 def longest_good_horizon(evidence: VerdictEvidence) -> float:
     """Return the time in s up to which the selected model is good; 0 where it never is."""
-    row, longest_horizon = evidence.rows_by_model[evidence.selected], 0.0
+    row = evidence.rows_by_model[evidence.selected]
+    longest_horizon = 0.0
     if row.get("diverged") and evidence.split in UNSEEN_SPLITS:
         return 0.0
     plant_models = {
@@ -184,10 +184,8 @@ def longest_good_horizon(evidence: VerdictEvidence) -> float:
         if not _has_enough_data(evidence, horizon_entry):
             return longest_horizon
         models = horizon_entry["models"]
-        selected_errors, error_intervals = (
-            models[evidence.selected],
-            models[evidence.selected]["intervals"],
-        )
+        selected_errors = models[evidence.selected]
+        error_intervals = models[evidence.selected]["intervals"]
         # what the plant itself leaves, started from measured states, is noise too
         noise_floors = [
             horizon_entry["floor"],
@@ -242,7 +240,8 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
         (sufficient_entries or horizon_entries)[-1],
     )
     error_text = _format_errors_with_intervals(main_entry, evidence.selected, main_entry["sailed"])
-    horizon_text, criterion_sentences = f"{format_number(main_entry['seconds'], 2)} s ahead", []
+    horizon_text = f"{format_number(main_entry['seconds'], 2)} s ahead"
+    criterion_sentences = []
     if not sufficient_entries:
         lead_sentence = (
             f"{format_count(main_entry['windows'], 'window')} of"
@@ -335,12 +334,11 @@ def _format_errors_with_intervals(
     horizon_entry: JsonObject, model_name: str, distance_travelled: float = 0.0
 ) -> str:
     """Return errors of position and heading with their intervals as text."""
-    model_errors, texts = horizon_entry["models"][model_name], []
+    model_errors = horizon_entry["models"][model_name]
+    texts = []
     for error_name in (error_name for error_name in POSE_ERROR_UNITS if error_name in model_errors):
-        interval_limits, error_text = (
-            model_errors["intervals"][error_name],
-            format_pose_error(error_name, model_errors[error_name]),
-        )
+        interval_limits = model_errors["intervals"][error_name]
+        error_text = format_pose_error(error_name, model_errors[error_name])
         details = (
             [format_interval(interval_limits, display_unit(POSE_ERROR_UNITS[error_name])[1], 2)]
             if interval_limits
@@ -379,10 +377,8 @@ def is_useless(evidence: VerdictEvidence) -> bool:
 
     Then no range is to be trusted.
     """
-    selected_row, constant_velocity_row = (
-        evidence.rows_by_model.get(evidence.selected),
-        evidence.rows_by_model.get(CONSTANT_VELOCITY),
-    )
+    selected_row = evidence.rows_by_model.get(evidence.selected)
+    constant_velocity_row = evidence.rows_by_model.get(CONSTANT_VELOCITY)
     if evidence.selected == CONSTANT_VELOCITY:
         return True
     if selected_row is None or constant_velocity_row is None:
@@ -396,17 +392,16 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
     """Return a sentence that compares the velocity errors with constant velocity and the
     baseline.
     """
-    model_name, split = evidence.selected, evidence.split
+    model_name = evidence.selected
+    split = evidence.split
     if model_name == CONSTANT_VELOCITY:
         return (
             "NOTHING BEATS CONSTANT VELOCITY, which holds the initial velocities of each free"
             " run: no"
             " model of this run is of use for prediction."
         )
-    selected_row, constant_velocity_row = (
-        evidence.rows_by_model.get(model_name),
-        evidence.rows_by_model.get(CONSTANT_VELOCITY),
-    )
+    selected_row = evidence.rows_by_model.get(model_name)
+    constant_velocity_row = evidence.rows_by_model.get(CONSTANT_VELOCITY)
     if selected_row is None:
         return f"The run holds no free runs of its selected model on {split} data."
     selected_nrmse = _mean_nrmse(selected_row)

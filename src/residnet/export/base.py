@@ -41,7 +41,8 @@ from residnet.core.version import __version__
 from residnet.evaluation.assessment import Assessment
 
 NumberArray = npt.NDArray[Any]
-SINGLE_TOLERANCE, DOUBLE_TOLERANCE = 1e-5, 1e-12
+SINGLE_TOLERANCE = 1e-5
+DOUBLE_TOLERANCE = 1e-12
 """Largest difference in each precision, as a share of a channel's range."""
 Attempt = TypeVar("Attempt")
 

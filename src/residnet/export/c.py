@@ -342,7 +342,8 @@ def deepest_stack(stack: Mapping[str, int], bodies: Mapping[str, str]) -> int:
 
 def report_footprint(what: str, size: Mapping[str, Any]) -> list[str]:
     """Report stack and size to the user before a file is written; return the warnings."""
-    stack, code = size["largest_stack_bytes"], size["code_bytes"]
+    stack = size["largest_stack_bytes"]
+    code = size["code_bytes"]
     log_message(
         f"  {what}: {stack:,} bytes of stack ({size['stack_from']}), {code:,} bytes of code and"
         f" constants ({size['code_from']}) on {size['machine']}"
@@ -417,10 +418,8 @@ def generate_c_source(
     step_function = lower(
         exported.build_step_module(torch.float64), exported.arguments, exported.results, label
     )
-    description_key, introduction = (
-        "force",
-        "a feed-forward, written by residnet. All arrays are the caller's.",
-    )
+    description_key = "force"
+    introduction = "a feed-forward, written by residnet. All arrays are the caller's."
     if isinstance(exported, ExportedVessel):
         description_key = "vessel"
         introduction = (
@@ -444,10 +443,8 @@ def generate_c_source(
             "MEMORY": (argument_sizes[2], "entries of the memory s"),
         }
     elif (initial_state := exported.build_initial_state(torch.float64)) is not None:
-        description_key, introduction = (
-            "policy",
-            "a policy, written by residnet. All arrays are the caller's.",
-        )
+        description_key = "policy"
+        introduction = "a policy, written by residnet. All arrays are the caller's."
         initial_function = lower(initial_state, exported.arguments[:1], ["s"], label)
         functions.append(
             CFunction("initial_state", "memory at the first measurement", initial_function)
@@ -474,7 +471,8 @@ def generate_c_source(
 
 def _render_vessel_functions(prefix: str, exported: ExportedVessel) -> list[tuple[str, str, str]]:
     """Return comment, prototype and body of the memory's functions and of the band."""
-    prefix_upper, real_type = prefix.upper(), f"{prefix}_real"
+    prefix_upper = prefix.upper()
+    real_type = f"{prefix}_real"
     has_memory = exported.model.n_state > 0
     zero_loop = f"    size_t k;\n    for (k = 0; k < {prefix_upper}_MEMORY; k++) s[k] = 0;\n"
     unused_casts = "    (void)x;\n    (void)w;\n    (void)count;\n    (void)s;\n"
@@ -517,7 +515,8 @@ class CompiledModel(LoadedExport):
         self, library: Path, exported: Exportable, dtype: torch.dtype, prefix: str
     ) -> None:
         self.real_dtype: Any = np.float64 if dtype == torch.float64 else np.float32
-        self.exported, self.prefix = exported, prefix
+        self.exported = exported
+        self.prefix = prefix
         self.library = ctypes.CDLL(str(library))
         self.output_sizes = self._result_sizes()
 

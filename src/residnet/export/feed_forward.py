@@ -83,7 +83,9 @@ class RequiredForce(nn.Module):
 
     def __init__(self, believed: nn.Module, correction: nn.Module, *, is_mirrored: bool) -> None:
         super().__init__()
-        self.believed, self.correction, self.is_mirrored = believed, correction, is_mirrored
+        self.believed = believed
+        self.correction = correction
+        self.is_mirrored = is_mirrored
         self.mirror_sign = nn.Buffer(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
@@ -127,11 +129,9 @@ class GuardedForce(nn.Module):
         self.ranges = GuardRanges(lower, upper, margin, torch.float64)
         self.range_width = nn.Buffer((upper - lower).clamp(min=1e-9))
         self.n_dof = PLANAR_LAYOUT.n_dof
-        self.fade_width, self.edge_width, self.max_force_ratio = (
-            FADE_SHARE,
-            _EDGE_SHARE,
-            MAX_FORCE_RATIO,
-        )
+        self.fade_width = FADE_SHARE
+        self.edge_width = _EDGE_SHARE
+        self.max_force_ratio = MAX_FORCE_RATIO
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
         """Return the force tau [B, 3] in N, N, N m and `outside` [B].
@@ -139,11 +139,9 @@ class GuardedForce(nn.Module):
         `outside` is True where a motion is beyond the training range or no number.
         """
         motion = torch.cat((nu_dot, nu), dim=-1).to(torch.float64)
-        lower, upper, replaced_motion = (
-            self.ranges.lower,
-            self.ranges.upper,
-            self.ranges.replace_unaccepted(motion),
-        )
+        lower = self.ranges.lower
+        upper = self.ranges.upper
+        replaced_motion = self.ranges.replace_unaccepted(motion)
         believed_force, correction_force = self.model.split_forces(
             replaced_motion[:, : self.n_dof], replaced_motion[:, self.n_dof :]
         )
@@ -247,8 +245,11 @@ class ExportedForce(Exportable):
         ranges: Sequence[tuple[float, float]],
         thruster_lag: dict[str, float] | None = None,
     ) -> None:
-        self.name, self.label = name, f"feed-forward of {name}"
-        self.force_model, self.ranges, self.thruster_lag = model.eval(), ranges, thruster_lag
+        self.name = name
+        self.label = f"feed-forward of {name}"
+        self.force_model = model.eval()
+        self.ranges = ranges
+        self.thruster_lag = thruster_lag
 
     def build_module(self, dtype: torch.dtype) -> nn.Module:
         return TracedForce(self.build_step_module(dtype)).eval()

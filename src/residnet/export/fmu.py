@@ -121,7 +121,8 @@ class FmuExporter(Exporter):
 
     def _make_sources(self, c_files: CSource, token: str, dt: float) -> dict[str, str]:
         """Return the source files by name."""
-        prefix, upper = c_files.prefix, c_files.prefix.upper()
+        prefix = c_files.prefix
+        upper = c_files.prefix.upper()
         fmi_source = f"fmi{self.version[0]}.c"
         return {
             fmi_source: _read_packaged_file(fmi_source),

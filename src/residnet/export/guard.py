@@ -62,7 +62,8 @@ class GuardRanges(nn.Module):
 
     def __init__(self, lower: Tensor, upper: Tensor, margin: Tensor, dtype: torch.dtype) -> None:
         super().__init__()
-        self.lower, self.upper = nn.Buffer(lower.to(dtype)), nn.Buffer(upper.to(dtype))
+        self.lower = nn.Buffer(lower.to(dtype))
+        self.upper = nn.Buffer(upper.to(dtype))
         self.accepted_lower = nn.Buffer((lower - margin).to(dtype))
         self.accepted_upper = nn.Buffer((upper + margin).to(dtype))
         self.midpoint = nn.Buffer((0.5 * (lower + upper)).to(dtype))
@@ -100,7 +101,8 @@ class GuardedDynamics(Dynamics):
         self.model = model
         self.float_max = _FLOAT32_MAX
         self.n_state = model.n_state
-        self.dof, self.has_roll = model.dof, model.has_roll
+        self.dof = model.dof
+        self.has_roll = model.has_roll
         self.set_attitude_columns(
             ATTITUDE if model.spatial else (), len(spec.signals.dof.state_names) + 1
         )
@@ -118,7 +120,8 @@ class GuardedDynamics(Dynamics):
                 _MAX_POSITION,
                 0.0,
             )
-        lower, upper = torch.cat((-pose_limit, lower)), torch.cat((pose_limit, upper))
+        lower = torch.cat((-pose_limit, lower))
+        upper = torch.cat((pose_limit, upper))
         margin = torch.cat((torch.zeros_like(pose_limit), margin))
         self.ranges = GuardRanges(lower, upper, margin, torch.float32)
         n_states = len(spec.signals.dof.state_names)
@@ -151,10 +154,8 @@ class GuardedDynamics(Dynamics):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the guarded state [B, 3 + n], inputs [B, m], memory and the flag [B]."""
         measured_values = torch.cat((x, w), dim=-1)
-        replaced_values, is_inside = (
-            self.ranges.replace_unaccepted(measured_values),
-            self.ranges.is_in_training_range(measured_values),
-        )
+        replaced_values = self.ranges.replace_unaccepted(measured_values)
+        is_inside = self.ranges.is_in_training_range(measured_values)
         # no reductions over nothing: not every format has them
         if self.n_state > 0:
             is_memory_valid = self.is_valid_memory(s)

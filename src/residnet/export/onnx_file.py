@@ -118,10 +118,8 @@ class OnnxExporter(Exporter):
                         generator.uniform(0.0, 0.1, (3, n_entries))
                         for _, n_entries in exported.arguments
                     ]
-                    batch_results, row_results = (
-                        loaded.step_rows(*example_arguments),
-                        LoadedExport.step_rows(loaded, *example_arguments),
-                    )
+                    batch_results = loaded.step_rows(*example_arguments)
+                    row_results = LoadedExport.step_rows(loaded, *example_arguments)
                     pairs = zip(batch_results, row_results, strict=True)
                     if not all(np.allclose(*pair, rtol=1e-5, atol=1e-5) for pair in pairs):
                         raise ExportError(
@@ -218,14 +216,16 @@ def _translate_arctangent(y: Any, x: Any = None) -> Any:
     def make_constant(value: float) -> Any:
         return op.Constant(value=ir.tensor(value, dtype=double_type))
 
-    zero, pi = make_constant(0.0), make_constant(math.pi)
+    zero = make_constant(0.0)
+    pi = make_constant(math.pi)
     x = make_constant(1.0) if x is None else x
     # nothing points ahead, as in torch
     x = op.Where(op.Equal(op.Add(op.Abs(x), op.Abs(y)), zero), make_constant(1.0), x)
     single_precision_angle = op.Cast(
         op.Atan(op.Cast(op.Div(y, x), to=ir.DataType.FLOAT)), to=double_type
     )
-    cos_angle, sin_angle = op.Cos(single_precision_angle), op.Sin(single_precision_angle)
+    cos_angle = op.Cos(single_precision_angle)
+    sin_angle = op.Sin(single_precision_angle)
     correction = op.Div(
         op.Sub(op.Mul(y, cos_angle), op.Mul(x, sin_angle)),
         op.Add(op.Mul(x, cos_angle), op.Mul(y, sin_angle)),

@@ -87,7 +87,8 @@ def identify_coefficients(spec: ModelSpec, model: HybridDynamics) -> VesselCoeff
             " fit a baseline of kind believed, or one of regressors with tau_x, tau_y and tau_n"
         )
     mass: Matrix = np.linalg.inv(force_columns_theta).astype(np.float64)
-    lower, upper = np.array(spec.low[:3]), np.array(spec.high[:3])
+    lower = np.array(spec.low[:3])
+    upper = np.array(spec.high[:3])
     nu = np.random.default_rng(0).uniform(lower, upper, (_N_SAMPLES, 3))
     z = np.zeros((_N_SAMPLES, len(model.signals.names)))
     z[:, :3] = nu
@@ -95,7 +96,9 @@ def identify_coefficients(spec: ModelSpec, model: HybridDynamics) -> VesselCoeff
         acceleration = model.baseline(torch.from_numpy(z)).numpy()
     force = acceleration @ mass.T
     damping_force = force + compute_coriolis_force(mass, nu)
-    linear, quadratic, residual_share = np.zeros((3, 3)), np.zeros((3, 3)), {}
+    linear = np.zeros((3, 3))
+    quadratic = np.zeros((3, 3))
+    residual_share = {}
     for i, axis in enumerate(VELOCITY_NAMES):
         damping_columns = _DAMPING_VELOCITIES[i]
         basis = np.concatenate(

@@ -125,7 +125,8 @@ class ScriptedModel(LoadedExport):
     reorders_sums = False
 
     def __init__(self, module: Any, dtype: torch.dtype) -> None:
-        self.module, self.dtype = module, dtype
+        self.module = module
+        self.dtype = dtype
 
     def _to_tensors(self, arrays: tuple[NumberArray, ...]) -> list[Tensor]:
         return [torch.as_tensor(array).to(self.dtype).unsqueeze(0) for array in arrays]

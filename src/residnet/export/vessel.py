@@ -34,7 +34,8 @@ PAST_STEPS = 50
 """Steps of measured past that warm the memory up."""
 _SWEEP_SHARES = (0.8, 0.4, 0.2)
 """Shares of the training range that inputs sweep together."""
-_N_TRACKS, _STEPS_PER_INPUT = 16, 20
+_N_TRACKS = 16
+_STEPS_PER_INPUT = 20
 """Tracks whose inputs jump, and steps between the jumps: eight may all miss what grows."""
 _FRAME_TEXT = (
     "NED; body axes x forward, y starboard, z down; psi unwrapped, clockwise from north; wind_dir"
@@ -78,18 +79,16 @@ class GuardedVesselModule(nn.Module):
         what = f"model {spec.name}"
         self.guarded_step = trace_function(guard.flagged_step, examples, what)
         self.next_memory = trace_function(lambda x, w, s: model.step(x, w, s)[1], examples, what)
-        self.ranges, self.of_state = guard.ranges, guard.state_ranges
+        self.ranges = guard.ranges
+        self.of_state = guard.state_ranges
         band_table = spec.band
-        band_steps, band_widths = (
-            torch.ones(1),
-            torch.full((1, len(spec.signals.dof.layout.band_channels)), torch.inf),
-        )
+        band_steps = torch.ones(1)
+        band_widths = torch.full((1, len(spec.signals.dof.layout.band_channels)), torch.inf)
         if band_table is not None:
-            band_steps, band_widths = (
-                torch.tensor(band_table.steps),
-                torch.tensor(band_table.columns).T,
-            )
-        self.band_steps, self.band_widths = nn.Buffer(band_steps), nn.Buffer(band_widths)
+            band_steps = torch.tensor(band_table.steps)
+            band_widths = torch.tensor(band_table.columns).T
+        self.band_steps = nn.Buffer(band_steps)
+        self.band_widths = nn.Buffer(band_widths)
 
     @torch.jit.export
     def band(self, k: int) -> Tensor:
@@ -99,7 +98,8 @@ class GuardedVesselModule(nn.Module):
         are zero at k = 0, grow in proportion to time beyond the calibrated horizon, and are
         infinite where the model has no band.
         """
-        band_steps, band_widths = self.band_steps.float(), self.band_widths.float()
+        band_steps = self.band_steps.float()
+        band_widths = self.band_widths.float()
         if k <= 0:
             return torch.zeros_like(band_widths[0])
         last_index = band_steps.shape[0] - 1
@@ -128,7 +128,8 @@ class GuardedVesselModule(nn.Module):
             y_history: states [B, T, 3 + n], oldest first.
             w_history: inputs [B, T, m], oldest first.
         """
-        n_rows, n_steps = get_size(y_history, 3, 0), get_size(y_history, 3, 1)
+        n_rows = get_size(y_history, 3, 0)
+        n_steps = get_size(y_history, 3, 1)
         require_shape("y_history", y_history, [n_rows, n_steps, self.n_states])
         require_shape("w_history", w_history, [n_rows, n_steps, self.n_inputs])
         s = torch.zeros(n_rows, self.n_state)
@@ -164,15 +165,14 @@ class GuardedVesselModule(nn.Module):
             States [B, T+1, 3 + n], memory [B, n_state] after the last step, and the flag `outside`
             [B, T] of each step.
         """
-        n_rows, n_steps = get_size(x0, 2, 0), get_size(w, 3, 1)
+        n_rows = get_size(x0, 2, 0)
+        n_steps = get_size(w, 3, 1)
         require_shape("x0", x0, [n_rows, self.n_states])
         require_shape("w", w, [n_rows, n_steps, self.n_inputs])
         require_shape("s", s, [n_rows, self.n_state])
         x, w, s = x0.float(), w.float(), s.float()
-        states, flags = (
-            [self.of_state.replace_unaccepted(x)],
-            [torch.zeros(n_rows, 0, dtype=torch.bool)],
-        )
+        states = [self.of_state.replace_unaccepted(x)]
+        flags = [torch.zeros(n_rows, 0, dtype=torch.bool)]
         # the first step sees x0 as it was given, for its flag
         for k in range(n_steps):
             x, s, outside = self.guarded_step(x, w[:, k], s)
@@ -218,10 +218,14 @@ class ExportedVessel(Exportable):
                 raise ExportError(
                     f"model {spec.name}: {submodule.export_error}; export another model"
                 )
-        self.spec, self.metrics = spec, metrics
+        self.spec = spec
+        self.metrics = metrics
         self.model = copy.deepcopy(model).eval().requires_grad_(False)
-        self.name, self.label, self.dt = spec.name, f"model {spec.name}", spec.dt
-        self.state_names, n_inputs = spec.signals.dof.state_names, len(spec.signals.input_columns)
+        self.name = spec.name
+        self.label = f"model {spec.name}"
+        self.dt = spec.dt
+        self.state_names = spec.signals.dof.state_names
+        n_inputs = len(spec.signals.input_columns)
         self.arguments = (("x", len(self.state_names)), ("w", n_inputs), ("s", model.n_state))
         # what is written and what is read back are compared with one run
         self._reference_runs: dict[torch.dtype, tuple[Tensor, Tensor, Tensor]] = {}
@@ -256,8 +260,10 @@ class ExportedVessel(Exportable):
                 )
 
     def card_contents(self) -> dict[str, Any]:
-        spec, band = self.spec, self.spec.band
-        units, dof = spec.signals.channel_units(), spec.signals.dof
+        spec = self.spec
+        band = self.spec.band
+        units = spec.signals.channel_units()
+        dof = spec.signals.dof
         guard_ranges = GuardedDynamics(self.model, spec).ranges
         accepted = torch.stack(
             (guard_ranges.accepted_lower, guard_ranges.accepted_upper), dim=1
@@ -340,7 +346,8 @@ class ExportedVessel(Exportable):
         run stays within the training data.
         """
         spec = self.spec
-        lower, upper = torch.tensor(spec.low, dtype=dtype), torch.tensor(spec.high, dtype=dtype)
+        lower = torch.tensor(spec.low, dtype=dtype)
+        upper = torch.tensor(spec.high, dtype=dtype)
         step_index = torch.arange(PARITY_STEPS + PAST_STEPS, dtype=dtype)
         n_dof = self.model.dof
         sweep_phase = torch.arange(lower.numel() - n_dof, dtype=dtype)
@@ -366,7 +373,8 @@ class ExportedVessel(Exportable):
             return self._reference_runs[dtype]
         model = self.to_precision(dtype)
         state_ranges = GuardedDynamics(self.model, self.spec).state_ranges
-        accepted_lower, accepted_upper = state_ranges.accepted_lower, state_ranges.accepted_upper
+        accepted_lower = state_ranges.accepted_lower
+        accepted_upper = state_ranges.accepted_upper
         for sweep_share in _SWEEP_SHARES:
             y, w = self.parity_inputs(dtype, sweep_share)
             with torch.no_grad():
@@ -374,7 +382,8 @@ class ExportedVessel(Exportable):
                 states = Rollout(model)(y[:, -1], w[:, PAST_STEPS:], s0)[0]
             is_outside = ~((states[0] >= accepted_lower) & (states[0] <= accepted_upper))
             if not bool(is_outside.any()):
-                self._reference_runs[dtype], self._sweep_share = (y, w, states), sweep_share
+                self._reference_runs[dtype] = (y, w, states)
+                self._sweep_share = sweep_share
                 return self._reference_runs[dtype]
             log_message(
                 f"{self.label}: its free run leaves what exports accept while all inputs sweep"
@@ -401,7 +410,8 @@ class ExportedVessel(Exportable):
             ExportError: where the model itself leaves what exports accept.
         """
         y, w, eager_states = self.run_reference(dtype)
-        past_states, inputs = y[0].numpy(), w[0].numpy()
+        past_states = y[0].numpy()
+        inputs = w[0].numpy()
         s = self.warm_up_memory(loaded, past_states, inputs[:PAST_STEPS])
         x = past_states[-1].copy()
         rollout_states = loaded.rollout(x, inputs[PAST_STEPS:], s)
@@ -435,10 +445,8 @@ class ExportedVessel(Exportable):
             return loaded_memory
         ranges = GuardedDynamics(self.model, self.spec).ranges
         is_good = ranges.is_accepted(torch.from_numpy(np.concatenate((y, w), axis=1))).tolist()
-        s, sample_index = (
-            np.zeros(self.model.n_state, y.dtype),
-            is_good.index(True) if any(is_good) else 0,
-        )
+        s = np.zeros(self.model.n_state, y.dtype)
+        sample_index = is_good.index(True) if any(is_good) else 0
         for k in range(len(y) if any(is_good) else 0):
             sample_index = k if is_good[k] else sample_index
             s = loaded.step(y[sample_index], w[sample_index], s)[1]

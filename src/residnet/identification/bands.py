@@ -131,7 +131,8 @@ class LeaveFoldOutModels:
         fold_models = [copy.deepcopy(full_model) for _ in range(self.n_folds)]
         if refit_config is None or "refit" not in fitted_model.notes:
             for k, model in enumerate(fold_models):
-                config, fold_samples = fitted_model.spec.baseline, self._samples_without_fold(k)
+                config = fitted_model.spec.baseline
+                fold_samples = self._samples_without_fold(k)
                 _load_matching_solution(
                     model.baseline, config.fit_solutions(model.baseline, fold_samples), fitted_model
                 )
@@ -308,10 +309,8 @@ class _ProtocolCalibration:
         if not reference_errors:
             return {}
         constant_velocity_errors = np.concatenate([run.error for run in reference_errors])
-        score_unit, is_scored = (
-            np.zeros(constant_velocity_errors.shape[1]),
-            np.isfinite(constant_velocity_errors).any(axis=0),
-        )
+        score_unit = np.zeros(constant_velocity_errors.shape[1])
+        is_scored = np.isfinite(constant_velocity_errors).any(axis=0)
         score_unit[is_scored] = np.sqrt(
             np.nanmean(np.compress(is_scored, constant_velocity_errors, axis=1) ** 2, axis=0)
         )

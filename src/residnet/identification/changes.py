@@ -69,7 +69,8 @@ def make_fault_hypotheses(signals: SignalsConfig) -> list[SystemChange]:
     def share(name: str, description: str, **effect: Any) -> SystemChange:
         return SystemChange(name, description, "share", 0.02, **effect)
 
-    units, dof = signals.channel_units(), signals.dof
+    units = signals.channel_units()
+    dof = signals.dof
     changes = [share("mass", "the vessel has become heavier", inertia_share=1.0)]
     for velocity in dof.velocities:
         description = f"the damping in {_AXIS_NAMES[velocity]} has grown"
@@ -134,7 +135,8 @@ def resolve_in_body_axes(x: Tensor, north: Tensor, east: Tensor) -> Tensor:
         body_components = horizontal_to_body(north, east, x[..., list(ATTITUDE)])
         columns = [SURGE, SWAY, SIX_DOF_LAYOUT.state_names.index("w")]
     else:
-        body_components, columns = [*to_body(north, east, x[..., HEADING])], [SURGE, SWAY]
+        body_components = [*to_body(north, east, x[..., HEADING])]
+        columns = [SURGE, SWAY]
     for column, component in zip(columns, body_components, strict=True):
         velocities[..., column] = component
     return velocities
@@ -154,7 +156,9 @@ class PerturbedDynamics(Dynamics):
     ) -> None:
         super().__init__(model.dt, model.integrator)
         self.model = model
-        self.n_state, self.dof, self.has_roll = model.n_state, model.dof, model.has_roll
+        self.n_state = model.n_state
+        self.dof = model.dof
+        self.has_roll = model.has_roll
         dynamic_states = get_dof(model.signals.names).dynamic_states
 
         def repeat_per_row(values: Sequence[Sequence[float]]) -> Tensor:
@@ -254,11 +258,9 @@ class PerturbedDynamics(Dynamics):
         Damping is the difference of the step with and without the velocity; for surge only a part
         of the speed is removed, since models may hold near a service speed only.
         """
-        damped_rows, damped_columns, probe_shares = (
-            self.damped_rows,
-            self.damped_columns,
-            self.probe_shares.to(x.dtype),
-        )
+        damped_rows = self.damped_rows
+        damped_columns = self.damped_columns
+        probe_shares = self.probe_shares.to(x.dtype)
         row_indices = torch.arange(len(damped_rows))
         velocity_shares = torch.ones(len(damped_rows), self.dof, dtype=x.dtype)
         velocity_shares[row_indices, self.damping_columns] = 1.0 - probe_shares

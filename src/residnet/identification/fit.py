@@ -148,7 +148,8 @@ def _describe_validation(fitted_model: FittedModel) -> str:
 
 def _fit_heads(fitter: Fitter, logs: Logs, models: dict[str, FittedModel]) -> None:
     """Fit the heads whose baseline is there, long trainings but one in processes of their own."""
-    settings, n_threads = fitter.settings, torch.get_num_threads()
+    settings = fitter.settings
+    n_threads = torch.get_num_threads()
     head_names = [name for name in settings.heads if settings.get_baseline_name(name) in models]
     n_parallel = count_parallel_heads(fitter)
     long_heads = [
@@ -278,7 +279,8 @@ def _submit_to_worker(name: str, serialized_baseline: _SerializedModel) -> _Seri
 @contextmanager
 def _forward_progress() -> Iterator[Any]:
     """Hold a queue whose reports of progress reach who listens to this process."""
-    callback, stop_event = get_callback(), Event()
+    callback = get_callback()
+    stop_event = Event()
     progress_queue: Any = get_context("spawn").SimpleQueue()
 
     def hand_on() -> None:

@@ -182,7 +182,8 @@ class ValidationScorer:
         n_diverged = sum(prediction.has_diverged for prediction in predictions["validated"])
         dof = errors.dof
         normalized_rmse = (errors.rmse.mean(0) / self.state_scales)[dof.active_indices]
-        window, predicted_states = self.windows[0], predictions["validated"][0].states
+        window = self.windows[0]
+        predicted_states = predictions["validated"][0].states
         measured = self.logs[window.log_index].y[
             window.start : window.start + len(predicted_states)
         ]
@@ -310,7 +311,8 @@ class Fitter:
         resolve_recipe: bool = True,
         validation_in_training: bool = False,
     ) -> None:
-        self.store, self.validation_in_training = store, validation_in_training
+        self.store = store
+        self.validation_in_training = validation_in_training
         self.training_logs = logs["train"]
         self.signals = settings.signals.build()
         self.lower_limits, self.upper_limits = compute_training_ranges(self.training_logs)
@@ -375,7 +377,8 @@ class Fitter:
         solution, choice_notes = select_by_free_run(
             model, model.baseline, solutions, self.score_on_validation
         )
-        coefficients, covariance = list(solution.table), None
+        coefficients = list(solution.table)
+        covariance = None
         notes: dict[str, Any] = {
             "samples": len(self.training_samples),
             **solution.hyperparameters,
@@ -456,10 +459,8 @@ class Fitter:
 
             training_config = self.settings.training.get(name, TrainingConfig())
             dtype = torch.float64 if training_config.is_double_precision else torch.float32
-            windows, folder = (
-                WindowStore.from_logs(self.training_logs, dtype),
-                self.store.training_folder,
-            )
+            windows = WindowStore.from_logs(self.training_logs, dtype)
+            folder = self.store.training_folder
 
             def validate(trained_model: HybridDynamics) -> Score:
                 return self.score_on_validation(spec.average_networks(trained_model))
@@ -523,10 +524,8 @@ class Fitter:
             if reduced_ensemble.notes["validation"] >= ensemble.notes["validation"]:
                 break
             log_message(f"  {name}: without {worst_member.name} it errs less on validation logs")
-            excluded_names, retained_members = (
-                [*excluded_names, worst_member.name],
-                remaining_members,
-            )
+            excluded_names = [*excluded_names, worst_member.name]
+            retained_members = remaining_members
             ensemble = reduced_ensemble if len(retained_members) > 1 else None
         if ensemble is None:
             raise FitError("no mean errs less on validation logs than one of its members")
@@ -588,7 +587,8 @@ def check_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
     fitter = Fitter(logs, settings, FitStore())
     # with the parts of the recipe for these logs, where it is asked for
     settings = fitter.settings
-    dt, window_store = settings.prepare.grid.step, WindowStore.from_logs(fitter.training_logs)
+    dt = settings.prepare.grid.step
+    window_store = WindowStore.from_logs(fitter.training_logs)
     for baseline in settings.all_baselines.values():
         baseline.validate_samples(fitter.training_samples)
     for refit_config in settings.refit.values():

@@ -118,7 +118,9 @@ def evaluate_splits(
             model: model_predictions[first_window:last_window]
             for model, model_predictions in predictions.items()
         }
-        first_window, evaluation, logs = last_window, evaluations[split], splits[split]
+        first_window = last_window
+        evaluation = evaluations[split]
+        logs = splits[split]
         free_run_ = FreeRun(name, split, windows, predictions_of_run)
         evaluation.free_runs.append(free_run_)
         protocol_evaluation = ProtocolEvaluation(free_run_, models, logs, scales)

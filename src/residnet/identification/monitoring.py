@@ -82,7 +82,9 @@ def compute_innovations(
     w = torch.from_numpy(np.stack([window.w for window in windows]))
     no_change = SystemChange("none", "", "", 1.0)
     all_changes = [no_change, *changes]
-    n_windows, n_steps, n_changes = len(windows), w.shape[1], len(all_changes)
+    n_windows = len(windows)
+    n_steps = w.shape[1]
+    n_changes = len(all_changes)
     n_blocks = min(_MAX_BLOCKS, n_steps)
     block_average = torch.zeros(n_blocks, n_steps, dtype=torch.float64)
     block_edges = np.linspace(0, n_steps, n_blocks + 1).round().astype(int)
@@ -135,7 +137,8 @@ def compute_innovations(
 
 def split_window(window: MeasuredWindow, n_parts: int) -> list[MeasuredWindow]:
     """Return equal parts of a window, each with its measured past; a remainder is dropped."""
-    n_warmup, steps_per_part = len(window.past_y), len(window.w) // n_parts
+    n_warmup = len(window.past_y)
+    steps_per_part = len(window.w) // n_parts
     y = np.concatenate((window.past_y, window.y))
     w = np.concatenate((window.past_w, window.w))
     return [
@@ -161,7 +164,8 @@ def make_measured_windows(log: PreparedLog, n_steps: int, n_warmup: int) -> list
         log: prepared as those of the fit.
         n_warmup: samples before a window for the warm-up of a memory; the first windows have none.
     """
-    windows, window_start = [], n_warmup
+    windows = []
+    window_start = n_warmup
     while window_start + n_steps < len(log):
         row_slice = slice(window_start - n_warmup, window_start + n_steps + 1)
         is_trusted = (
@@ -226,11 +230,13 @@ def compute_robust_score_sums(
         whitening_matrices: matrix [n, n] of each division.
         prior_precision: prior precision of the sizes of the changes [C, C].
     """
-    sums_by_look, n_innovations = [], 0
+    sums_by_look = []
+    n_innovations = 0
     for (innovation, effects), whitening_matrix in zip(
         innovations_and_effects, whitening_matrices, strict=True
     ):
-        block_size, (n_windows, n_changes, n_values) = len(whitening_matrix), effects.shape
+        block_size = len(whitening_matrix)
+        (n_windows, n_changes, n_values) = effects.shape
         whitened_innovations = (
             innovation.reshape(n_windows, -1, block_size) @ whitening_matrix.T
         ).reshape(n_windows, n_values)
@@ -246,7 +252,8 @@ def compute_robust_score_sums(
         )
         n_innovations += n_values
     scores, informations, squares = zip(*sums_by_look, strict=True)
-    score, information = np.sum(scores, axis=0), np.sum(informations, axis=0)
+    score = np.sum(scores, axis=0)
+    information = np.sum(informations, axis=0)
     estimated_sizes = np.linalg.solve(information + prior_precision, score[..., None])[..., 0]
     unexplained_squares = np.sum(
         [squares_of_look.sum(axis=1) for squares_of_look in squares], axis=0
@@ -271,10 +278,8 @@ def marginalise(
         n_target_changes: Q.
         prior_precision: prior precision of the environment parameters [n, n].
     """
-    target_information, cross_information = (
-        information[..., :n_target_changes, :n_target_changes],
-        information[..., n_target_changes:, :n_target_changes],
-    )
+    target_information = information[..., :n_target_changes, :n_target_changes]
+    cross_information = information[..., n_target_changes:, :n_target_changes]
     regression_coefficients = np.linalg.solve(
         information[..., n_target_changes:, n_target_changes:] + prior_precision, cross_information
     )
@@ -484,9 +489,9 @@ class ScoreDistribution:
         one.
         """
         weighted_scores, weighted_information, redundancy = self.weigh_by_log(groups)
-        weighted_scores, weights = (
-            weighted_scores / redundancy,
-            np.diagonal(weighted_information, axis1=1, axis2=2) / redundancy + _TINY_INFORMATION,
+        weighted_scores = weighted_scores / redundancy
+        weights = (
+            np.diagonal(weighted_information, axis1=1, axis2=2) / redundancy + _TINY_INFORMATION
         )
         sizes, total_weight = _huber_mean(weighted_scores, weights)
         inflation = self.wishart_inflation * self.inflation_factor**2
@@ -508,7 +513,8 @@ def _huber_mean(weighted_sizes: np.ndarray, weights: np.ndarray) -> tuple[np.nda
         weighted_sizes: sizes times weights of the logs [K, Q].
         weights: inverse variances of the sizes [K, Q].
     """
-    sizes_by_log, root_weights = weighted_sizes / weights, np.sqrt(weights)
+    sizes_by_log = weighted_sizes / weights
+    root_weights = np.sqrt(weights)
     huber_weights = np.ones_like(weights)
     mean_size = weighted_sizes.sum(axis=0) / weights.sum(axis=0)
     for _ in range(_HUBER_ITERATIONS):
@@ -522,7 +528,8 @@ def _huber_mean(weighted_sizes: np.ndarray, weights: np.ndarray) -> tuple[np.nda
 
 def fit_score_distribution(groups: GroupScores) -> ScoreDistribution:
     """Return how the scores of groups of clean windows scatter about zero."""
-    score, diagonal_information = groups.score, groups.diagonal_information
+    score = groups.score
+    diagonal_information = groups.diagonal_information
     n_groups, n_causes = score.shape
     noise_factor, size_variance = np.array(
         [
@@ -577,10 +584,8 @@ def estimate_score_inflation(
     """
     standardized_sizes = []
     for held_out_fold in np.unique(fold_of_group):
-        fold_indices, distribution = (
-            np.flatnonzero(fold_of_group == held_out_fold),
-            fit_score_distribution(groups[fold_of_group != held_out_fold]),
-        )
+        fold_indices = np.flatnonzero(fold_of_group == held_out_fold)
+        distribution = fit_score_distribution(groups[fold_of_group != held_out_fold])
         for stretch_start in range(0, len(fold_indices), groups_per_stretch):
             sizes, standard_errors, _ = distribution.estimate_sizes(
                 groups[fold_indices[stretch_start : stretch_start + groups_per_stretch]]
@@ -618,11 +623,13 @@ _N_WINDOW_PARTS = 5
 """Parts that a window is also looked at in, each from its own measured start."""
 _MIN_PART_STEPS = 10
 """Steps of a part below which windows are looked at as a whole only."""
-_DIVERGENCE_FACTOR, _MAX_HEADING_INNOVATION = 3.0, 2.0 * np.pi
+_DIVERGENCE_FACTOR = 3.0
+_MAX_HEADING_INNOVATION = 2.0 * np.pi
 """Innovation beyond which a free run ran away: in largest clean velocities; turns of heading."""
 _MAX_DIVERGED_SHARE = 0.5
 """Share of clean windows that may run away."""
-_CURRENT_STD, _PUSH_STD = 0.5, 0.05
+_CURRENT_STD = 0.5
+_PUSH_STD = 0.05
 """Standard deviations of a current in m/s and of a push in m/s^2 that are thought possible."""
 
 
@@ -715,10 +722,8 @@ class ChangeDetector:
         self.nuisance_precision = np.diag(nuisance_precisions)
         prior_precisions = [(PRIOR_STD * item.size) ** -2 for item in self.hypotheses]
         self.prior_precision = np.diag([*prior_precisions, *nuisance_precisions])
-        self.window_steps, self.n_warmup = (
-            round(config.window / spec.dt),
-            count_warmup_samples(model),
-        )
+        self.window_steps = round(config.window / spec.dt)
+        self.n_warmup = count_warmup_samples(model)
         indexed_groups = [
             (k, group_windows_)
             for k, log_of_group in enumerate(clean_windows)
@@ -853,7 +858,8 @@ class ChangeDetector:
         config: MonitorConfig,
     ) -> ChangeDetector:
         """Return the change detector of a model from clean logs, prepared as those of the fit."""
-        n_steps, n_warmup = round(config.window / spec.dt), count_warmup_samples(model)
+        n_steps = round(config.window / spec.dt)
+        n_warmup = count_warmup_samples(model)
         return cls(
             spec,
             model,
@@ -920,10 +926,8 @@ class ChangeDetector:
         effects_by_change = effects.reshape(n_windows, n_parts, len(self.all_changes), -1).swapaxes(
             1, 2
         )
-        innovation, effects = (
-            innovation.reshape(n_windows, -1),
-            effects_by_change.reshape(n_windows, len(self.all_changes), -1),
-        )
+        innovation = innovation.reshape(n_windows, -1)
+        effects = effects_by_change.reshape(n_windows, len(self.all_changes), -1)
         limits = np.tile(self.divergence_limits, innovation.shape[1] // len(self.divergence_limits))
         change_sizes = np.array([change.size for change in self.all_changes])[:, None]
         # comparisons with what is no number are false
@@ -1020,7 +1024,9 @@ class OnlineChangeDetector:
     """
 
     def __init__(self, watch: ChangeDetector) -> None:
-        self.detector, self.n_warmup, self.window_steps = watch, watch.n_warmup, watch.window_steps
+        self.detector = watch
+        self.n_warmup = watch.n_warmup
+        self.window_steps = watch.window_steps
         self.windows_per_group = max(round(watch.config.group / watch.config.window), 1)
         self.max_windows = max(round(watch.config.stretch / watch.config.window), 1)
         self.recent_groups: deque[tuple[int, ScoreSums]] = deque()
@@ -1044,7 +1050,8 @@ class OnlineChangeDetector:
         self.measured_inputs.append(np.asarray(w, dtype=float))
         if len(self.measured_states) < self.n_warmup + self.window_steps + 1:
             return None
-        states, inputs = np.stack(self.measured_states), np.stack(self.measured_inputs)
+        states = np.stack(self.measured_states)
+        inputs = np.stack(self.measured_inputs)
         window = MeasuredWindow(
             states[self.n_warmup :],
             inputs[self.n_warmup : -1],
@@ -1053,15 +1060,14 @@ class OnlineChangeDetector:
         )
         # the next window begins where this one ends
         n_retained = self.n_warmup + 1
-        self.measured_states, self.measured_inputs = (
-            self.measured_states[-n_retained:],
-            self.measured_inputs[-n_retained:],
-        )
+        self.measured_states = self.measured_states[-n_retained:]
+        self.measured_inputs = self.measured_inputs[-n_retained:]
         return self.update_with_sums(self.detector.compute_sums([window])[0])
 
     def start_new_log(self) -> None:
         """Begin a new log, whose wind and current are its own."""
-        self.measured_states, self.measured_inputs = [], []
+        self.measured_states = []
+        self.measured_inputs = []
         self.log_index += 1
         self.is_group_closed = True
 

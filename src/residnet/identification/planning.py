@@ -134,7 +134,8 @@ def propose_manoeuvres(
     speed for one that moves ahead.
     """
     manoeuvres: list[Manoeuvre] = []
-    duration, max_steer = trial_limits.time, trial_limits.rudder
+    duration = trial_limits.time
+    max_steer = trial_limits.rudder
     open_loop_timing: dict[str, Any] = {"duration": duration, "start": 0.05 * duration}
     closed_loop_timing: dict[str, Any] = {"duration": duration, "start": 0.1 * duration}
     for drive in (0.4, 0.7, 1.0) if dof.has_position else (1.0,):
@@ -181,10 +182,8 @@ def propose_manoeuvres(
             )
         )
     if dof.has_position:
-        switch_times, drive_levels = (
-            tuple(0.25 * duration * k for k in range(4)),
-            (1.0, 0.0, 0.6, 0.2),
-        )
+        switch_times = tuple(0.25 * duration * k for k in range(4))
+        drive_levels = (1.0, 0.0, 0.6, 0.2)
         manoeuvres.append(
             AccelerationDeceleration(
                 name="speed_changes", times=switch_times, levels=drive_levels, duration=duration
@@ -199,7 +198,9 @@ def infer_input_shares(spec: ModelSpec) -> Mapping[str, InputShare]:
     Raises:
         UsageError: if no input steers.
     """
-    units, ranges, shares = spec.signals.channel_units(), spec.ranges, {}
+    units = spec.signals.channel_units()
+    ranges = spec.ranges
+    shares = {}
     for name in spec.signals.inputs:
         max_input = max(map(abs, ranges[name]))
         steer_sign = next(
@@ -303,13 +304,12 @@ def plan_trials(
     Raises:
         DataError: if no candidate is within the limits, or all parameters are determined.
     """
-    spec, model = fitted_model.spec, fitted_model.model.double()
+    spec = fitted_model.spec
+    model = fitted_model.model.double()
     spec.signals.dof.require_on_surface("the plan of a trial")
     horizon = round(refit_config.horizon / spec.dt)
-    state_scales, manoeuvres = (
-        torch.from_numpy(state_scales_array),
-        propose_manoeuvres(trial_limits, spec.signals.dof),
-    )
+    state_scales = torch.from_numpy(state_scales_array)
+    manoeuvres = propose_manoeuvres(trial_limits, spec.signals.dof)
     # those of one kind fly together
     all_candidates = PredictionGoal(
         sorted(manoeuvres, key=lambda one: one.kind), trial_limits.time, {}
@@ -354,10 +354,8 @@ def plan_trials(
         )
     trials = []
     for (simulated_run, states, _), gram in zip(allowed_trajectories, grams, strict=True):
-        duration_minutes, information = (
-            (len(states) - 1) * spec.dt / 60.0,
-            information_per_gram * gram,
-        )
+        duration_minutes = (len(states) - 1) * spec.dt / 60.0
+        information = information_per_gram * gram
         volume_gain_ = compute_volume_gain(unidentified.covariance, information) / duration_minutes
         uncertainty_reduction = (
             1.0
@@ -416,7 +414,8 @@ def _simulate_manoeuvres(
     input_shares: Mapping[str, InputShare],
     goal_manoeuvres: PredictionGoal,
 ) -> list[ManoeuvreRun]:
-    spec, model = fitted_model.spec, fitted_model.model.double()
+    spec = fitted_model.spec
+    model = fitted_model.model.double()
     actuators = GivenActuators(input_shares, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.input_columns, spec.hold, actuators)
     initial_state = actuated.make_initial_state(1)

@@ -132,7 +132,8 @@ def check_window_fits(log: PreparedLog, settings: FitSettings) -> None:
     Raises:
         DataError: where it does not.
     """
-    dt, protocols = settings.prepare.grid.step, settings.evaluation.protocols
+    dt = settings.prepare.grid.step
+    protocols = settings.evaluation.protocols
     if not any(protocol.make_windows(log, 0, dt) for protocol in protocols.values()):
         raise DataError(
             f"log {log.log.name}: lasts {len(log) * dt:.1f} s, its longest stretch without a gap"

@@ -89,8 +89,10 @@ class TrainingDataSummary:
         Args:
             dt: of the grid, s.
         """
-        channel_values, channel_names = samples.z, samples.names
-        std, max_abs = channel_values.std(0, correction=0), channel_values.abs().amax(0)
+        channel_values = samples.z
+        channel_names = samples.names
+        std = channel_values.std(0, correction=0)
+        max_abs = channel_values.abs().amax(0)
         varying_channels = [
             name
             for name in _input_names(channel_names)
@@ -110,7 +112,8 @@ class TrainingDataSummary:
         median_segment_length = sorted_lengths[
             np.searchsorted(np.cumsum(sorted_lengths), 0.5 * sorted_lengths.sum())
         ]
-        median_segment_duration, roll_time_per_radian = float(median_segment_length) * dt, math.inf
+        median_segment_duration = float(median_segment_length) * dt
+        roll_time_per_radian = math.inf
         if "p" in channel_names:
             angle_std, rate_std = (float(std[channel_names.index(name)]) for name in ("phi", "p"))
             roll_time_per_radian = angle_std / max(rate_std, 1e-9)
@@ -233,10 +236,8 @@ def _all_terms(data_summary: TrainingDataSummary) -> list[str]:
     A thruster that turns pushes along and across; its thrust falls with the inflow.
     """
     forces, rudders, propellers = _classify_inputs(data_summary)
-    rotatable_thrusters, dof = (
-        azimuth_thrusters(data_summary.varying_inputs),
-        get_dof(data_summary.channel_names),
-    )
+    rotatable_thrusters = azimuth_thrusters(data_summary.varying_inputs)
+    dof = get_dof(data_summary.channel_names)
     dynamic_states = dof.dynamic_states
     if dof.is_six_dof:
         return submerged_terms(
@@ -318,7 +319,8 @@ _REFIT_STEPS = 200
 """Steps of the free runs of a refit, where its share of the protocol's length is less."""
 _BATCH_PER_NETWORK = 32
 """Windows in a batch for each network."""
-_BATCHES_PER_EPOCH, _BATCHES_PER_EPOCH_LONG = 15, 40
+_BATCHES_PER_EPOCH = 15
+_BATCHES_PER_EPOCH_LONG = 40
 """Batches in each of twenty epochs, for short logs and for long ones."""
 
 
@@ -671,7 +673,8 @@ def _correlation_time(log: Log, names: Sequence[str] = ("r", "u", "v")) -> float
         is_finite = np.isfinite(values)
         if is_finite.sum() < 50:
             continue
-        t, centred_values = log.t[is_finite], values[is_finite] - values[is_finite].mean()
+        t = log.t[is_finite]
+        centred_values = values[is_finite] - values[is_finite].mean()
         dt = float(np.median(np.diff(t)))
         elapsed = remove_pauses(t)
         resampled = np.interp(np.arange(0.0, elapsed[-1], dt), elapsed, centred_values)[:20_000]
@@ -726,7 +729,8 @@ def make_protocols(window_duration: float) -> dict[str, Any]:
 
 def make_scales(logs: Sequence[Log], dof: DegreesOfFreedom = SURGE_SWAY_YAW) -> dict[str, Any]:
     """Return the standard deviations of what lives of the motion, in units that read well."""
-    min_scale, scale_texts = 1e-4, {}
+    min_scale = 1e-4
+    scale_texts = {}
     for name in dof.active_states:
         std = max(float(np.nanstd(np.concatenate([log[name] for log in logs]))), min_scale)
         unit = CHANNEL_UNITS[name]

@@ -110,7 +110,8 @@ def refit_recursively(
         for group in detector.group_windows(log)
     ]
     verdict_before = verdict = _evaluate_groups(detector, indexed_groups)
-    model, identified_changes = detector.model, list[IdentifiedChange]()
+    model = detector.model
+    identified_changes = list[IdentifiedChange]()
     while True:
         first_change = verdict.hypotheses[0].change
         stopping_reason = _stopping_reason(
@@ -212,7 +213,8 @@ def _parameter_direction(
     states = torch.from_numpy(np.concatenate([window.y[:-1] for window in windows]))
     inputs = torch.from_numpy(np.concatenate([window.w for window in windows]))
     sample_stride = max(len(states) // _MAX_SAMPLES, 1)
-    states, inputs = states[::sample_stride], inputs[::sample_stride]
+    states = states[::sample_stride]
+    inputs = inputs[::sample_stride]
     initial_memory = states.new_zeros(len(states), model.n_state)
     # over a whole step the vessel answers to the change already, which would hide a part of it
     short_step_model = copy.deepcopy(model)
@@ -236,10 +238,8 @@ def _parameter_direction(
         # axes count alike, though an acceleration in yaw is no acceleration in surge
         axis_weights = added_increment[:, DYNAMIC_STATES].square().mean(0)
         axis_weights = (axis_weights + 1e-4 * axis_weights.max()).rsqrt().repeat(len(states))
-        sensitivities, target_accelerations = (
-            sensitivities * axis_weights[:, None],
-            target_accelerations * axis_weights,
-        )
+        sensitivities = sensitivities * axis_weights[:, None]
+        target_accelerations = target_accelerations * axis_weights
         gram = sensitivities.T @ sensitivities
         ridge = torch.diag(_DIRECTION_RIDGE * gram.diagonal() + 1e-300)
         direction = torch.linalg.solve(gram + ridge, sensitivities.T @ target_accelerations)
@@ -257,7 +257,8 @@ class _InformationFilter:
     """
 
     def __init__(self, detector: ChangeDetector, changes: Sequence[SystemChange]) -> None:
-        self.detector, self.changes = detector, changes
+        self.detector = detector
+        self.changes = changes
         self.model = copy.deepcopy(detector.model)
         self.baseline = require_parametric_baseline(self.model)
         self.initial_parameters = self.baseline.get_free()
@@ -322,10 +323,8 @@ class _InformationFilter:
         Free runs use the current sizes, or the initial sizes with `use_initial_sizes`.
         """
         precision = np.diag((PRIOR_STD * self.small_sizes) ** -2.0)
-        weighted_sizes, sizes = (
-            np.zeros((len(self.detector.bias_by_fold), len(self.sizes))),
-            self.sizes,
-        )
+        weighted_sizes = np.zeros((len(self.detector.bias_by_fold), len(self.sizes)))
+        sizes = self.sizes
         sizes_by_log: list[np.ndarray] = []
         for log_index in dict.fromkeys(log_number for log_number, _ in indexed_groups):
             self._set_sizes(self.sizes)
@@ -393,7 +392,8 @@ class _InformationFilter:
             all_effects = np.concatenate(
                 (np.stack(change_effects, axis=1), nuisance_effects), axis=1
             )
-            n_windows, n_changes = len(windows), all_effects.shape[1]
+            n_windows = len(windows)
+            n_changes = all_effects.shape[1]
             all_effects = all_effects.reshape(n_windows, n_parts, n_changes, -1).swapaxes(1, 2)
             all_effects = all_effects.reshape(n_windows, n_changes, -1) * is_valid[:, None, None]
             for innovations_of_fold, (model_bias, size_bias) in zip(

@@ -127,10 +127,8 @@ class FitSettings(ModelPartsConfig):
                 "current: currents are told by u, v and r beside a position; leave `current` out of"
                 f" a model of {', '.join(self.signals.velocities)}"
             )
-        scale_names, required_names = (
-            tuple(self.evaluation.scales.to_dict()),
-            self.signals.dof.active_states,
-        )
+        scale_names = tuple(self.evaluation.scales.to_dict())
+        required_names = self.signals.dof.active_states
         if scale_names != required_names:
             raise ValueError(
                 f"evaluation.scales: the velocities of the model are {', '.join(required_names)}"
@@ -177,10 +175,8 @@ class FitSettings(ModelPartsConfig):
             except ConfigError as error:
                 raise ValueError(f"{part_name}: {error}") from None
         for part_name, config in self.heads.items():
-            head, baseline = (
-                config.build(channel_names),
-                self.get_baseline_config(part_name).build(channel_names),
-            )
+            head = config.build(channel_names)
+            baseline = self.get_baseline_config(part_name).build(channel_names)
             try:
                 head.set_inertia(baseline.inertia_matrix())
             except ConfigError as error:
@@ -202,7 +198,8 @@ class FitSettings(ModelPartsConfig):
                     " 'linear_steady', 'mmg', 'nomoto' or 'nomoto_sideslip'"
                 )
         if self.current is not None:
-            name, baselines = self.current.baseline, self.all_baselines
+            name = self.current.baseline
+            baselines = self.all_baselines
             check_known_names("current.baseline", (name,), baselines, "baseline")
             if not isinstance(baselines[name].build(channel_names), RegressorBaseline):
                 raise ValueError(

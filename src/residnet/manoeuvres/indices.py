@@ -103,10 +103,8 @@ class SmoothTrack:
         sample_times = self.t[(self.t > interval_start) & (self.t < interval_end)]
         times = np.concatenate(([interval_start], sample_times, [interval_end]))
         peak_index = int(np.argmax(sign * self.psi(times)))
-        lower_time, upper_time = (
-            times[max(peak_index - 1, 0)],
-            times[min(peak_index + 1, times.size - 1)],
-        )
+        lower_time = times[max(peak_index - 1, 0)]
+        upper_time = times[min(peak_index + 1, times.size - 1)]
         derivative = self.psi.derivative()
         if (
             peak_index in (0, times.size - 1)
@@ -126,7 +124,8 @@ class SmoothTrack:
 
         Ahead is along the heading that the vessel had at `origin`; both times are in s.
         """
-        north, east = float(self.x(time) - self.x(origin)), float(self.y(time) - self.y(origin))
+        north = float(self.x(time) - self.x(origin))
+        east = float(self.y(time) - self.y(origin))
         c, s = math.cos(float(self.psi(origin))), math.sin(float(self.psi(origin)))
         return north * c + east * s, east * c - north * s
 

@@ -19,7 +19,9 @@ EXPORTS = "exports.json"
 CellMark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
 
 
-_PAGE_WIDTH, _LETTER_WIDTH, _CELL_PADDING = 700.0, 5.8, 6.0
+_PAGE_WIDTH = 700.0
+_LETTER_WIDTH = 5.8
+_CELL_PADDING = 6.0
 """Pixels: text width of an A4 page, width of a bold letter in a table, padding of a cell."""
 
 
@@ -147,7 +149,9 @@ class Table:
             caption: a sentence above the table.
             groups: titles that span several columns after the first, with how many they span.
         """
-        self.columns, self.caption, self.groups = list(columns), caption, list(groups)
+        self.columns = list(columns)
+        self.caption = caption
+        self.groups = list(groups)
         n_ungrouped = len(self.columns) - 1 - sum(count for _, count in self.groups)
         if self.groups and n_ungrouped:
             # the line of groups is as long as that of columns
@@ -179,7 +183,8 @@ class Table:
 
     def select_columns(self, first_column: int, last_column: int) -> Table:
         """Return a table with the data columns `first_column` to `last_column` (exclusive)."""
-        groups, column = [], 0
+        groups = []
+        column = 0
         for title, count in self.groups:
             n_overlap = min(column + count, last_column) - max(column, first_column)
             column += count
@@ -206,7 +211,8 @@ class Table:
         break_columns = [*accumulate(count for _, count in self.groups)] or [
             *range(1, len(self.columns))
         ]
-        column_ranges, previous_end = [[0, 0]], 0
+        column_ranges = [[0, 0]]
+        previous_end = 0
         for end in break_columns:
             first_column = column_ranges[-1][0]
             if (
@@ -229,7 +235,8 @@ class Table:
         lines = [self.columns]
         lines += [[row.label, *(_cell_text(cell) for cell in row.cells)] for row in self.rows]
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        group_titles, start = [" " * widths[0]], 1
+        group_titles = [" " * widths[0]]
+        start = 1
         for title, count in self.groups:
             # a group is as wide as its columns and the gaps between them
             width = sum(widths[start : start + count]) + 2 * (count - 1)

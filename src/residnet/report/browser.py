@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from bokeh.plotting import figure as Canvas
 
 _FONT = "12px"
-_LETTER_WIDTH, _MIN_PANEL_WIDTH = 6.5, 260.0
+_LETTER_WIDTH = 6.5
+_MIN_PANEL_WIDTH = 260.0
 """Pixels of a letter of that font, and between the axes of a panel on a phone."""
 _DASHES: dict[str, Any] = {"long": [10, 4], "short": [4, 3], "dense": [8, 3, 2, 3, 2, 3]}
 _MARKERS = {"o": "circle", "s": "square", "x": "x", "^": "triangle"}
@@ -163,8 +164,9 @@ def _build_renderer(name: str, style: GlyphStyle, source: ColumnDataSource) -> A
     from bokeh import models
     from bokeh.models.renderers import GlyphRenderer
 
-    color, x = "#808080" if style.color == TEXT_COLOR else style.color, f"x of {name}"
-    # what is faint on paper stays to be seen on a screen
+    color = "#808080" if style.color == TEXT_COLOR else style.color
+    x = f"x of {name}"
+    # a faint colour that prints well needs more opacity on a screen
     alpha = max(style.alpha, 0.25)
     fill: dict[str, Any] = {"fill_color": color, "fill_alpha": alpha, "line_color": None}
     line: dict[str, Any] = {
@@ -213,7 +215,8 @@ def _figure_json(figure: Figure) -> str:
     from bokeh.document import Document
 
     # models are numbered in their order, so that the same run has the same page
-    document, panels = Document(), _build_canvases(figure)
+    document = Document()
+    panels = _build_canvases(figure)
     for panel in panels:
         document.add_root(panel)
     names: dict[str, str] = {}

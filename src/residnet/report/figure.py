@@ -24,15 +24,13 @@ Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
 GlyphKind: TypeAlias = Literal["line", "points", "fill", "across", "upright", "strip"]
 
 # Okabe and Ito's palette, which stays distinct under the common colour-vision deficiencies
-BLUE, ORANGE, VERMILLION, PURPLE, GREEN, SKY_BLUE, GREY = (
-    "#0072B2",
-    "#E69F00",
-    "#D55E00",
-    "#CC79A7",
-    "#009E73",
-    "#56B4E9",
-    "#7F7F7F",
-)
+BLUE = "#0072B2"
+ORANGE = "#E69F00"
+VERMILLION = "#D55E00"
+PURPLE = "#CC79A7"
+GREEN = "#009E73"
+SKY_BLUE = "#56B4E9"
+GREY = "#7F7F7F"
 COLORS = (BLUE, VERMILLION, GREEN, PURPLE, SKY_BLUE, ORANGE, GREY)
 DASHES = ("solid", "long", "dashdot", "short", "dense", "dashed", "dotted")
 
@@ -274,7 +272,8 @@ def subsample_indices(length: int, max_count: int) -> np.ndarray:
 
 def band_outline(x: Any, lower: Any, upper: Any) -> Curve:
     """Return the outline of what lies between two curves [T] over x [T], a `fill`."""
-    lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+    lower = np.asarray(lower, dtype=float)
+    upper = np.asarray(upper, dtype=float)
     is_finite = np.isfinite(lower) & np.isfinite(upper)
     x = np.asarray(x, dtype=float)
     return join_with_gaps(

@@ -72,7 +72,8 @@ def write_figure(folder: Path, figure: Figure, name: str = "") -> Figure:
         name: stem of the files; the name of the figure if empty.
     """
     name = make_file_stem(name or figure.name)
-    image_paths, has_several = [], len(figure.static_cases) > 1
+    image_paths = []
+    has_several = len(figure.static_cases) > 1
     for number, case in enumerate(figure.static_cases, start=1):
         path = folder / (f"{name}_{number}.png" if has_several else f"{name}.png")
         title = figure.title + (f": {case.title}" if has_several else "")

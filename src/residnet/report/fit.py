@@ -20,7 +20,8 @@ def _iterate_fit_sections(run: RunFiles) -> Iterator[Section | None]:
     Add a section here and its figures in `write_fit_figures`. Sections that most readers need are
     not collapsed.
     """
-    folder, findings = run.path / "figures", read_sanity_findings(run.path)
+    folder = run.path / "figures"
+    findings = read_sanity_findings(run.path)
     yield verdict.opening_section(run, read_figures(folder, "track"))
     yield verdict.cautions_section(run, findings)
     yield _figures_section("Error against horizon", folder, "horizon")

@@ -145,7 +145,8 @@ class RunFiles:
         Raises:
             DataError: if a file of the run cannot be read.
         """
-        summary, inspection = self.read_json("summary.json"), self.read_json("doctor.json")
+        summary = self.read_json("summary.json")
+        inspection = self.read_json("doctor.json")
         level, verdict = judged or (summary.get("level") or "", summary.get("verdict") or [])
         findings = None
         if inspection:

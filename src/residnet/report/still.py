@@ -99,10 +99,8 @@ def render_matplotlib(
             cell = grid[
                 len(map_lines) + line, n_map_columns * column : n_map_columns * (column + 1)
             ]
-            panel, panel_below = (
-                figure.panels[number],
-                other_panels[position + columns : position + columns + 1],
-            )
+            panel = figure.panels[number]
+            panel_below = other_panels[position + columns : position + columns + 1]
             group = f"{panel.group}{column if panel.x_limits else ''}"
             axes = canvas.add_subplot(cell, sharex=shared.get(group))
             shared.setdefault(group, axes)

@@ -261,7 +261,8 @@ class Task(Config):
         Raises:
             ResidnetError: if the input does not allow it, or a result fails a check.
         """
-        folder_path, resolved_yaml = self.resolve_folder(output_folder), dump_config(self)
+        folder_path = self.resolve_folder(output_folder)
+        resolved_yaml = dump_config(self)
         # refuse an unusable folder before the check, which may read large files
         RunFolder(folder_path).require_usable(resolved_yaml, resume=resume, overwrite=overwrite)
         self.check()
@@ -325,11 +326,9 @@ class Task(Config):
             folder.write_summary(self.task, outcome.verdict, **summary_fields, is_finished=False)
             # final version: the report shows it and must be reproducible
             provenance.write(folder)
-            verdict, files, export_errors = (
-                list(outcome.verdict),
-                list[Path](),
-                list[ResidnetError](),
-            )
+            verdict = list(outcome.verdict)
+            files = list[Path]()
+            export_errors = list[ResidnetError]()
             if report:
                 from residnet.report.page import render_figures
 
@@ -364,7 +363,8 @@ class Task(Config):
     ) -> Path:
         from residnet.report.page import exports_section, write_page
 
-        exports, summary = exports_section(run.path), run.read_summary()
+        exports = exports_section(run.path)
+        summary = run.read_summary()
         return write_page(
             run.path,
             "",
@@ -454,7 +454,9 @@ def _write_exports(
 
     If one model cannot be exported, the other exports and the run still complete.
     """
-    files, errors, rows = list[Path](), list[ResidnetError](), []
+    files = list[Path]()
+    errors = list[ResidnetError]()
+    rows = []
     for name, write_export in exports.items():
         try:
             file = write_export()

@@ -106,7 +106,8 @@ class ArduPilotBackend:
     def __init__(
         self, vehicle: Vehicle, servos: Sequence[Servo], port: int = 9002, host: str = "127.0.0.1"
     ) -> None:
-        self.vehicle, self.servos = vehicle, list(servos)
+        self.vehicle = vehicle
+        self.servos = list(servos)
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self.socket.bind((host, port))
@@ -186,7 +187,8 @@ class ArduPilotBackend:
                     self.previous_state, self.vehicle.inputs_at(commands), self.memory
                 )
             if bool(torch.isfinite(next_state).all()) and bool(torch.isfinite(memory).all()):
-                self.current_state, self.memory = next_state, memory
+                self.current_state = next_state
+                self.memory = memory
             self.steps += 1
         step_fraction = min(max(self.time / self._dt - (self.steps - 1), 0.0), 1.0)
         state: Tensor = self.previous_state[0] + step_fraction * (
@@ -196,7 +198,9 @@ class ArduPilotBackend:
         north, east, psi, u, v, r = state[:6].tolist()
         named_states = dict(zip(self.vehicle.states, state.tolist(), strict=True))
         phi, p = named_states.get("phi", 0.0), named_states.get("p", 0.0)
-        cos_psi, sin_psi, horizontal_sway = math.cos(psi), math.sin(psi), v * math.cos(phi)
+        cos_psi = math.cos(psi)
+        sin_psi = math.sin(psi)
+        horizontal_sway = v * math.cos(phi)
         wrapped_heading = math.remainder(psi, 2 * math.pi)
         reply = {
             "timestamp": self.time,

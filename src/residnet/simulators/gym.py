@@ -65,7 +65,9 @@ class ReferenceTask(ABC):
 class HeadingTask(ReferenceTask):
     """Turn to a heading and keep it; a goal is a heading in rad."""
 
-    name, goal_size, observation_size = "heading", 1, 2
+    name = "heading"
+    goal_size = 1
+    observation_size = 2
 
     def sample_goal(self, x: Tensor, generator: torch.Generator, cruise: float) -> Tensor:
         """Return headings up to 60 degrees to either side."""
@@ -86,7 +88,9 @@ class HeadingTask(ReferenceTask):
 class CourseTask(ReferenceTask):
     """Follow a straight line; a goal is a point of it (north, east) in m and its direction."""
 
-    name, goal_size, observation_size = "course", 3, 3
+    name = "course"
+    goal_size = 3
+    observation_size = 3
 
     def sample_goal(self, x: Tensor, generator: torch.Generator, cruise: float) -> Tensor:
         """Return lines within 45 degrees of the heading that pass the vehicle at some distance."""
@@ -125,7 +129,9 @@ class CourseTask(ReferenceTask):
 class DockingTask(ReferenceTask):
     """Slow down to a docking speed and keep the heading; a goal is speed in m/s and heading."""
 
-    name, goal_size, observation_size = "docking", 2, 3
+    name = "docking"
+    goal_size = 2
+    observation_size = 3
 
     def sample_goal(self, x: Tensor, generator: torch.Generator, cruise: float) -> Tensor:
         """Return a tenth to a third of the cruise speed, at the heading of the start."""
@@ -169,12 +175,10 @@ class EpisodeBatch:
     def __init__(self, vehicle: Vehicle, task: str, n_episodes: int, episode_length: int) -> None:
         if task not in REFERENCE_TASKS:
             raise UsageError(f"no task '{task}'{suggest_name(task, REFERENCE_TASKS)}")
-        self.vehicle, self.task, self.n_episodes, self.episode_length = (
-            vehicle,
-            REFERENCE_TASKS[task],
-            n_episodes,
-            episode_length,
-        )
+        self.vehicle = vehicle
+        self.task = REFERENCE_TASKS[task]
+        self.n_episodes = n_episodes
+        self.episode_length = episode_length
         self.generator = torch.Generator()
         self.generator.seed()
         self.observation_size = 3 + self.task.observation_size + vehicle.n_commands
@@ -203,7 +207,8 @@ class EpisodeBatch:
 
     def observe(self) -> np.ndarray:
         """Return the observation [B, size] in float32."""
-        cruise, (u, v, r) = self.vehicle.cruise, dynamic_states(self.x).unbind(-1)
+        cruise = self.vehicle.cruise
+        (u, v, r) = dynamic_states(self.x).unbind(-1)
         # yaw in turns of a look-ahead
         motion = torch.stack((u / cruise, v / cruise, r * LOOK_AHEAD_TIME), dim=-1)
         observation_parts = (motion, self.task.observe(self.x, self.goal, cruise), self.last_action)
@@ -235,7 +240,9 @@ class EpisodeBatch:
         reward = (
             reward - 0.05 * (action - self.last_action).square().mean(dim=-1) - 10.0 * has_diverged
         )
-        self.x, self.s, self.last_action = next_state, memory, action
+        self.x = next_state
+        self.s = memory
+        self.last_action = action
         self.step_count += 1
         return (
             reward.double().numpy(),
@@ -340,11 +347,9 @@ class VesselVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if bool(restarted_mask.any()):
             self.episodes.reset(restarted_mask)
             is_continuing = ~restarted_mask.numpy()
-            reward, diverged, finished = (
-                reward * is_continuing,
-                diverged & is_continuing,
-                finished & is_continuing,
-            )
+            reward = reward * is_continuing
+            diverged = diverged & is_continuing
+            finished = finished & is_continuing
         truncated = finished & ~diverged
         self.needs_reset = torch.from_numpy(diverged | truncated)
         return self.episodes.observe(), reward, diverged, truncated, {}

@@ -92,7 +92,8 @@ def load_learned_vehicle(run: Path, name: str = "selected") -> Vehicle:
         GuardedDynamics(model.float(), spec).float().eval().requires_grad_(False)
     )
     command_columns = slice(dof.n_dynamic, dof.n_dynamic + len(spec.signals.inputs))
-    lower, upper = torch.tensor(spec.low), torch.tensor(spec.high)
+    lower = torch.tensor(spec.low)
+    upper = torch.tensor(spec.high)
     return _with_cruise_speed(
         Vehicle(
             spec.name,

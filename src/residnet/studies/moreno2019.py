@@ -196,10 +196,8 @@ def _difference_row(
     """
     row: dict[str, Any] = {"model": model, "to": reference_model, "split": split}
     for axis, name in enumerate(_AXES):
-        squares, reference = (
-            _squared_errors(model, records, axis),
-            _squared_errors(reference_model, records, axis),
-        )
+        squares = _squared_errors(model, records, axis)
+        reference = _squared_errors(reference_model, records, axis)
         interval = block_bootstrap_interval(
             [a - b for a, b in zip(squares, reference, strict=True)]
         )
@@ -267,7 +265,8 @@ def grid_figures(notes: Mapping[str, Any]) -> list[Figure]:
     error_grids = grid_errors(notes)
     if not error_grids[0]:
         return []
-    names, figures = ("lambda", "sigma"), []
+    names = ("lambda", "sigma")
+    figures = []
     for parameter_index, parameter_text in enumerate(
         ("the penalty lambda", "the width sigma of the radial kernel")
     ):

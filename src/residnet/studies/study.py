@@ -97,7 +97,8 @@ def comparison_columns(
 
     def make_cell(pick: Callable[[Any], float]) -> Callable[[Any], Cell]:
         def cell(row: Any) -> Cell:
-            values, published_values = row[key], row["published"].get(key)
+            values = row[key]
+            published_values = row["published"].get(key)
             return published_cell(
                 None if values is None else factor * pick(values),
                 None if published_values is None else pick(published_values),

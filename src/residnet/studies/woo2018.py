@@ -52,10 +52,8 @@ MODEL_STYLES = {
 }
 MANOEUVRE_KINDS = ("zigzag", "acceleration_deceleration", "three_two_one_one")
 """Kinds of manoeuvre that the figures show."""
-_SIMPLE_MODELS, _LEARNED_MODELS = (
-    ("nomoto", "nomoto_side_slip", "baseline"),
-    ("lstm_printed", "lstm_rate", "lstm"),
-)
+_SIMPLE_MODELS = ("nomoto", "nomoto_side_slip", "baseline")
+_LEARNED_MODELS = ("lstm_printed", "lstm_rate", "lstm")
 _COMPARED_MODELS = ("baseline", *_LEARNED_MODELS)
 _CHANNELS = {
     "u": (0, "surge velocity u", "m/s", 1.0),
@@ -137,10 +135,8 @@ def error_changes(files: RunFiles, model: str) -> dict[str, float | None]:
 
 def steady_state_table(files: RunFiles) -> Table:
     """Return the constraints (32) of the linear model with intervals, next to Table 1."""
-    constraints, published_constraints = (
-        files.fit_notes("baseline")["steady_constraints"],
-        load_published("woo2018")["steady"],
-    )
+    constraints = files.fit_notes("baseline")["steady_constraints"]
+    published_constraints = load_published("woo2018")["steady"]
     table = Table(
         ["steady state", "Phi", "95 % interval", "bias", "95 % interval", "unit"],
         caption="Steady states of the constant manoeuvres as x = Phi tau + bias (32), beside those"
@@ -149,7 +145,8 @@ def steady_state_table(files: RunFiles) -> Table:
     for state, (_, _, unit, factor) in _CHANNELS.items():
         cells: list[Any] = []
         for key, number in zip(("phi", "bias"), published_constraints[state], strict=True):
-            value, error = constraints[state][key], 1.96 * constraints[state][f"{key}_error"]
+            value = constraints[state][key]
+            error = 1.96 * constraints[state][f"{key}_error"]
             cells.append(published_cell(factor * value, number, 3))
             cells.append(format_interval([value - error, value + error], factor, 3))
         force, measure = _DRIVING_FORCES[state]
@@ -177,9 +174,11 @@ def build_figures(files: RunFiles) -> list[Figure]:
     ]
     steering_curves = [(zigzag, "v"), (zigzag, "r"), (step_test, "v"), (step_test, "r")]
     notes = files.fit_notes("baseline")
-    states, panels_and_traces = notes["steady_states"], []
+    states = notes["steady_states"]
+    panels_and_traces = []
     for state, (_, _, unit, factor) in _CHANNELS.items():
-        (force, measure), constraint = _DRIVING_FORCES[state], notes["steady_constraints"][state]
+        (force, measure) = _DRIVING_FORCES[state]
+        constraint = notes["steady_constraints"][state]
         tau = np.array(states[force])
         force_limits = np.array([tau.min(), tau.max()])
         fitted_line = factor * (constraint["phi"] * force_limits + constraint["bias"])
@@ -268,7 +267,8 @@ def _time_series_figure(
     panels_and_traces = list(leading_panels)
     for window, channel in windows_and_channels:
         column, name, unit, factor = _CHANNELS[channel]
-        time, measured = window.t - window.t[0], factor * window.measured[:, column]
+        time = window.t - window.t[0]
+        measured = factor * window.measured[:, column]
         paths = {model: factor * window.predicted[model][:, column] for model in models}
         group = f"{window.log} {channel}"
         motion_panel = Panel(f"{name} [{unit}]", title=window.log, height=210, group=group)

@@ -210,16 +210,15 @@ class ActuatorsTaskConfig(Task):
             ResidnetError: if the logs cannot be used or do not determine the actuators.
         """
         throttle_data = step_data = bollard_data = None
-        test_names, main_estimates = [], dict[str, IntervalEstimate]()
+        test_names = []
+        main_estimates = dict[str, IntervalEstimate]()
         report_json: dict[str, Any] = {"schema": "residnet.actuators/1"}
         vessel_lines: dict[str, Any] = {}
         if self.throttle is not None:
             throttle_values, n = self.throttle.read_concatenated()
             throttle_map = fit_throttle_map(throttle_values, n)
-            throttle_data, main_estimates["n_max"] = (
-                (throttle_values, n, throttle_map),
-                throttle_map.n_max,
-            )
+            throttle_data = (throttle_values, n, throttle_map)
+            main_estimates["n_max"] = throttle_map.n_max
             report_json["throttle"] = _estimates_to_json(throttle_map._asdict())
             vessel_lines["n_max"] = f"{throttle_map.n_max.value * 60:.5g} rpm"
             test_names.append("throttle map")
@@ -403,7 +402,8 @@ def plot_actuator_tests(
         panels_and_curves.append((panel, panel_curves))
     if step_data is not None:
         responses, step_response = step_data
-        rate, dead_time = step_response.rate.value, step_response.dead_time.value
+        rate = step_response.rate.value
+        dead_time = step_response.dead_time.value
         panel = Panel("revolutions [rpm]", "time [s]", "step response", height=250, group="step")
         step_curves = {
             "command": join_with_gaps((t - t[0], 60 * command) for t, command, _ in responses),

@@ -285,7 +285,8 @@ def _write_conclusion(
 def _plot_error_growth(runs: Sequence[EvaluatedRun], output_folder: Path) -> Block:
     """Plot the growth of the errors of the selected models over the common windows."""
     protocol, windows = next(iter(_common_windows(runs).items()))
-    scales, error_curves = _reference_scales(runs), {}
+    scales = _reference_scales(runs)
+    error_curves = {}
     for run in runs:
         error = (
             error_growth([run.windows_by_key[window] for window in windows], run.model)[

@@ -121,7 +121,8 @@ def write_new_config(
     ascii_name = unicodedata.normalize("NFKD", output_file.stem).encode("ascii", "ignore").decode()
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", ascii_name).strip("_.-") or "my_boat"
     draft = draft_fit_config(logs, output_file.parent, name, answer_question)
-    file, n_guesses = draft.save(output_file), len(draft.guesses)
+    file = draft.save(output_file)
+    n_guesses = len(draft.guesses)
     messages = [f"{key}: {reason}" for key, reason in draft.guesses[:_MAX_SHOWN_GUESSES]]
     if n_guesses > _MAX_SHOWN_GUESSES:
         messages.append(f"and {n_guesses - _MAX_SHOWN_GUESSES} more, marked in the file")
@@ -479,7 +480,8 @@ def _split_logs(
             entry: Any = path.resolve().relative_to(common_folder).as_posix()
             duration = draft_logs.longest_times[path]
             if segment_limits:
-                reason, source = "few logs: each is cut in time", usable_logs[path]
+                reason = "few logs: each is cut in time"
+                source = usable_logs[path]
                 entry = {"log": entry}
                 entry |= (
                     {"from": f"{segment_limits[0]:.13g} s"}
@@ -672,7 +674,8 @@ def _choose_force_set(
 
 def _explained_variance(logs: Sequence[Log], names: Sequence[str]) -> float:
     """Return the mean R² of a linear regression of the accelerations on velocities and inputs."""
-    rows, velocity_changes = [], []
+    rows = []
+    velocity_changes = []
     for log in logs:
         columns = [name for name in (*STATE_NAMES[3:], *names) if name in log.channels]
         if len(columns) < 3 + len(names):
@@ -685,7 +688,8 @@ def _explained_variance(logs: Sequence[Log], names: Sequence[str]) -> float:
         velocity_changes.append((table[horizon:, :3] - table[:-horizon, :3])[is_usable])
     if not rows or sum(map(len, rows)) < 50:
         return 0.0
-    regressors, responses = np.concatenate(rows), np.concatenate(velocity_changes)
+    regressors = np.concatenate(rows)
+    responses = np.concatenate(velocity_changes)
     regressors = np.column_stack(
         (
             (regressors - regressors.mean(0)) / np.maximum(regressors.std(0), 1e-12),

@@ -85,7 +85,8 @@ class ImportConfig(Task):
             DataError: if a recording cannot be used; earlier recordings are already written.
         """
         paths = self._find_paths()
-        reader, names = self.reader.build(), assign_log_names(paths)
+        reader = self.reader.build()
+        names = assign_log_names(paths)
         findings: dict[str, Any] = {}
         rows = []
         for number, path in enumerate(paths):

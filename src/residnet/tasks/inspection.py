@@ -82,7 +82,8 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
     )
     configured_reader = None if task is None else getattr(task, "reader", None) or task.data.reader
     files = find_log_files(paths)
-    results, channel_map_lines = dict[Path, Log | ResidnetError](), list[str]()
+    results = dict[Path, Log | ResidnetError]()
+    channel_map_lines = list[str]()
     if configured_reader is None:
         for draft in read_mixed_formats(files):
             results |= {**draft.logs, **draft.errors}
@@ -203,7 +204,8 @@ def _check_regressor_conditioning(logs: Sequence[Log], fit_config: FitConfig) ->
         baseline = config.build(data.names)
         if not isinstance(baseline, RegressorBaseline):
             continue
-        regressor_matrix, terms = baseline.library(data.z).numpy(), list(baseline.library.terms)
+        regressor_matrix = baseline.library(data.z).numpy()
+        terms = list(baseline.library.terms)
         is_varying = np.ptp(regressor_matrix, axis=0) > 1e-12 * np.abs(regressor_matrix).max(
             axis=0, initial=0.0
         )

@@ -169,7 +169,8 @@ class Programme(Config):
         Raises:
             ResidnetError: if a log cannot be read.
         """
-        manoeuvres, reader = self.sample_manoeuvres(), self.reader.build()
+        manoeuvres = self.sample_manoeuvres()
+        reader = self.reader.build()
         for manoeuvre in manoeuvres:
             if isinstance(manoeuvre, Replay):
                 manoeuvre.use_log(reader.read(manoeuvre.log))
@@ -237,24 +238,24 @@ class Programme(Config):
         return craft, TrialEnvironment(plant, self.disturbance, self.noise, self.seed)
 
     def _build_model_craft(self, choice: ModelChoice) -> tuple[SimulatedVessel, TrialEnvironment]:
-        name, (spec, model) = choice.model_folder.name, load_model(choice.model_folder)
+        name = choice.model_folder.name
+        (spec, model) = load_model(choice.model_folder)
         step = spec.dt
         if self.step is not None and abs(self.step - step) > 1e-9:
             raise ConfigError(
                 f"programme.step ({self.step:g} s) must be that of model '{name}' ({step:g} s);"
                 " leave it out"
             )
-        vessel, plant = choice.actuators or self.vessel, None
+        vessel = choice.actuators or self.vessel
+        plant = None
         actuators: GivenActuators | PlantActuators
         forces: Callable[[Tensor], Tensor] | None = None
         if choice.inputs:
             actuators = GivenActuators(choice.inputs, spec.signals.exogenous, step)
         elif vessel is not None:
             plant = load_vessel(vessel).build()
-            actuators, forces = (
-                PlantActuators(plant, step, self.substeps),
-                Helm.from_plant(plant).forces,
-            )
+            actuators = PlantActuators(plant, step, self.substeps)
+            forces = Helm.from_plant(plant).forces
         else:
             raise ConfigError(
                 "a model flies with actuators: name a vessel's in programme.model.actuators, or"
@@ -365,7 +366,8 @@ class SimulateConfig(ComputingTask):
                 (craft, self.programme.simulate_all(craft, sea))
                 for craft, sea in self.programme.build_crafts()
             ]
-            length, n_listed = self.programme.hull_length, len(self.programme.manoeuvres)
+            length = self.programme.hull_length
+            n_listed = len(self.programme.manoeuvres)
             crafts = zip(("logs", "model_logs"), flights_by_craft, strict=False)
             flights_by_folder = [
                 (subfolder, flight) for subfolder, (_, flights) in crafts for flight in flights
@@ -376,7 +378,8 @@ class SimulateConfig(ComputingTask):
             flights_by_craft = [
                 (build_trial_vessel(self.data), simulate_trials(manoeuvres, self.data))
             ]
-            length, n_listed = load_vessel(self.data.vessel).length.value, 0
+            length = load_vessel(self.data.vessel).length.value
+            n_listed = 0
             flights_by_split = zip(
                 self.data.assign_splits(manoeuvres), flights_by_craft[0][1], strict=True
             )
@@ -394,7 +397,8 @@ class SimulateConfig(ComputingTask):
         folder.write_json(folder.path / "indices.json", content)
         figures = trial_figures({craft.name: flights for craft, flights in flights_by_craft})
         write_figures(folder.figures, figures)
-        n_flights, faulty_rows = len(flights_by_folder), [row for row in rows if row["fault"]]
+        n_flights = len(flights_by_folder)
+        faulty_rows = [row for row in rows if row["fault"]]
         completion_text = (
             f"{len(faulty_rows)} of {n_flights} manoeuvres did NOT end as they should"
             if faulty_rows

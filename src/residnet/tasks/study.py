@@ -325,7 +325,8 @@ def plot_differences(rows: Sequence[JsonObject], reference: str) -> Figure:
     """
     protocols = list(dict.fromkeys(row["protocol"] for row in rows))
     names = [name for name in dict.fromkeys(row["variant"] for row in rows) if name != reference]
-    panel_curves, panels = [], []
+    panel_curves = []
+    panels = []
     for protocol in protocols:
         protocol_rows = [
             row for row in rows if row["protocol"] == protocol and row["variant"] != reference

@@ -97,7 +97,8 @@ def rollout_loss(
     states, _, _ = rollout(x0, w, s)
     n = scales.numel()
     error = (dynamic_states(states[:, 1:], n) - dynamic_states(y, n)) / scales
-    weight, count = usable.to(error.dtype).unsqueeze(-1), float(n)
+    weight = usable.to(error.dtype).unsqueeze(-1)
+    count = float(n)
     if robust > 0:
         square = (error.square() * weight).sum((1, 2)) / (count * weight.sum((1, 2))).clamp(min=1.0)
         return torch.sqrt(square + robust**2).sum() / process_mean(torch.ones_like(square).sum())
@@ -190,7 +191,8 @@ class HeadTraining(EpochTraining):
         self.scales = scales
         self.validate = validate
         self.stages = config.windows(model.dt)
-        self.rank, self.world = 0, 1
+        self.rank = 0
+        self.world = 1
         self.mirror = Mirror.from_signals(model.signals) if config.mirror else None
 
     def data(self, store: WindowStore) -> WindowsDataModule:
@@ -241,7 +243,8 @@ class HeadTraining(EpochTraining):
     def on_fit_start(self) -> None:
         super().on_fit_start()
         if torch.distributed.is_available() and torch.distributed.is_initialized():
-            self.rank, self.world = self.global_rank, torch.distributed.get_world_size()
+            self.rank = self.global_rank
+            self.world = torch.distributed.get_world_size()
         self.scales = self.scales.to(self.device)
 
     def on_train_epoch_start(self) -> None:
@@ -284,7 +287,8 @@ class HeadTraining(EpochTraining):
         return one_step_loss(self.model, z, baseline, nu_dot, is_counted, scale, self.process_mean)
 
     def _multi_step(self, windows: Sequence[WindowBatch], stage: int) -> Tensor:
-        initial_states, memories = [], []
+        initial_states = []
+        memories = []
         if self.mirror is not None:
             windows = [self.mirror.mirror_alternate(part) for part in windows]
         for number, part in enumerate(windows):
@@ -340,7 +344,9 @@ class HeadTraining(EpochTraining):
 
     def compute_validation_score(self) -> tuple[nn.Module, float]:
         score = self.validate(self.model)
-        self.diverged, self.axes, self.example = score.diverged, score.axes, score.example
+        self.diverged = score.diverged
+        self.axes = score.axes
+        self.example = score.example
         return self.model, score.error
 
 

@@ -100,7 +100,8 @@ def estimate_leave_one_out(
     problem = build_problem(model, samples, store, config, scales).with_fixed(fixed)
     problem = estimate_initial_states(model, problem)
     cost, states = simulate(model, problem)
-    refitted_theta, parameters = baseline.theta.detach().clone(), baseline.get_free()
+    refitted_theta = baseline.theta.detach().clone()
+    parameters = baseline.get_free()
     fold_of_window = fold[problem.log]
     n_folds = int(fold.max()) + 1
     n_windows = torch.bincount(fold_of_window, minlength=n_folds).to(parameters.dtype)
@@ -150,7 +151,8 @@ def _largest_improving_step(
     model: HybridDynamics, remaining: Problem, parameters: Tensor, step: Tensor
 ) -> Tensor:
     """Return the parameters after the largest fraction of the step that lowers the cost."""
-    baseline, (initial_cost, _) = require_parametric_baseline(model), simulate(model, remaining)
+    baseline = require_parametric_baseline(model)
+    (initial_cost, _) = simulate(model, remaining)
     for halving in range(_MAX_HALVINGS):
         trial = parameters + 0.5**halving * step
         baseline.set_free(trial)

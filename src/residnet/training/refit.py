@@ -174,7 +174,8 @@ class Problem:
         return inverse
 
     def prior_cost(self, theta: Tensor, per_nat: Tensor) -> Tensor:
-        from_prior, from_belief = theta - self.prior_mean, theta - self.belief_mean
+        from_prior = theta - self.prior_mean
+        from_belief = theta - self.belief_mean
         quadratic = from_prior @ self.precision @ from_prior + theta @ self.symmetry @ theta
         return quadratic + per_nat * (self.belief_precision * from_belief.square()).sum()
 
@@ -219,7 +220,8 @@ def build_problem(
     scales: Tensor,
 ) -> Problem:
     """Return the refit problem after a least-squares fit to `samples`; no parameter is fixed."""
-    baseline, steps = require_parametric_baseline(model), round(config.horizon / model.dt)
+    baseline = require_parametric_baseline(model)
+    steps = round(config.horizon / model.dt)
     starts = find_free_run_starts(store, config, model.dt)
     usable = store.take_windows(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)
     # u and v come from positions, which can freeze; an IMU measures the other velocities
@@ -388,7 +390,8 @@ def estimate_initial_states(model: HybridDynamics, problem: Problem) -> Problem:
     if problem.initial is None:
         return problem
     states = simulate(model, problem)[1]
-    error, counts = all_but_pose(states[:, 1:]) - problem.measured, problem.weight > 0.0
+    error = all_but_pose(states[:, 1:]) - problem.measured
+    counts = problem.weight > 0.0
     noise = problem.initial.noise.square()
     mean_square = (error.square() * counts).sum((0, 1)) / counts.sum((0, 1)).clamp(min=1)
     variance = noise + (mean_square - noise).clamp(min=0.0) * error.shape[1]
@@ -429,7 +432,9 @@ def _fit_growing_horizon(
         return not (cost < _DIVERGED or (steps == 1 and cost < torch.inf))
 
     total = problem.inputs.shape[1]
-    horizon, first, iterated = 0, 0, 0
+    horizon = 0
+    first = 0
+    iterated = 0
     while horizon < total:
         # double the horizon, then halve the increase until the free runs are finite
         next_horizon = min(2 * horizon, total) if horizon else total
@@ -476,7 +481,8 @@ def refit(
         with torch.no_grad():
             baseline.theta.copy_(begin)
     cost, _ = simulate(model, problem)
-    iterated, first_horizon = 0, problem.inputs.shape[1]
+    iterated = 0
+    first_horizon = problem.inputs.shape[1]
     if not torch.isfinite(cost):
         first_horizon, iterated = _fit_growing_horizon(model, problem, config.iterations)
         cost, _ = simulate(model, problem)

@@ -90,7 +90,8 @@ class EpochTraining(L.LightningModule, ABC):
         model, score = self.compute_validation_score()
         self.start_score = score
         if math.isfinite(score):
-            self.best_score, self.best_state = score, _copy_state(model)
+            self.best_score = score
+            self.best_state = _copy_state(model)
 
     def seed_epoch(self) -> None:
         """Seed the random numbers of the current epoch."""
@@ -116,7 +117,9 @@ class EpochTraining(L.LightningModule, ABC):
             entry["validation"] = score
             entry["diverged"] = float(self.diverged)
             if self._is_improvement(score):
-                self.best_score, self.best_diverged, self.without_gain = score, self.diverged, 0
+                self.best_score = score
+                self.best_diverged = self.diverged
+                self.without_gain = 0
                 self.best_state = _copy_state(model)
             else:
                 self.without_gain += 1
@@ -179,7 +182,9 @@ class EpochEnd(L.Callback):
     """
 
     def __init__(self, name: str, epochs: int, checkpoint: Path | None) -> None:
-        self.name, self.epochs, self.checkpoint = name, epochs, checkpoint
+        self.name = name
+        self.epochs = epochs
+        self.checkpoint = checkpoint
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Finish the epoch, write the checkpoint, and report the loss and the best score."""
@@ -191,7 +196,8 @@ class EpochEnd(L.Callback):
         elif self.checkpoint is not None:
             # all processes must call this to synchronise; only the first one writes
             trainer.save_checkpoint(self.checkpoint)
-        done, last = trainer.current_epoch + 1, pl_module.history[-1]
+        done = trainer.current_epoch + 1
+        last = pl_module.history[-1]
         score = pl_module.best_score if math.isfinite(pl_module.best_score) else None
         line = (
             f"  {self.name}: epoch {done}/{self.epochs}, stage {int(last['stage'])}, loss"
@@ -241,7 +247,8 @@ def run_epochs(
             return run_epochs(name, module, data, model, trained, Path(temporary), machine)
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     settings: Epochs = module.settings
-    logger, last = None, None
+    logger = None
+    last = None
     if folder is not None:
         last = folder / "checkpoints" / name / "last.ckpt"
         tensorboard = folder / "tensorboard" / name

@@ -98,7 +98,8 @@ def test_unscored_samples_and_runs_of_other_lengths_are_left_out() -> None:
 
 
 def test_a_roll_has_bands_of_its_own(band: Band) -> None:
-    live, random = DegreesOfFreedom(ROLL_LAYOUT.velocities), np.random.default_rng(6)
+    live = DegreesOfFreedom(ROLL_LAYOUT.velocities)
+    random = np.random.default_rng(6)
 
     def rolling(given: list[RunErrors]) -> list[RunErrors]:
         out = []
@@ -148,7 +149,8 @@ def test_a_weighted_quantile_is_the_smallest_score_that_suffices() -> None:
 
 def of_unlike_models(logs: int, off: float, seed: int) -> list[RunErrors]:
     """Runs of the first of four models, whose errors beside the noise are of one size."""
-    random, out = np.random.default_rng(seed), []
+    random = np.random.default_rng(seed)
+    out = []
     grown = np.sqrt(STEP * np.arange(1, LENGTH + 1))[:, None, None]
     for number in range(logs):
         apart = grown * (0.1 * random.normal(size=(1, 5, 1)) + off * random.normal(size=(1, 5, 4)))

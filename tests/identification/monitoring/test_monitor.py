@@ -29,7 +29,8 @@ from residnet.identification.monitoring import (
 from residnet.identification.recursive_refit import refit_recursively
 from residnet.testing.checks import EXAMPLE_TIME_STEP, make_example_model, make_example_spec
 
-SECONDS, WINDOW = 60, 100
+SECONDS = 60
+WINDOW = 100
 NOISE = np.array([0.0, 0.0, 0.002, 0.02, 0.02, 0.003])
 NONE = SystemChange("none", "", "", 1.0)
 
@@ -131,7 +132,8 @@ def test_sample_by_sample_it_says_what_windows_say(
     known: tuple[ModelSpec, HybridDynamics], watch: ChangeDetector
 ) -> None:
     y, w = logs(known[1], NONE, 1, 7)[0]
-    whole, single = OnlineChangeDetector(watch), OnlineChangeDetector(watch)
+    whole = OnlineChangeDetector(watch)
+    single = OnlineChangeDetector(watch)
     wanted = [whole.update_with_sums(sums) for sums in watch.compute_sums(windows((y, w)))]
     given = np.concatenate((w, w[-1:]))
     found = [
@@ -276,7 +278,8 @@ def test_what_lasts_for_a_stretch_makes_its_scores_lie_wider() -> None:
 def test_one_log_at_odds_with_the_others_does_not_speak_for_all() -> None:
     random = np.random.default_rng(5)
     scatter = fit_score_distribution(groups(random, 60, 1, UNCHANGED, 0.1))
-    changed, strange = [], []
+    changed = []
+    strange = []
     for _ in range(50):
         known = groups(random, 5, 1, UNCHANGED, 0.1)
         # a manoeuvre that no clean log held asks for ten standard deviations alone
@@ -306,7 +309,9 @@ def test_a_cause_is_no_likelier_because_clean_logs_were_surer_of_it() -> None:
     assert first > 40
 
 
-WINDOWS, CHANGES, VALUES = 6, 3, 40
+WINDOWS = 6
+CHANGES = 3
+VALUES = 40
 BELIEF = np.diag([1.0, 1.0, 1.0])
 
 

@@ -37,7 +37,8 @@ SHARES = {"tau_x": InputShare(drive=1.0), "tau_n": InputShare(steer=0.3)}
 def known() -> tuple[FittedModel, RefitUncertainty, torch.Tensor]:
     logs = trials()[:3]
     model = model_of(LINEAR)
-    given, store = make_samples(logs, model.signals), WindowStore.from_logs(logs, torch.float64)
+    given = make_samples(logs, model.signals)
+    store = WindowStore.from_logs(logs, torch.float64)
     RegressorsConfig(terms=tuple(LINEAR)).fit_preferred(model.baseline, given)
     refitted = refit(model, given, store, CONFIG, SCALES)
     low, high = compute_training_ranges(logs)
@@ -80,7 +81,8 @@ def test_a_look_back_finds_the_covariance_of_the_refit(
 def test_information_adds_to_what_is_known() -> None:
     random = torch.Generator().manual_seed(0)
     a, b = (torch.randn(4, 4, generator=random, dtype=torch.float64) for _ in range(2))
-    covariance, told = torch.linalg.inv(a @ a.T), b @ b.T
+    covariance = torch.linalg.inv(a @ a.T)
+    told = b @ b.T
     torch.testing.assert_close(
         update_covariance(covariance, told), torch.linalg.inv(a @ a.T + told)
     )

@@ -115,7 +115,8 @@ def find_passages(track: Array, buoys: Sequence[BuoyConfig]) -> list[Passage]:
 def _side_of_buoy(track: Array, sample: int, buoy: BuoyConfig) -> str:
     """Return the side of the vessel on which a buoy lies at a sample."""
     step = track[min(sample + 1, len(track) - 1)] - track[max(sample - 1, 0)]
-    north, east = buoy.north - track[sample, 0], buoy.east - track[sample, 1]
+    north = buoy.north - track[sample, 0]
+    east = buoy.east - track[sample, 1]
     return "starboard" if step[0] * east - step[1] * north > 0 else "port"
 
 

@@ -397,7 +397,8 @@ class RouteProblem:
 
     def bounds(self) -> tuple[Array, Array]:
         """Return the lower and upper bounds of z."""
-        lower, upper = self.route.lower_bounds(), self.route.upper_bounds()
+        lower = self.route.lower_bounds()
+        upper = self.route.upper_bounds()
         if self.trust_region is None:
             return lower, upper
         z, trust_radius = self.trust_region
@@ -456,10 +457,8 @@ class RouteProblem:
             if iteration % _ACTIVE_SET_INTERVAL == 0:
                 self.refresh_constraints(z)
                 linearized = self.linearize(z)
-            step_lower, step_upper = (
-                np.maximum(lower - z, -trust_radius),
-                np.minimum(upper - z, trust_radius),
-            )
+            step_lower = np.maximum(lower - z, -trust_radius)
+            step_upper = np.minimum(upper - z, trust_radius)
             if not self.is_heading_free:
                 step_lower[0] = step_upper[0] = 0.0
             step, predicted_gain = linearized.solve_linear_program(step_lower, step_upper)

@@ -245,14 +245,13 @@ class RatedBangBangHeading(Policy):
         )
         r = turn_direction * yaw_rate
         rudder = turn_direction * rudder_angle
-        lower, upper = torch.zeros_like(r), torch.full_like(r, 20.0 * self.limit)
+        lower = torch.zeros_like(r)
+        upper = torch.full_like(r, 20.0 * self.limit)
         for _ in range(_N_BISECTIONS):
             trial_effort = 0.5 * (lower + upper)
             is_turning = self._simulate_braking(r, rudder, trial_effort)[0] > 0
-            lower, upper = (
-                torch.where(is_turning, trial_effort, lower),
-                torch.where(is_turning, upper, trial_effort),
-            )
+            lower = torch.where(is_turning, trial_effort, lower)
+            upper = torch.where(is_turning, upper, trial_effort)
         effort = 0.5 * (lower + upper)
         distance = self._simulate_braking(r, rudder, effort)[1]
         remaining_error = turn_direction * error - distance

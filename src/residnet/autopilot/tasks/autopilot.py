@@ -502,7 +502,8 @@ def minimum_turn_time(
             first_duration - second_duration
         ), first_duration + second_duration
 
-    lower, upper = 0.0, time_constant
+    lower = 0.0
+    upper = time_constant
     while turn_and_time(upper)[0] < change:
         upper *= 2.0
     for _ in range(60):

@@ -550,7 +550,8 @@ def project_to_tangent_plane(
         f" {origin}"
     )
     is_finite = np.isfinite(latitude) & np.isfinite(longitude)
-    north, east = np.full(latitude.shape, np.nan), np.full(latitude.shape, np.nan)
+    north = np.full(latitude.shape, np.nan)
+    east = np.full(latitude.shape, np.nan)
     east[is_finite], north[is_finite], _ = transformer.transform(
         longitude[is_finite], latitude[is_finite], np.zeros(int(is_finite.sum())), radians=True
     )

@@ -205,9 +205,12 @@ def _quantity_cell(run: RunFiles, key: str, row: JsonObject | None) -> Cell:
         small_print = (
             f"{format_number(interval[0])}–{format_number(interval[1])}" if interval else ""
         )
-        value, is_worse, factor = row["nrmse"]["mean"], False, 1.0
+        value = row["nrmse"]["mean"]
+        is_worse = False
+        factor = 1.0
     else:
-        value, factor = row["rmse"].get(key), run.display_unit(key)[1]
+        value = row["rmse"].get(key)
+        factor = run.display_unit(key)[1]
         if value is None:
             return Cell(DASH)
         row_key = (row["split"], row["protocol"], row.get("manoeuvre", "all"))
@@ -505,7 +508,8 @@ def _coverage_table(
     rows: Sequence[JsonObject], title: str, label: Any, selected_model: str | None = None
 ) -> Table:
     def comparison_cell(row: JsonObject, name: str) -> Cell:
-        value, band_score = row.get(name), row["band_score"]
+        value = row.get(name)
+        band_score = row["band_score"]
         note = (
             format_percent_change(100 * (value / band_score - 1))
             if value is not None and band_score > 0

@@ -55,7 +55,9 @@ from residnet.report.run_reader import JsonObject, RunFiles
 
 _MAX_SEPARATE_FLIGHTS = 12
 """Most flights that have a table and a picture each; of more, the first of each kind has."""
-_MAX_CASES, _MAX_PANELS, _MAX_ZIGZAGS = 30, 12, 6
+_MAX_CASES = 30
+_MAX_PANELS = 12
+_MAX_ZIGZAGS = 6
 """Maximum number of manoeuvres and panels in the interactive figure and of zigzags in an image.
 
 They limit the page to a few megabytes and an image to one page.
@@ -379,7 +381,8 @@ def trial_figures(trials_by_craft: Mapping[str, Sequence[ManoeuvreRun]]) -> Iter
 def _trial_curves(
     crafts: Sequence[str], group: Sequence[ManoeuvreRun], factors: Mapping[str, float]
 ) -> list[dict[str, Curve]]:
-    manoeuvre, first_motion = group[0].manoeuvre, group[0].true_log
+    manoeuvre = group[0].manoeuvre
+    first_motion = group[0].true_log
     x0, y0 = (float(first_motion[name][0]) for name in ("x", "y"))
     logs: dict[str, Log] = {}
     if isinstance(manoeuvre, Replay):
@@ -413,7 +416,8 @@ def _trial_curves(
 def _spiral_figure(
     crafts: Sequence[str], group: Sequence[ManoeuvreRun], styles: Mapping[str, GlyphStyle]
 ) -> Figure:
-    name, manoeuvre = group[0].true_log.name, group[0].manoeuvre
+    name = group[0].true_log.name
+    manoeuvre = group[0].manoeuvre
     by_angle = isinstance(manoeuvre, Spiral) and len(manoeuvre.rudders) > 0
     panel: dict[str, Curve] = {}
     for craft, trial in zip(crafts, group, strict=True):
@@ -497,7 +501,8 @@ def _repeated_zigzag_table(content: JsonObject, pages: Sequence[JsonObject]) -> 
     }
 
     def cell(page: JsonObject, name: str, key: str) -> Cell:
-        entry, factor = page["indices"].get(name, {}), index_units[name][1]
+        entry = page["indices"].get(name, {})
+        factor = index_units[name][1]
         if "measured" not in entry:
             return Cell(DASH)
         if key == "difference":
@@ -525,7 +530,8 @@ def _repeated_zigzag_table(content: JsonObject, pages: Sequence[JsonObject]) -> 
 
 def booklet_figures(run: RunFiles) -> Iterator[Figure]:
     """Draw the turning circles with all draws and the repeated zigzags of a booklet."""
-    content, frame = run.read_json("booklet.json"), run.read_parquet("booklet.parquet")
+    content = run.read_json("booklet.json")
+    frame = run.read_parquet("booklet.parquet")
     if not content or frame is None:
         return
     by_page = {str(name): rows for name, rows in frame.groupby("page", sort=False)}
@@ -580,7 +586,8 @@ def _turning_circle_figure(
     }
     curves_by_role: dict[bool, list[Curve]] = {True: [], False: []}
     for page in pages:
-        rows, indices = by_page[page["name"]], page["indices"]
+        rows = by_page[page["name"]]
+        indices = page["indices"]
         for draw_number, draw_rows in rows[rows["draw"] >= 0].groupby("draw"):
             curves_by_role[draw_number == 0].append(
                 (draw_rows["y"] / length, draw_rows["x"] / length)
@@ -627,7 +634,8 @@ def _zigzag_curves(rows: Any, level: float) -> dict[str, Curve]:
         )
         return heading_change
 
-    fitted_rows, measured_rows = rows[rows["draw"] == 0], rows[rows["draw"] == -1]
+    fitted_rows = rows[rows["draw"] == 0]
+    measured_rows = rows[rows["draw"] == -1]
     t = fitted_rows["t"].to_numpy()
     traces = {
         "model": (t, relative_heading_deg(fitted_rows)),

@@ -98,13 +98,15 @@ def _coefficient_table(notes: JsonObject) -> Table:
     """Return coefficients with their standard errors, to two digits of these, and units."""
 
     def value(entry: JsonObject) -> str:
-        value, error = float(entry["value"]), float(entry["standard_error"])
+        value = float(entry["value"])
+        error = float(entry["standard_error"])
         decimals = max(1 - math.floor(math.log10(error)), 0) if error > 0 else 7
         # an exact one has no error to tell its digits by
         return format_fixed(value, decimals) if decimals <= 6 else format_number(value, 4)
 
     def ratio(entry: JsonObject) -> Cell:
-        value, error = abs(float(entry["value"])), float(entry["standard_error"])
+        value = abs(float(entry["value"]))
+        error = float(entry["standard_error"])
         if error <= 1e-9 * value:
             return Cell("exact")
         return Cell(format_number(value / error, 2), mark="weak" if value < 2 * error else "")
@@ -210,7 +212,8 @@ def _head_section(run: RunFiles) -> Section | None:
 
 def _inputs_text(run: RunFiles, model: str) -> str:
     """Return the inputs of a head and the baseline below it, or the members of an ensemble."""
-    notes, head = run.fit_notes(model), run.model_card(model).get("head") or {}
+    notes = run.fit_notes(model)
+    head = run.model_card(model).get("head") or {}
     if notes.get("members"):
         return "mean of " + ", ".join(notes["members"])
     if not head:
@@ -231,7 +234,8 @@ _COMPLEXITY_FORMATS = {
 
 
 def _complexity_text(run: RunFiles, model: str) -> str:
-    head, texts = run.model_card(model).get("head") or {}, []
+    head = run.model_card(model).get("head") or {}
+    texts = []
     # a card's `term_figures` are names
     properties = dict(run.fit_notes(model)) | {
         key: head[key] for key in ("hidden", "hidden_size") if key in head
@@ -323,7 +327,8 @@ def term_figures(run: RunFiles) -> Iterator[Figure]:
                 index="t", columns="term", values="value", sort=False
             )
             terms_over_time *= AXES[axis][2]
-            time, target = terms_over_time.index.to_numpy(), terms_over_time.pop("target")
+            time = terms_over_time.index.to_numpy()
+            target = terms_over_time.pop("target")
             order = (terms_over_time**2).mean().sort_values(ascending=False, kind="stable").index
             curves_by_name = {"target": target} | {
                 str(term): terms_over_time[term] for term in order[:_MAX_PLOTTED_TERMS]

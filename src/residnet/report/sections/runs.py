@@ -39,7 +39,9 @@ from residnet.report.run_reader import RunFiles, StoredWindow
 
 DisplayUnits: TypeAlias = Mapping[str, tuple[str, str, float]]
 """By channel its SI unit, the unit in which it is shown, and the factor to that."""
-_MAX_CASES, _MAX_STATIC_IMAGES, _MAX_TIME_BINS = 12, 6, 60
+_MAX_CASES = 12
+_MAX_STATIC_IMAGES = 6
+_MAX_TIME_BINS = 60
 """Maximum number of windows in the interactive figure and in images, and points of an error curve.
 
 They limit the page to a few megabytes and keep the curve smooth.
@@ -98,7 +100,8 @@ def model_styles(run: RunFiles) -> dict[str, GlyphStyle]:
             color, dash, order = _ROLE_STYLES[kind]
         else:
             head_index = run.heads.index(model)
-            color, order = _HEAD_COLORS[head_index % len(_HEAD_COLORS)], 4
+            color = _HEAD_COLORS[head_index % len(_HEAD_COLORS)]
+            order = 4
             dash = _HEAD_DASHES[(head_index + head_index // len(_HEAD_COLORS)) % len(_HEAD_DASHES)]
         styles[model] = GlyphStyle(
             short_label(run, model), color, dash, is_visible=model in visible_models, z_order=order
@@ -309,7 +312,8 @@ def _window_curves(
     window: StoredWindow, main_model: str, units: DisplayUnits
 ) -> list[dict[str, Curve]]:
     """Return track and motion of a run, measured and predicted, and the band of one model."""
-    time, usable = window.t - window.t[0], window.usable
+    time = window.t - window.t[0]
+    usable = window.usable
     # headings begin within half a turn of north, tracks at their start
     whole_turns = 2 * math.pi * math.floor((window.measured[0, 3] + math.pi) / (2 * math.pi))
     origin = np.zeros(window.measured.shape[1])
@@ -332,7 +336,8 @@ def _window_curves(
     for name in _MOTION_TITLES:
         if name not in moving_channels:
             continue
-        column, factor = columns.index(name), units[name][2]
+        column = columns.index(name)
+        factor = units[name][2]
         is_scored = usable | (column >= 2)
         measured = factor * (window.measured - origin)[:, column]
         panel: dict[str, Curve] = {"measured": (time, np.where(is_scored, measured, np.nan))}
@@ -375,7 +380,8 @@ def error_growth(windows: Sequence[StoredWindow], model: str) -> pd.DataFrame:
 
 def horizon_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw the error of every model against the horizon, on a logarithmic scale."""
-    cases, (panels, factors) = [], _build_error_panels(run, "RMS error of\n", 175)
+    cases = []
+    (panels, factors) = _build_error_panels(run, "RMS error of\n", 175)
     for protocol in run.protocols:
         protocol_windows = [window for window in windows if window.protocol == protocol]
         panel_curves: list[dict[str, Curve]] = [{} for _ in panels]
@@ -413,7 +419,8 @@ def _build_error_panels(
     run: RunFiles, prefix: str, height: int
 ) -> tuple[list[Panel], dict[str, float]]:
     """Return a panel for the errors of each channel that moves, and its factor from SI by name."""
-    units, moving_channels = display_units(run), _moving_channels(run.dof)
+    units = display_units(run)
+    moving_channels = _moving_channels(run.dof)
     error_channels = [name for name in _ERROR_NAMES if name in moving_channels]
     panels = [
         _build_panel(f"{prefix}{_ERROR_NAMES[name]}", units[name], height)
@@ -486,7 +493,8 @@ def band_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None
     """Draw the half width of the prediction bands of the main model against the errors."""
     model = run.main_model
     bands_by_protocol = (run.read_json("bands.json").get("models") or {}).get(model) or {}
-    cases, coverage_level = [], 0.0
+    cases = []
+    coverage_level = 0.0
     panels, factors = _build_error_panels(run, "", 165)
     for protocol, band in bands_by_protocol.items():
         band_windows = [

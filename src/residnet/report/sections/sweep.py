@@ -176,7 +176,8 @@ def _wrap_key(key: str) -> str:
 
 def sections(run: RunFiles) -> list[Section]:
     """Return the sections with the best trials, the figures in the folder and all trials."""
-    content, figures = run.read_json("sweep.json"), []
+    content = run.read_json("sweep.json")
+    figures = []
     if content["best"] is not None:
         figures = [parallel_coordinates(content), _progress_figure(content)]
         if content["importance"]:

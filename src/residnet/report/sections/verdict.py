@@ -49,7 +49,8 @@ _NO_POSE_TEXT = (
 
 def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
     """Read the evidence for the verdict on the selected model from the run folder."""
-    protocol, split = run.protocols[0], run.report_split
+    protocol = run.protocols[0]
+    split = run.report_split
     rows = {
         model: row for model in run.model_kinds if (row := run.find_row(model, split, protocol))
     }
@@ -208,10 +209,8 @@ def cautions_section(run: RunFiles, findings: Sequence[SanityFinding]) -> Sectio
     sentences = []
     main_model = run.predictor
     for protocol in run.protocols:
-        row, baseline_row = (
-            run.find_row(main_model, run.report_split, protocol),
-            run.find_row(run.baseline, run.report_split, protocol),
-        )
+        row = run.find_row(main_model, run.report_split, protocol)
+        baseline_row = run.find_row(run.baseline, run.report_split, protocol)
         training_row = run.find_row(main_model, "train", protocol)
         if row is None:
             continue

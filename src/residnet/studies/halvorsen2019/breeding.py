@@ -27,7 +27,9 @@ SettingValue = int | float | str
 Matrix = tuple[tuple[float | None, ...], ...]
 SignalRecord = dict[str, np.ndarray]
 CHANNELS = ("x", "u", "tau_x")
-MASS, DAMPING, STIFFNESS = 10.0, 13.0, 5.0
+MASS = 10.0
+DAMPING = 13.0
+STIFFNESS = 5.0
 """The system m x_ddot + d x_dot + k x = tau (4.1) in kg, kg/s and N/m (section 5.3, (5.13)); that
 of (4.3) is another one: 20 kg, 10 kg/s, 12 N/m (correction H24).
 """
@@ -173,7 +175,8 @@ class BreedingTaskConfig(StudyTask, SearchConfig):
 
     @model_validator(mode="after")
     def _check_grid(self) -> BreedingTaskConfig:
-        n_rows, n_columns = len(self.rows.values), len(self.columns.values)
+        n_rows = len(self.rows.values)
+        n_columns = len(self.columns.values)
         for name in ("published", "published_error"):
             table = getattr(self, name)
             if table is not None and [len(row) for row in table] != [n_columns] * n_rows:
@@ -217,10 +220,12 @@ class BreedingTaskConfig(StudyTask, SearchConfig):
         require_package("deap", "genetic programming", "gp")
 
     def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
-        rows, cells = [], self.combinations()
+        rows = []
+        cells = self.combinations()
         for n_done, (i, j) in enumerate(cells):
             progress.report_progress("searching equations", n_done, len(cells))
-            settings, start_time = self.combination_config(i, j), time.process_time()
+            settings = self.combination_config(i, j)
+            start_time = time.process_time()
             trials = [run_search_trial(settings, seed) for seed in range(self.repeats)]
             errors, equations = ([*values] for values in zip(*trials, strict=True))
             rows.append(
@@ -376,7 +381,8 @@ def run_search_trial(settings: SearchConfig, seed: int) -> tuple[float, dict[str
         FitError: where the data do not determine an equation.
         UsageError: where DEAP is not installed.
     """
-    record, head = settings.record, settings.head
+    record = settings.record
+    head = settings.head
     clean_record = record.simulate(record.period)
     noisy_record = settings.noise.add_noise(clean_record, np.random.default_rng(seed))
     algebra = Algebra(CHANNELS, expression_limits(head.evolution))
@@ -407,7 +413,8 @@ def _result_figure(config: BreedingTaskConfig, rows: Sequence[Mapping[str, Any]]
     for row_index, value in enumerate(config.rows.values):
         setting_rows = [row for row in rows if row["row"] == value]
         x = np.array([columns.index(row["column"]) for row in setting_rows], dtype=float)
-        name, color = _format_value(value), COLORS[row_index % len(COLORS)]
+        name = _format_value(value)
+        color = COLORS[row_index % len(COLORS)]
         styles[name] = GlyphStyle(f"{config.rows.key} {name}", color)
         styles[f"{name} points"] = GlyphStyle("", color, kind="points", size=3)
         styles[f"{name} published"] = GlyphStyle("", color, "dotted")

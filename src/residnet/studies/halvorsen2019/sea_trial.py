@@ -84,10 +84,13 @@ from residnet.studies.study import (
     plot_time_series,
 )
 
-CONTROLS, FORCES = ("cmd_n", "cmd_nozzle"), ("tau_x", "tau_y", "tau_n")
+CONTROLS = ("cmd_n", "cmd_nozzle")
+FORCES = ("tau_x", "tau_y", "tau_n")
 CHANNELS = (*VELOCITY_NAMES, *CONTROLS, *FORCES)
 ALL = "all"
-STANDARD, SEPARATE, PLANT = "standard", "separate", "plant"
+STANDARD = "standard"
+SEPARATE = "separate"
+PLANT = "plant"
 SAMPLE_SETS = (*SPEED_REGIMES, ALL)
 """Sets of samples that a model is fitted to and judged on."""
 Published = dict[str, tuple[float, float, float, float, float, float]]
@@ -314,7 +317,8 @@ class SeaTrialTaskConfig(StudyTask, ComputingTask):
         return next(iter(self.trials.values())).seed
 
     def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
-        trials, figures = {}, []
+        trials = {}
+        figures = []
         for name in self.trials:
             trials[name], trial_figures = run_trial(self, name)
             figures += trial_figures
@@ -443,8 +447,10 @@ def simulate_sea_trial_logs(config: SeaTrialConfig) -> list[Log]:
         ConfigError: if the vessel cannot be disturbed or is of another kind.
         DataError: if the motion does not remain finite.
     """
-    name, disturbance = config.vessel, config.disturbance
-    vessel, logs = load_odin(name), []
+    name = config.vessel
+    disturbance = config.disturbance
+    vessel = load_odin(name)
+    logs = []
     for course_index, course_angle in enumerate(config.programme.courses):
         plant = vessel.build()
         disturbance.check_plant(plant, name)
@@ -479,7 +485,8 @@ def prepare_logs(
     """
     from scipy.signal import butter, filtfilt
 
-    generator, actuators = np.random.default_rng([seed, 11]), vessel.build().actuators
+    generator = np.random.default_rng([seed, 11])
+    actuators = vessel.build().actuators
     low_pass = butter(config.order, config.cutoff)
     log_parts: list[tuple[np.ndarray, ...]] = []
     for log_index, raw_log in enumerate(logs):
@@ -500,7 +507,8 @@ def prepare_logs(
             ],
             1,
         )
-        nu, command = torch.from_numpy(z[:, RANGE_VELOCITIES]), torch.from_numpy(z[:, RANGE_INPUTS])
+        nu = torch.from_numpy(z[:, RANGE_VELOCITIES])
+        command = torch.from_numpy(z[:, RANGE_INPUTS])
         force = actuators.force(torch.zeros(len(t), 0, dtype=torch.float64), command, nu).numpy()
         inputs = np.concatenate((z[:, RANGE_INPUTS], force), axis=1)
         if config.filter_inputs:
@@ -557,8 +565,10 @@ def run_trial(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], 
     Raises:
         ResidnetError: if the trial cannot be simulated or a model is not determined.
     """
-    config, mass = settings.trials[name], settings.standard.mass
-    vessel, logs = load_odin(config.vessel), simulate_sea_trial_logs(config)
+    config = settings.trials[name]
+    mass = settings.standard.mass
+    vessel = load_odin(config.vessel)
+    logs = simulate_sea_trial_logs(config)
     trials = {
         cutoff: prepare_logs(
             logs, vessel, config.preparation.model_copy(update={"cutoff": cutoff}), config.seed
@@ -604,7 +614,8 @@ def run_trial(settings: SeaTrialTaskConfig, name: str) -> tuple[dict[str, Any], 
             )
     for model in (STANDARD, *settings.equations):
         # where a phase has no model, the one of all phases takes its place
-        predicted, count = models[model, ALL].predicted.copy(), np.zeros(3)
+        predicted = models[model, ALL].predicted.copy()
+        count = np.zeros(3)
         for phase in SPEED_REGIMES:
             if phase in sets:
                 predicted[sets[phase]] = models[model, phase].predicted[sets[phase]]
@@ -723,7 +734,8 @@ def _trial_figure(name: str, trial: TrialSamples) -> Figure:
 
 
 def _cutoff_figure(name: str, trials: Mapping[float, TrialSamples]) -> Figure:
-    styles, paths = {}, {}
+    styles = {}
+    paths = {}
     shown_samples = _most_turning_samples(next(iter(trials.values())), np.ones(1, dtype=bool))
     for (cutoff, trial), color in zip(trials.items(), COLORS, strict=False):
         label = f"cut-off {cutoff:g}"
@@ -764,10 +776,8 @@ def _parameters_figure(
             )
             for parameter_values in (standard_fit["values"], standard_fit["standard_errors"], truth)
         )
-        error, double_error = (
-            (values - true_values) / SCALE[shown_parameters],
-            2 * errors / SCALE[shown_parameters],
-        )
+        error = (values - true_values) / SCALE[shown_parameters]
+        double_error = 2 * errors / SCALE[shown_parameters]
         positions = np.arange(len(shown_parameters)) + 0.16 * (
             set_index - (len(fits_by_set) - 1) / 2
         )
@@ -805,10 +815,8 @@ def _excerpt_figure(
         else trial.is_validation & (trial.phase == SPEED_REGIMES.index(set_name))
     )
     segment = _most_turning_samples(trial, mask)
-    t, paths = (
-        np.arange(len(segment)) * trial.step,
-        {"measured": trial.samples.target.numpy()[segment]},
-    )
+    t = np.arange(len(segment)) * trial.step
+    paths = {"measured": trial.samples.target.numpy()[segment]}
     styles = {"measured": MEASURED_STYLE}
     other_key = next((key for key in models if key[0] != STANDARD and key[1] == set_name), None)
     for key, style in (((STANDARD, set_name), DASHED_STYLE), (other_key, SOLID_STYLE)):
@@ -855,7 +863,8 @@ def _goodness_table(
     set_name: str, rows: Sequence[StudyResults], published_values: Mapping[str, Published]
 ) -> Table:
     """Return the goodness of fit of all models on one set (Tables 7.3 to 7.5)."""
-    names, shown_rows = ("rmse", "cp", "r2_adjusted", "mae", "low", "high"), []
+    names = ("rmse", "cp", "r2_adjusted", "mae", "low", "high")
+    shown_rows = []
     for row in rows:
         # the document fits its standard model to the phase, and its equations to all samples
         is_published_set = row["on"] == (set_name if row["model"] == STANDARD else ALL)
@@ -896,7 +905,8 @@ def _goodness_table(
 
 
 def _parameter_table(trial: StudyResults) -> Table:
-    fits_by_set, published_parameters = trial["standard"], load_published("halvorsen2019")
+    fits_by_set = trial["standard"]
+    published_parameters = load_published("halvorsen2019")
     columns = ["parameter", "true", *map(SET_NAMES.__getitem__, fits_by_set)]
     table = Table(
         [*columns, "published before", "published after"], caption="SI units, with standard errors."

@@ -30,7 +30,8 @@ _MAX_OPEN_COMBINATION = 1e-3
 """A combination with a larger share in the open directions has no finite standard error."""
 
 
-_MASS, _INERTIA = 5e3, 2e4
+_MASS = 5e3
+_INERTIA = 2e4
 """Typical mass in kg and typical moment of inertia in kg m^2."""
 PARAMETERS: dict[str, tuple[float, float, float]] = {
     "I_z": (1e3, 1e7, _INERTIA),
@@ -126,11 +127,13 @@ def standard_accelerations(
     """
     i_z, x_udot, y_vdot, y_rdot, n_vdot, n_rdot, x_u, y_v, y_r, n_v, n_r, x_uu, y_vv, n_rr = p
     u, v, r = nu.T
-    sway_momentum, surge_momentum = (mass - y_vdot) * v - y_rdot * r, (mass - x_udot) * u
+    sway_momentum = (mass - y_vdot) * v - y_rdot * r
+    surge_momentum = (mass - x_udot) * u
     x = tau[:, 0] + sway_momentum * r + (x_u + x_uu * np.abs(u)) * u
     y = tau[:, 1] - surge_momentum * r + (y_v + y_vv * np.abs(v)) * v + y_r * r
     n = tau[:, 2] - sway_momentum * u + surge_momentum * v + n_v * v + (n_r + n_rr * np.abs(r)) * r
-    sway_inertia, yaw_inertia = mass - y_vdot, i_z - n_rdot
+    sway_inertia = mass - y_vdot
+    yaw_inertia = i_z - n_rdot
     determinant = max(
         sway_inertia * yaw_inertia - y_rdot * n_vdot, _MIN_DETERMINANT * mass * _INERTIA
     )
@@ -169,7 +172,9 @@ def fit_standard_model(
     """
     from scipy.optimize import least_squares
 
-    nu, tau, nu_dot = nu[:: config.thin], tau[:: config.thin], nu_dot[:: config.thin]
+    nu = nu[:: config.thin]
+    tau = tau[:: config.thin]
+    nu_dot = nu_dot[:: config.thin]
     if 3 * len(nu) <= len(STANDARD_PARAMETER_NAMES):
         raise FitError(
             f"the standard model's {len(STANDARD_PARAMETER_NAMES)} parameters need more than"
@@ -201,7 +206,8 @@ def fit_standard_model(
     values = best_solution.x * SCALE
     is_at_bound = np.minimum(values - LOWER, UPPER - values) <= 1e-6 * SCALE
     # a bound fixes what the data leave open: what the data determine is judged without bounds
-    jacobian, errors = np.asarray(best_solution.jac), best_solution.fun.reshape(-1, 3)
+    jacobian = np.asarray(best_solution.jac)
+    errors = best_solution.fun.reshape(-1, 3)
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
     is_determined = singular > _RANK_TOLERANCE * singular[0]
     open_directions = directions[~is_determined].T

@@ -72,7 +72,9 @@ from residnet.studies.study import (
     join_numbers,
 )
 
-_MAX_RESIDUAL_GROWTH, _MIN_VARIANCE_SHARE, _MIN_SEGMENT_SHARE = 4.0, 0.02, 0.5
+_MAX_RESIDUAL_GROWTH = 4.0
+_MIN_VARIANCE_SHARE = 0.02
+_MIN_SEGMENT_SHARE = 0.5
 """Criteria of an invalid model on one axis; chosen by hand.
 
 Largest growth of the mean square residual, in the whole log and in a share of its segments (one
@@ -95,7 +97,8 @@ def compare_residuals(
         Whether the model `fits`; by axis `growth` (ratio of mean square residuals), `worse_share`
         of the force's variance, and `segments`, the share of segments with a worse fit.
     """
-    variance, accepted_mse = force.var(0), accepted_residual.square().mean(0)
+    variance = force.var(0)
+    accepted_mse = accepted_residual.square().mean(0)
     segments = [new_residual[fold == segment].square().mean(0) for segment in torch.unique(fold)]
     # the segments, and the whole log as the last row
     squares = torch.stack([*segments, new_residual.square().mean(0)])
@@ -293,7 +296,8 @@ class FerryStudyConfig(StudyTask, ComputingTask):
 
     def export_model(self, request: ExportRequest) -> Path:
         """Write the feed-forward of a model; `selected` leaves the least of the residual force."""
-        run, results = request.run, read_json(request.run.path / self.results_file)
+        run = request.run
+        results = read_json(request.run.path / self.results_file)
         name = find_best_model(results) if request.model == "selected" else request.model
         if name not in self.models:
             raise UsageError(f"{run.path}: no model '{name}'{suggest_name(name, self.models)}")
@@ -313,7 +317,8 @@ class FerryStudyConfig(StudyTask, ComputingTask):
         )
 
     def summarize(self, results: StudyResults) -> list[str]:
-        models, best_name = results["models"], find_best_model(results)
+        models = results["models"]
+        best_name = find_best_model(results)
         remaining_text = join_numbers([100 * share for share in models[best_name]["share_left"]])
         sentences = [
             f"Of {len(models)} residual models, {best_name} leaves the least of the residual"
@@ -576,7 +581,8 @@ def forward_runs(
     w = thrusters.requested_force(commands)[:, :-1]
     velocity_limit = _DIVERGENCE_FACTOR * x[..., VELOCITIES].abs().amax(dim=(0, 1))
     believed_equations = BelievedConfig(vessel=config.believed).hull_equations()
-    signals, rows = SignalsConfig(inputs=FORCE_CHANNELS).build(), {}
+    signals = SignalsConfig(inputs=FORCE_CHANNELS).build()
+    rows = {}
     for name, equations in {_BELIEVED_NAME: believed_equations, **models}.items():
         baseline = BelievedConfig(vessel=equations).build(signals.names)
         model = HybridDynamics(signals, baseline, ZeroHead(), trials.step).double()
@@ -655,12 +661,11 @@ def write_results(
 
 def _exported_model(terms: Sequence[str], study_result: FerryStudy, name: str) -> dict[str, Any]:
     """Return the model for export, with its training range."""
-    record, model = study_result.record, study_result.models[name]
+    record = study_result.record
+    model = study_result.models[name]
     if name in study_result.whole_course_models:
-        record, model = (
-            replace(record, is_training=torch.ones_like(record.is_training)),
-            study_result.whole_course_models[name],
-        )
+        record = replace(record, is_training=torch.ones_like(record.is_training))
+        model = study_result.whole_course_models[name]
     ranges = record.motion_ranges(mirror=bool(model.fit.notes.get("mirror")))
     return {**fit_to_json(terms, model.fit), "notes": model.fit.notes, "range": ranges}
 
@@ -764,7 +769,8 @@ def find_best_model(results: StudyResults) -> str:
 
 def _residual_table(config: FerryStudyConfig, results: StudyResults) -> Table:
     """Return the table of the remaining residual (Tables 4.2, 4.5, 4.7 and 4.15)."""
-    unmodelled, published_base = results["unmodelled_test_mse"], config.published.mse
+    unmodelled = results["unmodelled_test_mse"]
+    published_base = config.published.mse
     rows = []
     believed_row = {"test_mse": unmodelled, "notes": {}}
     for name, model in {_BELIEVED_NAME: believed_row, **results["models"]}.items():

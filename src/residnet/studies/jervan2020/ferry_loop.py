@@ -78,7 +78,8 @@ class LoopConfig(Config):
 
     def build_pid(self, hull_mass: Tensor) -> MotionPID:
         """Return the feedback for a hull's mass matrix [3, 3] in SI units."""
-        mass, omega = hull_mass.diagonal(), torch.tensor(self.frequency, dtype=torch.float64)
+        mass = hull_mass.diagonal()
+        omega = torch.tensor(self.frequency, dtype=torch.float64)
         proportional = mass * omega**2
         gains = [
             tuple(gain_values.tolist())
@@ -149,7 +150,8 @@ class NoisyLoop(Source):
 
     def __init__(self, loop: Source) -> None:
         super().__init__()
-        self.loop, self.depends_on_step = loop, loop.depends_on_step
+        self.loop = loop
+        self.depends_on_step = loop.depends_on_step
 
     def initial(self, x: Tensor) -> Tensor:
         return self.loop.initial(x)
@@ -229,7 +231,10 @@ class FerrySimulation:
         disturbance: Disturbance,
         seed: int,
     ) -> None:
-        self.loop, self.noise, self.disturbance, self.seed = loop, noise, disturbance, seed
+        self.loop = loop
+        self.noise = noise
+        self.disturbance = disturbance
+        self.seed = seed
         self.plant, self.thrusters = load_force_vessel(plant_name)
         self.believed_hull = load_force_vessel(believed_name)[0].hull
         if not self.thrusters.state_names:
@@ -253,7 +258,9 @@ class FerrySimulation:
         Raises:
             DataError: where the closed loop is unstable.
         """
-        gains, step, lags = self.loop, self.loop.step, [lag for _, lag in feeds]
+        gains = self.loop
+        step = self.loop.step
+        lags = [lag for _, lag in feeds]
         if not feedback:
             gains = gains.model_copy(update={"frequency": (0.0, 0.0, 0.0)})
         pid = gains.build_pid(self.believed_hull.mass)
@@ -276,7 +283,8 @@ class FerrySimulation:
         with torch.no_grad():
             if isinstance(path, CrossingConfig):
                 guidance = Crossing(path, step, feeds)
-                plant, loop = RecordedPlantDynamics(self.plant, step), ClosedLoop(policy, guidance)
+                plant = RecordedPlantDynamics(self.plant, step)
+                loop = ClosedLoop(policy, guidance)
                 model: FreeRun = Rollout(plant, NoisyLoop(loop))
                 rollout_arguments = (x0, torch.cat((w, noise[..., MOTION]), dim=2), x0[:, :0])
             else:
@@ -306,7 +314,8 @@ class FerrySimulation:
                 )
             measured_states = measured(states, noise[..., MOTION])
             if isinstance(path, CrossingConfig):
-                memory, rows = guidance.initial_state(states[:, 0]), []
+                memory = guidance.initial_state(states[:, 0])
+                rows = []
                 for k in range(steps):
                     reference, memory = guidance(measured_states[:, k], k, memory)
                     rows.append(reference)
@@ -327,8 +336,10 @@ class FerrySimulation:
         noise: Tensor,
         pid: MotionPID,
     ) -> FerryRun:
-        loop, commands = self.loop, w[:, : self.plant.n_commands]
-        command, desired = self.thrusters.requested_force(commands), reference[:, :9]
+        loop = self.loop
+        commands = w[:, : self.plant.n_commands]
+        command = self.thrusters.requested_force(commands)
+        desired = reference[:, :9]
         error = pid.body_error(measured_states, reference)
         feedback, _ = pid(measured_states, desired, (error.cumsum(0) - error) * loop.step)
         rate = self.plant.derivative(x, w)
@@ -336,7 +347,8 @@ class FerrySimulation:
         metrics = compute_tracking_metrics(
             x[:, POSE], motion, desired, command, feedback, loop.step
         )
-        stride, half_window = slice(None, None, loop.steps_per_sample), loop.steps_per_sample // 2
+        stride = slice(None, None, loop.steps_per_sample)
+        half_window = loop.steps_per_sample // 2
         padded_command = torch.cat(
             (command[:1].expand(half_window, 3), command, command[-1:].expand(half_window, 3))
         )

@@ -140,7 +140,8 @@ class MeasuredForceLogs:
                 for log_flags in fold_flags
             ]
         )
-        train, test = self.usable & ~is_near_fold, self.usable & inside_fold
+        train = self.usable & ~is_near_fold
+        test = self.usable & inside_fold
         for problem, samples in (
             ("nothing left to fit to beside", train),
             ("no sample to judge on in", test),
@@ -196,17 +197,23 @@ def read_force_logs(
     """
     import pandas as pd
 
-    reader, paths = data.reader.build(), assign_log_names(data.find_paths())
+    reader = data.reader.build()
+    paths = assign_log_names(data.find_paths())
     raw_logs = [reader.read(path).replace(name=name) for path, name in paths.items()]
     # a model would be fitted to the very samples that judge it
     check_leaks({log.name: [log] for log in raw_logs})
     columns = (*channels.commanded, *channels.actual, *(channels.acceleration or ()))
     logs = [prepare_log(log, "all", columns, preparation) for log in raw_logs]
-    names, lengths = [log.log.name for log in logs], [len(log) for log in logs]
+    names = [log.log.name for log in logs]
+    lengths = [len(log) for log in logs]
     step = preparation.grid.step
     # whole logs are folds where there are enough; no segment reaches across logs
     uses_log_folds = len(logs) >= _MIN_LOGS_FOR_FOLDS
-    fold_parts, segments, commands, masked, n_segments_total = [], [], [], {}, 0
+    fold_parts = []
+    segments = []
+    commands = []
+    masked = {}
+    n_segments_total = 0
     for log_index, (log, name, length) in enumerate(zip(logs, names, lengths, strict=True)):
         if not log.trainable.any():
             raise DataError(
@@ -303,7 +310,8 @@ def compare_forces(measured: MeasuredForceLogs) -> dict[str, Any]:
         `lag` (its parameters, or the reason why it is undetermined), and by axis the share of the
         actual force's variance that the command explains, without and with the lag.
     """
-    record, usable = measured.record, measured.usable
+    record = measured.record
+    usable = measured.usable
     comparison: dict[str, Any] = {}
     try:
         lag = fit_lag(
@@ -317,12 +325,11 @@ def compare_forces(measured: MeasuredForceLogs) -> dict[str, Any]:
         comparison["lag"] = lag.model_dump()
         lagged_command = simulate_lagged_force(record.command, lag, record.dt, record.run_lengths)
     except FitError as error:
-        comparison["lag"], lagged_command = str(error), record.command
-    actual, commanded, lagged_force = (
-        measured.forces["actual"][usable],
-        record.command[usable],
-        lagged_command[usable],
-    )
+        comparison["lag"] = str(error)
+        lagged_command = record.command
+    actual = measured.forces["actual"][usable]
+    commanded = record.command[usable]
+    lagged_force = lagged_command[usable]
     force_variance = (actual - actual.mean(0)).square().mean(0)
     unexplained, unexplained_late = (
         (actual - force).square().mean(0) / force_variance for force in (commanded, lagged_force)

@@ -293,8 +293,10 @@ def run_force_study(config: ForceResidualConfig) -> tuple[dict[str, Any], list[F
     Raises:
         ResidnetError: where a log cannot be used or no model is determined.
     """
-    measured, believed = config.read_logs(), ForceModel(config.believed_hull())
-    models, failures = dict[str, CrossValidatedModel](), dict[str, str]()
+    measured = config.read_logs()
+    believed = ForceModel(config.believed_hull())
+    models = dict[str, CrossValidatedModel]()
+    failures = dict[str, str]()
     for name, model_config in config.models.items():
         try:
             models[name] = _cross_validate(config, name, model_config, measured, believed)
@@ -302,7 +304,8 @@ def run_force_study(config: ForceResidualConfig) -> tuple[dict[str, Any], list[F
             failures[name] = f"model {name}: {error}"
     if not models:
         raise FitError(next(iter(failures.values())))
-    record, resampling_blocks = measured.record, measured.resampling_blocks()
+    record = measured.record
+    resampling_blocks = measured.resampling_blocks()
     motion = record.nu_dot, record.nu, record.pose[:, HEADING]
     unmodelled = {
         force_kind: believed.force_residual(force, *motion)
@@ -352,15 +355,14 @@ def run_force_study(config: ForceResidualConfig) -> tuple[dict[str, Any], list[F
         if row["force"] == "actual" and row["model"] in models
     }
     if actual_force_errors:
-        best_name, residual = (
-            min(actual_force_errors, key=actual_force_errors.__getitem__),
-            unmodelled["actual"],
-        )
+        best_name = min(actual_force_errors, key=actual_force_errors.__getitem__)
+        residual = unmodelled["actual"]
         compared_signals = {"residual of the believed model": residual}
         compared_signals[f"predicted by {best_name}"] = residual - models[best_name].error
         title = f"Residual of the believed model and what {best_name} predicts on left-out folds"
         signals.append(("residual", title, compared_signals, _FORCE_UNITS))
-    figures, start = [_score_figure(rows)], 0
+    figures = [_score_figure(rows)]
+    start = 0
     for name, length in zip(measured.names, record.run_lengths, strict=True):
         log_samples = slice(start, start + length)
         figures += [
@@ -388,11 +390,10 @@ def _cross_validate(
     Raises:
         FitError: where the training samples do not determine the model.
     """
-    target, command = (
-        measured.forces[model_config.evaluation_force],
-        measured.forces[model_config.force],
-    )
-    error, folds = torch.full_like(target, torch.nan), []
+    target = measured.forces[model_config.evaluation_force]
+    command = measured.forces[model_config.force]
+    error = torch.full_like(target, torch.nan)
+    folds = []
     for fold_index in range(int(measured.fold_index.max()) + 1):
         record, test = measured.split_fold(fold_index, config.validation.gap)
         model = fit_model(model_config, replace(record, command=command), believed)
@@ -422,7 +423,8 @@ def _evaluation_rows(
     groups: dict[str, list[str]] = {}
     for name in models:
         groups.setdefault(config.models[name].evaluation_force, []).append(name)
-    segments, resampling_blocks = measured.usable_segments(), measured.resampling_blocks()
+    segments = measured.usable_segments()
+    resampling_blocks = measured.resampling_blocks()
     rows: list[dict[str, Any]] = []
     for force, names in groups.items():
         residuals = {"zero": measured.forces[force], "believed": unmodelled[force]}
@@ -518,17 +520,16 @@ def _score_figure(rows: Sequence[StudyResults]) -> Figure:
         "other interval": GlyphStyle("", GREY),
         "other": GlyphStyle("no better", GREY, kind="points", marker="s", size=4.5),
     }
-    panels, panel_traces = [], []
+    panels = []
+    panel_traces = []
     for force in dict.fromkeys(row["force"] for row in rows):
         force_rows = [row for row in rows if row["force"] == force and row["model"] != "believed"][
             ::-1
         ]
         points: dict[str, list[tuple[float, ...]]] = {"better": [], "other": []}
         for row_index, row in enumerate(force_rows):
-            mean, confidence_interval = (
-                row["minus_believed"]["mean"][3],
-                row["minus_believed"]["ci95"][3],
-            )
+            mean = row["minus_believed"]["mean"][3]
+            confidence_interval = row["minus_believed"]["ci95"][3]
             limits = (np.nan, np.nan) if confidence_interval is None else confidence_interval
             point_kind = (
                 "better"
@@ -640,7 +641,9 @@ def _data_section(config: ForceResidualConfig, results: StudyResults) -> Section
         for log, reasons in results["masked"].items()
         for reason, share in reasons.items()
     ]
-    folds, validation, blocks = results["folds"], config.validation, results["intervals"]
+    folds = results["folds"]
+    validation = config.validation
+    blocks = results["intervals"]
     fold_text = (
         "each consists of whole logs"
         if folds["of"] == "logs"
@@ -715,9 +718,12 @@ def _model_table(
     config: ForceResidualConfig, results: StudyResults, group: Mapping[str, StudyResults]
 ) -> Table:
     """Return the table of the models that are judged on one force (Tables 5.1, 5.2, 5.4, 5.5)."""
-    believed_mse, rows = group["believed"]["mse"], []
+    believed_mse = group["believed"]["mse"]
+    rows = []
     for name, row in group.items():
-        model_config, published_share, notes = config.models.get(name), None, ""
+        model_config = config.models.get(name)
+        published_share = None
+        notes = ""
         if model_config is not None:
             notes = format_notes(results["models"][name]["all"])
             if model_config.published is not None:

@@ -106,7 +106,9 @@ class ForceRegressionData:
     @property
     def standardised(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """E [N, J], F [N, 3], mean of x, mean of y, std of y (3.3), (3.4), (4.8)."""
-        mean_x, mean_y, std_y = self.x.mean(0), self.y.mean(0), self.y.std(0)
+        mean_x = self.x.mean(0)
+        mean_y = self.y.mean(0)
+        std_y = self.y.std(0)
         return (self.x - mean_x) / self.scale, (self.y - mean_y) / std_y, mean_x, mean_y, std_y
 
 
@@ -218,8 +220,10 @@ class RegressionConfig(Config):
 def _errors_by_order(data: ForceRegressionData) -> dict[str, Tensor]:
     """Return the mean square errors [A, 3] of a PLSR over its order, on folds left out and test."""
     e, f, mean_x, mean_y, std_y = data.standardised
-    folds, nan_errors = data.fold.unique(), torch.full_like(f, torch.nan).repeat(e.shape[1], 1, 1)
-    left_out_errors, test_errors = nan_errors.clone(), nan_errors[:, :1]
+    folds = data.fold.unique()
+    nan_errors = torch.full_like(f, torch.nan).repeat(e.shape[1], 1, 1)
+    left_out_errors = nan_errors.clone()
+    test_errors = nan_errors[:, :1]
     for fold in folds if len(folds) > 1 else ():
         is_left_out = data.fold == fold
         left_out_errors[:, is_left_out] = _error_by_order(
@@ -237,8 +241,10 @@ def _errors_by_order(data: ForceRegressionData) -> dict[str, Tensor]:
 
 def _error_by_order(e: Tensor, f: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Return the errors [J, N, 3] at x of a PLSR of f on e, for each order."""
-    mean_e, mean_f = e.mean(0), f.mean(0)
-    centred, orders = e - mean_e, e.shape[1]
+    mean_e = e.mean(0)
+    mean_f = f.mean(0)
+    centred = e - mean_e
+    orders = e.shape[1]
     path = pls_path(centred.T @ centred, centred.T @ (f - mean_f), orders)
     if len(path) < orders:
         # what is left explains nothing: higher orders change no more
@@ -248,7 +254,9 @@ def _error_by_order(e: Tensor, f: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _fit_by_surface_analysis(data: ForceRegressionData, rule: str) -> RegressionFit:
-    x, y, groups = data.x, data.y, data.fold
+    x = data.x
+    y = data.y
+    groups = data.fold
     estimator = SurfacePLSR("simplest" if rule == "simplest" else "least")
     if rule == "test":
         if data.test is None:
@@ -403,7 +411,8 @@ def fit_model(
     """
     if config.searches_settings:
         return _search_settings(config, record, base)
-    train, psi = record.is_training, record.pose[:, HEADING]
+    train = record.is_training
+    psi = record.pose[:, HEADING]
     x = TermLibrary(config.terms, MOTION_CHANNELS)(torch.cat((record.nu_dot, record.nu), dim=-1))
     base_force = base.thruster_force(record.nu_dot, record.nu, psi)
     # unit forces to north and to east in body axes, without a moment
@@ -430,12 +439,15 @@ def fit_model(
             )
         force = simulate_lagged_force(record.averaged_command, lag, record.dt, record.run_lengths)
         notes["lag"] = lag.model_dump()
-    y, earth_force = force - base_force, None
+    y = force - base_force
+    earth_force = None
     if config.earth:
         earth_force = estimate_earth_force(x[train], y[train], -earth_axes[train])
         y = y + torch.einsum("nad,d->na", earth_axes, earth_force)
         notes["earth"] = dict(zip(("north", "east"), earth_force.tolist(), strict=True))
-    train_terms, train_target, fold = x[train], y[train], record.fold[train]
+    train_terms = x[train]
+    train_target = y[train]
+    fold = record.fold[train]
     if config.mirror:
         signs = mirror_signs(config.terms)
         if signs is None:
@@ -444,7 +456,8 @@ def fit_model(
             torch.cat((values, values * signs_applied))
             for values, signs_applied in ((train_terms, signs), (train_target, _MIRROR_SIGNS))
         )
-        fold, notes["mirror"] = fold.repeat(2), True
+        fold = fold.repeat(2)
+        notes["mirror"] = True
     data = ForceRegressionData(
         config.terms,
         train_terms,
@@ -473,7 +486,8 @@ def _search_settings(
     base_mse = torch.tensor(
         mean_squares_by_axis(no_residual_model.residual_along(record)[record.is_training])
     )
-    candidates, errors = [], []
+    candidates = []
+    errors = []
     known_lag: ActuatorLag | None = None
     mirrors = [False, True] if config.mirror is None else [config.mirror]
     if mirror_signs(config.terms) is None and config.mirror is None:
@@ -595,7 +609,8 @@ def derive_forward_equations(believed: str, model: ForceModel, label: str) -> Hu
     residual_terms = {"1": zero_force}
     for correction in model.corrections:
         assert isinstance(correction, ForceCorrection)
-        terms, coefficients = correction.library.terms, correction.coefficients
+        terms = correction.library.terms
+        coefficients = correction.coefficients
         augmented_mass, remaining_terms = augment_mass(augmented_mass, terms, coefficients, label)
         correction_terms = {"1": correction.intercept} | {
             terms[j]: coefficients[j] for j in remaining_terms
@@ -645,11 +660,10 @@ def missing_coefficients(plant_name: str, believed: str) -> dict[str, list[float
             names.get(factors(term), term): -mass @ column for term, column in columns.items()
         }
 
-    plant_coefficients, believed_coefficients = (
-        force_coefficients(plant_name),
-        force_coefficients(believed),
-    )
-    zero, missing = torch.zeros(3, dtype=torch.float64), {}
+    plant_coefficients = force_coefficients(plant_name)
+    believed_coefficients = force_coefficients(believed)
+    zero = torch.zeros(3, dtype=torch.float64)
+    missing = {}
     for key in dict.fromkeys((*believed_coefficients, *plant_coefficients)):
         plant_value = plant_coefficients.get(key, zero)
         difference = plant_value - believed_coefficients.get(key, zero)
@@ -757,11 +771,9 @@ def model_figures(
     Args:
         unmodelled: mean square of the believed model's residual by axis.
     """
-    positions, weights, names = (
-        np.arange(len(config.terms)),
-        fit.scaled_coefficients.abs().numpy(),
-        tick_labels(config.terms),
-    )
+    positions = np.arange(len(config.terms))
+    weights = fit.scaled_coefficients.abs().numpy()
+    names = tick_labels(config.terms)
     figures = [
         Figure(
             f"weights_{name}",

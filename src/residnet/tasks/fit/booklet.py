@@ -56,7 +56,8 @@ def write_booklet(
     """
     import pandas as pd
 
-    craft, rudder = _build_craft(config, fitted_model, config.inputs), config.steering_input()
+    craft = _build_craft(config, fitted_model, config.inputs)
+    rudder = config.steering_input()
     pages = [
         _make_page(craft, config, flights, limit)
         for flights in _simulate_draws(craft, config, fitted_model, config.manoeuvres)
@@ -132,7 +133,8 @@ def _build_craft(
     config: BookletConfig, fitted_model: FittedModel, inputs: Mapping[str, InputShare]
 ) -> SimulatedVessel:
     """Return the model with its actuators as a simulated vessel; batch rows are draws."""
-    spec, model = fitted_model.spec, fitted_model.model.double()
+    spec = fitted_model.spec
+    model = fitted_model.model.double()
     gear = GivenActuators(inputs, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.input_columns, spec.hold, gear)
     start = actuated.make_initial_state(1)
@@ -266,7 +268,8 @@ def _make_page(
     Raises:
         DataError: if the run with fitted parameters does not end, or diverges.
     """
-    manoeuvre, name = flights[0].manoeuvre, flights[0].true_log.name
+    manoeuvre = flights[0].manoeuvre
+    name = flights[0].true_log.name
     if flights[0].fault_text:
         raise DataError(
             f"booklet: {config.model}, {name}: {flights[0].fault_text}; give more"

@@ -106,7 +106,8 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
         Raises:
             ResidnetError: if a file is missing or its contents cannot be used.
         """
-        cached_logs, self._checked_logs = self._checked_logs, None
+        cached_logs = self._checked_logs
+        self._checked_logs = None
         return cached_logs or read_split_logs(self.data)
 
     def cache_logs(self, logs: LogsBySplit) -> None:

@@ -105,7 +105,8 @@ def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
         folder.write_json(folder.path / "currents.json", currents)
     identified_models = fit_models(logs, config, store=RunModelStore(folder))
     begin_stage("free runs")
-    fitted_models, time_step = list(identified_models.values()), config.prepare.grid.step
+    fitted_models = list(identified_models.values())
+    time_step = config.prepare.grid.step
     if config.bands is not None:
         bands = {entry.name: entry.bands for entry in fitted_models}
         folder.write_record(folder.bands, build_bands_file(config.name, bands))
@@ -175,7 +176,8 @@ def evaluate_on_logs(
         require_apart(folder_path, input_paths)
 
     def evaluate_models(folder: RunFolder) -> TaskOutcome:
-        store, model_order = RunModelStore(run), [CONSTANT_VELOCITY, *config.model_names]
+        store = RunModelStore(run)
+        model_order = [CONSTANT_VELOCITY, *config.model_names]
         fitted_models = [store.load(name) for name in store.names()]
         fitted_models.sort(key=lambda model: (*model_order, model.name).index(model.name))
         log_message(f"{config.name}: {len(prepared)} logs, {len(fitted_models)} models")
@@ -213,7 +215,9 @@ def evaluate_on_logs(
 
 def export_model(config: FitConfig, request: ExportRequest) -> Path:
     """Export one model of a finished fit; see `FitConfig.export_model`."""
-    run, name, metrics = request.run, request.model, request.run.read_metrics()
+    run = request.run
+    name = request.model
+    metrics = request.run.read_metrics()
     model_name = str(metrics.get(name, metrics["selected"])) if name in _MODEL_ALIASES else name
     available_models = model_names(run.models)
     if model_name not in available_models:

@@ -49,7 +49,8 @@ def write_inspection(
     )
 
     begin_stage("examining logs")
-    inputs, masks = config.signals.input_columns, (*config.prepare.masks, SpikeMask())
+    inputs = config.signals.input_columns
+    masks = (*config.prepare.masks, SpikeMask())
     logs = [log for members in splits.values() for log in members]
     split_of = {log.name: split for split, members in splits.items() for log in members}
     reports = [inspect_log(log, inputs, masks) for log in logs]
@@ -99,7 +100,8 @@ def write_evaluation(
     folder.write_record(
         folder.metrics, build_metrics_file(config.name, units, scales, *names, rows)
     )
-    n_commands, step = len(config.signals.inputs), config.prepare.grid.step
+    n_commands = len(config.signals.inputs)
+    step = config.prepare.grid.step
     evaluated_logs = [log for evaluation in evaluations.values() for log in evaluation.logs]
     limits = {
         "schema": LIMITS_SCHEMA,

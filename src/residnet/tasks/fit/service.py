@@ -176,7 +176,9 @@ class FittedModelService:
         if name not in store.names():
             valid_names = ["selected", *store.names()]
             raise UsageError(f"{run.path}: no model '{name}'{suggest_name(name, valid_names)}")
-        self.config, self.run, self.fitted_model = config, run, store.load(name)
+        self.config = config
+        self.run = run
+        self.fitted_model = store.load(name)
         self.input_paths, _, self.logs = read_external_logs(config, log_paths)
         # reference logs over ground like the new ones: the detector removes currents from both
         clean_splits = prepare_splits(config.load_logs(), config)
@@ -191,7 +193,8 @@ class FittedModelService:
         Raises:
             DataError: if a log contains no window.
         """
-        online_detector, monitored = OnlineChangeDetector(self.detector), []
+        online_detector = OnlineChangeDetector(self.detector)
+        monitored = []
         for log in self.logs:
             windows = self.detector.make_windows(log)
             online_detector.start_new_log()
@@ -391,7 +394,8 @@ def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
         UsageError: if the folder may not be used, or the model has no parameters to change.
         DataError: if there are fewer than two logs, or a log is too short.
     """
-    config, original_model = service.config, service.fitted_model
+    config = service.config
+    original_model = service.fitted_model
     if len(service.logs) < 2:
         raise DataError(
             "a refit needs at least two new logs, the last of which are held out to judge it; give"
@@ -400,7 +404,8 @@ def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
     for log in service.logs:
         check_window_fits(log, config)
     n_held_out = max(len(service.logs) // _HOLD_OUT_RATIO, 1)
-    training_logs, held_out_logs = service.logs[:-n_held_out], service.logs[-n_held_out:]
+    training_logs = service.logs[:-n_held_out]
+    held_out_logs = service.logs[-n_held_out:]
     log_message(
         f"recursive refit of {original_model.name} on {len(training_logs)} logs, {n_held_out}"
         f" held out"
@@ -422,7 +427,8 @@ def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
     errors: dict[str, Any] = {}
 
     def evaluate_refit(folder: RunFolder) -> TaskOutcome:
-        store, models = RunModelStore(folder), service.run.models
+        store = RunModelStore(folder)
+        models = service.run.models
         reference_names = [
             name
             for name in dict.fromkeys((CONSTANT_VELOCITY, original_model.name))
@@ -545,7 +551,8 @@ class NextTrials:
             return self._write(folder)
 
     def _write(self, folder: Path) -> list[Path]:
-        trials, tracks = folder / "next_trials.yaml", folder / "next_tracks.csv"
+        trials = folder / "next_trials.yaml"
+        tracks = folder / "next_tracks.csv"
         flights = [trial.simulated_run for trial in self.plan.selected_trials]
         chosen = [flight.manoeuvre.model_dump(mode="json") for flight in flights]
         states = [
@@ -598,11 +605,9 @@ def plan_next_trials(
             f"{run.path}: no refitted baseline '{name}'{suggest_name(name, refitted_names)}"
         )
     logs, _ = convert_to_motion_through_water(prepare_splits(config.load_logs(), config), config)
-    fitted_model, training_logs, refit = (
-        RunModelStore(run).load(name),
-        logs["train"],
-        config.refit[name],
-    )
+    fitted_model = RunModelStore(run).load(name)
+    training_logs = logs["train"]
+    refit = config.refit[name]
     refit = refit.with_prior(float(fitted_model.notes.get("prior", refit.prior)))
     scales = config.evaluation.scales.to_array()
     open_directions = estimate_refit_covariance(
@@ -613,14 +618,16 @@ def plan_next_trials(
         torch.from_numpy(scales),
         fitted_model.notes["refit"].get("at_rest", ()),
     )
-    divergence_bounds, goal = divergence_limit(fitted_model.spec, config), None
+    divergence_bounds = divergence_limit(fitted_model.spec, config)
+    goal = None
     if booklet is None:
         input_shares = infer_input_shares(fitted_model.spec)
     else:
         initial = {key: float(value) for key, value in booklet.initial.items()}
         # manoeuvres of one kind are simulated in one batch
         manoeuvres = sorted(booklet.manoeuvres, key=lambda manoeuvre: manoeuvre.kind)
-        goal, input_shares = PredictionGoal(manoeuvres, booklet.duration, initial), booklet.inputs
+        goal = PredictionGoal(manoeuvres, booklet.duration, initial)
+        input_shares = booklet.inputs
     return NextTrials(
         name,
         plan_trials(

@@ -36,7 +36,8 @@ _LOCK_TIMEOUT = 10
 """Seconds after which the lock of a killed process is removed."""
 _SEED_STRIDE = 7_919
 """Factor that makes the trial seeds of neighbouring search seeds different."""
-JOURNAL_FILE, BEST_CONFIG_FILE = "journal.log", "best.yaml"
+JOURNAL_FILE = "journal.log"
+BEST_CONFIG_FILE = "best.yaml"
 _STATE_NAMES = {"COMPLETE": "finished", "PRUNED": "ended early", "FAIL": "failed"}
 
 
@@ -54,8 +55,10 @@ def execute(config: SweepConfig, folder: RunFolder) -> TaskOutcome:
         content = journal.read_bytes()
         journal.write_bytes(content[: content.rfind(b"\n") + 1])
     study = open_optuna_study(config, folder.path)
-    queue, trial_by_future = TrialQueue(config, study), dict[Future[TrialResult], Any]()
-    n_lost, restart_queue = Counter[int](), list[Any]()
+    queue = TrialQueue(config, study)
+    trial_by_future = dict[Future[TrialResult], Any]()
+    n_lost = Counter[int]()
+    restart_queue = list[Any]()
     with config.runner.open_executor() as pool:
         while True:
             while len(trial_by_future) < config.runner.n_parallel and (
@@ -106,7 +109,8 @@ def open_optuna_study(config: SweepConfig, folder: Path) -> optuna.Study:
     from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
 
     optuna.logging.set_verbosity(logging.ERROR)
-    path, pruning = str((folder / JOURNAL_FILE).absolute()), config.pruning
+    path = str((folder / JOURNAL_FILE).absolute())
+    pruning = config.pruning
     try:
         return optuna.create_study(
             storage=JournalStorage(
@@ -132,7 +136,8 @@ class TrialQueue:
     def __init__(self, config: SweepConfig, study: optuna.Study) -> None:
         from optuna.trial import TrialState
 
-        self.config, self.study = config, study
+        self.config = config
+        self.study = study
         self.distributions = {key: values.to_distribution() for key, values in config.space.items()}
         existing_trials = study.get_trials(deepcopy=False)
         # trials that were interrupted by a kill are continued first
@@ -231,7 +236,9 @@ def run_sweep_trial(
     import optuna
 
     run = RunFolder(_trial_folder_path(folder, number))
-    value, is_pruned, error_message = None, False, ""
+    value = None
+    is_pruned = False
+    error_message = ""
     try:
         if not run.is_finished:
             task, overrides = config.build_trial(values, f"{config.name}.{number:05d}")
@@ -250,9 +257,11 @@ def run_sweep_trial(
     # a complete run whose results failed a check has a value, too
     if run.is_finished and not is_pruned:
         try:
-            value, error_message = config.objective.read_value(run), ""
+            value = config.objective.read_value(run)
+            error_message = ""
             if value is None or not math.isfinite(value):
-                value, error_message = None, f"{run.path}: the objective is not finite"
+                value = None
+                error_message = f"{run.path}: the objective is not finite"
         except ResidnetError as error:
             error_message = str(error)
     has_provenance = run.provenance.is_file()
@@ -287,10 +296,8 @@ def _write_results(config: SweepConfig, study: optuna.Study, folder: RunFolder) 
     by_state = {
         state: [row for row in rows if row["state"] == state] for state in _STATE_NAMES.values()
     }
-    finished_rows, direction_sign = (
-        by_state["finished"],
-        1.0 if config.objective.is_minimized else -1.0,
-    )
+    finished_rows = by_state["finished"]
+    direction_sign = 1.0 if config.objective.is_minimized else -1.0
     best_row = min(
         finished_rows, key=lambda row: (direction_sign * row["value"], row["number"]), default=None
     )
