@@ -490,22 +490,29 @@ def hash_measured_rows(log: Log, channels: Sequence[str]) -> np.ndarray:
     return np.asarray(hash_rows(log, channels)[2 * n_measured >= n_measured.max(initial=0)])
 
 
+_ROWS_PER_HASH_CHUNK = 250_000
+
+
 def hash_rows(log: Log, channels: Sequence[str]) -> np.ndarray:
     """Return a hash of the given channels for each row, uint64 [T]."""
     import pandas as pd
 
-    columns = {}
-    for name in channels:
-        values = log[name]
-        # a copy that was unwrapped from another start differs by rounding errors in the heading
-        columns[name] = (
-            np.round(np.remainder(values, 2.0 * np.pi), 9)
-            if log.units[name] == "rad"
-            else values + 0.0
-        )
-    hashes = pd.util.hash_pandas_object(pd.DataFrame(columns), index=False).to_numpy()
+    hashes = np.empty(len(log), dtype=np.uint64)
+    # chunks, because the temporary arrays of millions of rows would double the memory of the log
+    for start in range(0, len(log), _ROWS_PER_HASH_CHUNK):
+        chunk = slice(start, start + _ROWS_PER_HASH_CHUNK)
+        columns = {}
+        for name in channels:
+            values = log[name][chunk]
+            # a copy that was unwrapped from another start differs by rounding errors in the heading
+            columns[name] = (
+                np.round(np.remainder(values, 2.0 * np.pi), 9)
+                if log.units[name] == "rad"
+                else values + 0.0
+            )
+        hashes[chunk] = pd.util.hash_pandas_object(pd.DataFrame(columns), index=False).to_numpy()
     release_pages()
-    return np.asarray(hashes)
+    return hashes
 
 
 def find_logs(folder: Path) -> list[Path]:

@@ -110,8 +110,7 @@ def check_copies(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     candidate_logs = [log.log for log in logs.logs]
     if names and (sampling_interval := row_sampling_interval(candidate_logs)) > 1:
         # for very many rows, a sample by hash value selects the logs that may share rows: equal
-        # rows
-        # have equal hashes, so all copies of a row are sampled or none
+        # rows have equal hashes, so all copies of a row are sampled or none
         hashes_by_log = (hash_rows(log, names) for log in candidate_logs)
         sampled_hashes = [
             hashes[hashes % np.uint64(sampling_interval) == 0] for hashes in hashes_by_log
@@ -126,12 +125,15 @@ def check_copies(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     if not names or not candidate_logs:
         return
     # each row is hashed independently, so all logs can be hashed in one call
-    joined_log = Log(
-        "together",
-        np.concatenate([log.t for log in candidate_logs]),
-        {name: np.concatenate([log[name] for log in candidate_logs]) for name in names},
-        candidate_logs[0].units,
-    )
+    if len(candidate_logs) == 1:
+        joined_log = candidate_logs[0]
+    else:
+        joined_log = Log(
+            "together",
+            np.concatenate([log.t for log in candidate_logs]),
+            {name: np.concatenate([log[name] for log in candidate_logs]) for name in names},
+            candidate_logs[0].units,
+        )
     hashes = np.split(
         hash_rows(joined_log, names), np.cumsum([len(log) for log in candidate_logs])[:-1]
     )

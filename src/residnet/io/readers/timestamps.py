@@ -117,10 +117,11 @@ _ROWS_PER_CHUNK = 250_000
 def _split_datetimes(cells: pd.Series) -> pd.DataFrame:
     """Split dates and times into columns such as date, hour, minute, second, fraction and zone.
 
-    Equal texts share one object in memory.
+    The columns are categorical: as text they would take several times the memory of the file.
     """
     import pandas as pd
     import pyarrow as pa
+    from pandas.api.types import union_categoricals
     from pyarrow import compute
 
     has_no_hours = _MINUTES_PATTERN.fullmatch(str(next(iter(cells), ""))) is not None
@@ -149,11 +150,17 @@ def _split_datetimes(cells: pd.Series) -> pd.DataFrame:
             codes = np.where(np.isfinite(codes), codes, -1).astype(np.int64)
             extracted = pd.Series(digit_texts[codes], index=chunk.index)
             table[name] = extracted.where(extracted.notna() & (extracted != ""), table[name])
-        return table
+        return table.astype("category")
 
     starts = range(0, max(len(cells), 1), _ROWS_PER_CHUNK)
     tables = [split_chunk(cells.iloc[start : start + _ROWS_PER_CHUNK]) for start in starts]
-    return tables[0] if len(tables) == 1 else pd.concat(tables)
+    if len(tables) == 1:
+        return tables[0]
+    # unlike `concat`, `union_categoricals` keeps columns of unlike categories categorical
+    columns = {
+        name: union_categoricals([table[name] for table in tables]) for name in tables[0].columns
+    }
+    return pd.DataFrame(columns, index=cells.index)
 
 
 def is_date_column(texts: pd.Series) -> bool:
@@ -169,7 +176,7 @@ def detect_date_order(texts: pd.Series) -> DateOrder | None:
 
 
 def _order_from_parts(cells: pd.DataFrame) -> DateOrder | None:
-    parts = cells["date"].drop_duplicates().str.extract(_DATE_PARTS)
+    parts = cells["date"].drop_duplicates().astype("string").str.extract(_DATE_PARTS)
     first_part = parts["a"].dropna()
     second_part = parts["b"].dropna()
     if first_part.empty or (first_part.str.len() == 4).any():
@@ -232,7 +239,10 @@ def parse_texts(
 
 def strip_cells(cells: pd.Series) -> tuple[pd.Series, np.ndarray]:
     """Return the cells without surrounding blanks, and which of them are not empty, bool [T]."""
-    column = cells.astype("string").str.strip()
+    column = cells.astype("string")
+    # most files have no blanks, and a second copy of the text takes as much memory as the first
+    if column.str.contains(r"^\s|\s$", regex=True).any():
+        column = column.str.strip()
     return column, (column.notna() & (column != "")).to_numpy(dtype=bool)
 
 
@@ -291,13 +301,14 @@ def _parse_datetimes(cells: pd.Series, zone: str | None, order: DateOrder | None
         cells, (parts["date" if has_dates else "hour"].isna()).to_numpy(), "date or time"
     )
     # remove each column of text as soon as its numbers exist, to save memory
-    hour, minute, second = (
-        convert_per_text(parts.pop(name).fillna("0"), int) for name in ("hour", "minute", "second")
-    )
+    hour = convert_per_text(parts.pop("hour"), int, missing="0")
     if parts["half"].notna().any():
-        half_day = parts["half"].fillna("").str.lower().str.slice(0, 1)
+        half_day = parts["half"].astype("string").fillna("").str.lower().str.slice(0, 1)
         hour = np.where(half_day == "p", hour % 12 + 12, np.where(half_day == "a", hour % 12, hour))
-    whole_seconds = (hour * 60 + minute) * 60 + second
+    whole_seconds = hour * 3_600
+    del hour
+    whole_seconds += convert_per_text(parts.pop("minute"), int, missing="0") * 60
+    whole_seconds += convert_per_text(parts.pop("second"), int, missing="0")
     if has_dates:
         date_order = order or _order_from_parts(parts) or "dmy"
         whole_seconds += _parse_days(cells, parts["date"], date_order) * 86_400
@@ -314,10 +325,20 @@ def _parse_datetimes(cells: pd.Series, zone: str | None, order: DateOrder | None
     return TimeStamps(ns + midnight_count * _DAY_NS, False, None, remarks)
 
 
-def convert_per_text(column: pd.Series, function: Callable[[str], int]) -> np.ndarray:
-    """Return the integer [T] of each text, calling the function once per distinct text."""
+def convert_per_text(
+    column: pd.Series, function: Callable[[str], int], *, missing: str
+) -> np.ndarray:
+    """Return the integer [T] of each text, calling the function once per distinct text.
+
+    Args:
+        column: texts [T], best as categories.
+        function: conversion of one text.
+        missing: text that replaces a missing one.
+    """
     categories = column.astype("category")
-    converted = np.array([function(str(text)) for text in categories.cat.categories], np.int64)
+    # a missing text has the code -1, which selects the last entry
+    texts = [*categories.cat.categories, missing]
+    converted = np.array([function(str(text)) for text in texts], np.int64)
     integers: np.ndarray = converted[categories.cat.codes.to_numpy()]
     return integers
 
@@ -359,12 +380,9 @@ def _to_utc(ns: np.ndarray, zones: pd.Series, zone: str | None) -> np.ndarray:
     """
     import pandas as pd
 
-    zone_categories = zones.fillna("").astype("category")
-    if (zone_categories != "").any():
-        utc_offsets = np.array(
-            [_parse_utc_offset(str(text)) for text in zone_categories.cat.categories]
-        )
-        utc_ns: np.ndarray = ns - utc_offsets[zone_categories.cat.codes.to_numpy()] * _NS_PER_SECOND
+    if (zones.notna() & (zones != "")).any():
+        utc_offsets = convert_per_text(zones, _parse_utc_offset, missing="")
+        utc_ns: np.ndarray = ns - utc_offsets * _NS_PER_SECOND
         return utc_ns
     if zone is None:
         return ns
@@ -405,9 +423,8 @@ def _parse_fractions(
     Returns:
         The fractions, and a remark if leading zeros were restored.
     """
-    digits = column.fillna("0").str.slice(0, 9)
-    digit_count = convert_per_text(digits, len)
-    value = convert_per_text(digits, int)
+    digit_count = convert_per_text(column, lambda text: len(text[:9]), missing="0")
+    value = convert_per_text(column, lambda text: int(text[:9]), missing="0")
     as_printed = value * 10 ** (9 - digit_count)
     max_digits = int(digit_count.max(initial=0))
     if max_digits not in (3, 6, 9) or (digit_count == max_digits).all():
@@ -418,7 +435,8 @@ def _parse_fractions(
         int((np.diff(whole_seconds * _NS_PER_SECOND + fraction) < 0).sum())
         for fraction in (as_printed, as_integers)
     )
-    n_leading_zeros = int((digits.str.startswith("0") & (digit_count > 1)).sum())
+    starts_with_zero = convert_per_text(column, lambda text: text.startswith("0"), missing="0")
+    n_leading_zeros = int(((starts_with_zero == 1) & (digit_count > 1)).sum())
     # where zeros are printed, one fraction in ten starts with one
     is_undecided = n_backward_integers == n_backward_printed and (
         n_backward_printed > 0 or n_leading_zeros > 0 or whole_seconds.size < 100
