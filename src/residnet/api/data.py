@@ -25,6 +25,7 @@ from residnet.core.log import Log
 from residnet.core.names import suggest_name
 from residnet.core.progress import ProgressCallback, log_message, report_progress
 from residnet.evaluation.protocol import EvaluationConfig, longest_segment_length
+from residnet.identification.prepared import mask_unexplained_idle
 from residnet.identification.recipe import PreparationPlan, make_evaluation_settings
 from residnet.io.drafting.questions import DraftNotes, Question, dump_commented_yaml
 from residnet.io.drafting.reading import find_log_files, read_mixed_formats
@@ -34,6 +35,7 @@ from residnet.io.sources import read_split_logs as read_splits
 from residnet.io.split import SPLITS, assign_log_names, check_leaks, split_logs
 from residnet.manoeuvres.trials import SimulatedTrials
 from residnet.physics.signals import SignalsConfig
+from residnet.preprocessing.masks import MaskRule
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.preprocessing.prepare import PrepareConfig, PreparedLog
 from residnet.preprocessing.prepare import prepare_log as prepare_log
@@ -187,8 +189,7 @@ def inspect(
     import pandas as pd
 
     log_list = read_logs(logs)
-    settings = {"grid": {"step": 1.0}, "masks": to_builtin(masks)}
-    mask_rules = validate_config(settings, PrepareConfig, "inspect").masks
+    mask_rules = _validate_masks(masks, "inspect")
     quality_reports = [
         *(examine(log, inputs, mask_rules) for log in log_list),
         inspect_log_set(log_list, inputs),
@@ -295,9 +296,9 @@ def prepare(
     Settings that are not given are derived from the logs, as `draft_config` does it: inputs from
     names and values; step and derivative from the sampling interval and the correlation time of the
     yaw rate; evaluation windows back to back, of the length that most validation and test logs
-    contain and of about a third of it; scales as the standard deviations of u, v and r over the
-    training and validation logs. If the logs measure only some of u, v and r, the models have these
-    velocities; if all logs measure the roll angle, the models include roll.
+    contain and of about a third of it; scales as the winsorized standard deviations of u, v and r
+    over the unmasked training samples. If the logs measure only some of u, v and r, the models have
+    these velocities; if all logs measure the roll angle, the models include roll.
 
     Args:
         logs: a list of logs (of each five, sorted by manoeuvre, the third is used for validation
@@ -311,9 +312,9 @@ def prepare(
         settings_from: dataset whose settings are used; all logs then form the split `external`.
         progress: called with the progress of the work.
         settings: further keys of the sections `signals` (exogenous, forces, velocities),
-            `prepare` (masks, derivative, motion, trim, hold, beside) and `evaluation` (protocols,
-            selection, scales, groups, divergence) of a config, as in YAML; without `selection` the
-            first of `protocols` is used for model selection.
+            `prepare` (masks, derivative, motion, trim, hold, beside, dead_commands) and
+            `evaluation` (protocols, selection, scales, groups, divergence) of a config, as in YAML;
+            without `selection` the first of `protocols` is used for model selection.
 
     Returns:
         The data: y, smooth [T, 3 + n], nu_dot [T, n], w [T, m] of each log, float64, SI.
@@ -362,7 +363,8 @@ def prepare(
         common_inputs = [
             name for name in input_names if all(name in log.channels for log in all_logs)
         ]
-        preparation_recipe = PreparationPlan.from_logs(all_logs, common_inputs, dof)
+        masks = _validate_masks(settings.get("masks") or (), "prepare")
+        preparation_recipe = PreparationPlan.from_logs(all_logs, common_inputs, dof, masks)
         if dof.description:
             log_message(f"velocities: {dof.description}")
         log_message(f"recipe: {preparation_recipe.reason}")
@@ -411,7 +413,11 @@ def prepare(
         }
         evaluation_settings = (
             make_evaluation_settings(
-                complete_logs, durations, preparation_recipe.correlation_time, dof
+                complete_logs,
+                durations,
+                preparation_recipe.correlation_time,
+                masks,
+                dof,
             )
             | evaluation_settings
         )
@@ -419,9 +425,15 @@ def prepare(
         return Dataset(prepared, signals_config, preparation, evaluation, source)
 
 
+def _validate_masks(masks: Any, function_name: str) -> tuple[MaskRule, ...]:
+    settings = {"grid": {"step": 1.0}, "masks": to_builtin(masks)}
+    return validate_config(settings, PrepareConfig, function_name).masks
+
+
 def _prepare_splits(
     splits: Mapping[str, Sequence[Log]], signals: SignalsConfig, config: PrepareConfig
 ) -> dict[str, list[PreparedLog]]:
+    splits = mask_unexplained_idle(splits, config, signals.input_columns)
     n_done = 0
     total = sum(map(len, splits.values()))
     prepared: dict[str, list[PreparedLog]] = {}

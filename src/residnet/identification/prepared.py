@@ -17,7 +17,7 @@ from residnet.core.progress import log_message
 from residnet.evaluation.protocol import longest_segment_length
 from residnet.identification.settings import FitSettings
 from residnet.preprocessing.masks import UNEXPLAINED_IDLE
-from residnet.preprocessing.prepare import PreparedLog, prepare_log
+from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
 from residnet.training.current import estimate_currents, through_water
 
 _MAX_SAMPLES = 500_000
@@ -36,44 +36,7 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
         DataError: where a log has nothing to learn from or to predict.
     """
     signals = settings.signals
-    if settings.prepare.dead_commands == "mask":
-        # what explains motion is learned from training and validation logs
-        # a config is checked without what only data need
-        from residnet.quality.consensus import find_unexplained_idle
-        from residnet.quality.statistics import LogStatistics
-
-        statistics_by_split = {
-            split: [LogStatistics(log, signals.input_columns) for log in logs]
-            for split, logs in splits.items()
-        }
-        training_statistics = [
-            log for split in ("train", "validation") for log in statistics_by_split.get(split, ())
-        ]
-        other_statistics = [
-            log
-            for split in statistics_by_split.keys() - {"train", "validation"}
-            for log in statistics_by_split[split]
-        ]
-        idle_segments = find_unexplained_idle(
-            training_statistics, other_statistics, signals.input_columns
-        )
-
-        def masked(log: Log) -> Log:
-            is_idle = np.zeros(len(log), dtype=bool)
-            for start, last in idle_segments.get(log.name, ()):
-                is_idle[start : last + 1] = True
-                log_message(
-                    f"  {log.name}: t = {log.t[start]:.1f} to {log.t[last]:.1f} s is left out: all"
-                    " inputs rest, and the other logs do not explain the motion"
-                    " (prepare.dead_commands: keep would keep it)"
-                )
-            return (
-                log.replace(masks={**log.masks, UNEXPLAINED_IDLE: is_idle})
-                if is_idle.any()
-                else log
-            )
-
-        splits = {split: [masked(log) for log in logs] for split, logs in splits.items()}
+    splits = mask_unexplained_idle(splits, settings.prepare, signals.input_columns)
     prepared = {
         split: paged.PageReleasingList(
             prepare_log(log_part, split, signals.input_columns, settings.prepare, signals.dof)
@@ -110,6 +73,45 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
                 f"  {log.log.name}: spikes are bridged and left out (samples: {counts_text})"
             )
     return prepared
+
+
+def mask_unexplained_idle(
+    splits: Mapping[str, Sequence[Log]], config: PrepareConfig, input_names: Sequence[str]
+) -> dict[str, Sequence[Log]]:
+    """Mask unexplained motion with constant inputs in training logs, if the config asks for it.
+
+    Validation and test logs are returned unchanged: an error of such a stretch is an error of the
+    models.
+
+    Args:
+        splits: canonical logs by split.
+        config: whose `dead_commands` is the decision of the user.
+        input_names: input channels of the model.
+    """
+    if config.dead_commands == "keep" or "train" not in splits:
+        return dict(splits)
+    # reading a config must not import the data checks
+    from residnet.quality.consensus import find_unexplained_idle
+    from residnet.quality.statistics import LogStatistics
+
+    reference_logs = [*splits["train"], *splits.get("validation", ())]
+    idle_segments = find_unexplained_idle(
+        [LogStatistics(log, input_names) for log in reference_logs], [], input_names
+    )
+
+    def mask_log(log: Log) -> Log:
+        is_idle = np.zeros(len(log), dtype=bool)
+        for first, last in idle_segments.get(log.name, ()):
+            is_idle[first : last + 1] = True
+            log_message(
+                f"  {log.name}: t = {log.t[first]:.1f} to {log.t[last]:.1f} s is excluded from"
+                " training (prepare.dead_commands: mask): all inputs are constant and the other"
+                " logs do not explain the motion"
+            )
+        masks = {**log.masks, UNEXPLAINED_IDLE: is_idle}
+        return log.replace(masks=masks) if is_idle.any() else log
+
+    return {**splits, "train": [mask_log(log) for log in splits["train"]]}
 
 
 def split_long_log(log: Log) -> list[Log]:

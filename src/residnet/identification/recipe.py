@@ -26,8 +26,10 @@ from residnet.dynamics.base import Integrator
 from residnet.evaluation.protocol import EvaluationConfig, WindowProtocol, longest_segment_length
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
 from residnet.physics.symmetry import get_dof, mirror_channels, violates_symmetry
+from residnet.preprocessing.channel_values import bridge_spikes
+from residnet.preprocessing.masks import MaskRule, apply_masks, find_scored_samples
 from residnet.preprocessing.motion import remove_pauses
-from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
+from residnet.preprocessing.prepare import TAIL_SHARE, PrepareConfig, PreparedLog, prepare_log
 
 _MIN_RELATIVE_SPREAD = 1e-3
 """Smallest spread of a varying channel, as a share of its magnitude."""
@@ -508,9 +510,21 @@ class PreparationPlan:
 
     @classmethod
     def from_logs(
-        cls, logs: Sequence[Log], inputs: Sequence[str], dof: DegreesOfFreedom = SURGE_SWAY_YAW
+        cls,
+        logs: Sequence[Log],
+        inputs: Sequence[str],
+        dof: DegreesOfFreedom = SURGE_SWAY_YAW,
+        masks: Sequence[MaskRule] = (),
     ) -> PreparationPlan:
-        """Return how logs that hold velocities are prepared for models with these inputs."""
+        """Return how logs that hold velocities are prepared for models with these inputs.
+
+        Args:
+            logs: logs with velocities.
+            inputs: input channels of the models.
+            dof: degrees of freedom of the models.
+            masks: rules that exclude samples.
+        """
+        logs = [blank_masked_samples(log, masks, dof) for log in logs]
         sample_interval = float(np.median([np.median(np.diff(log.t)) for log in logs]))
         correlation_times = [_correlation_time(log) for log in logs]
         correlation_time = float(
@@ -626,26 +640,28 @@ def make_evaluation_settings(
     splits: Mapping[str, Sequence[Log]],
     usable_durations: Mapping[str, Sequence[float]],
     correlation_time: float,
+    masks: Sequence[MaskRule] = (),
     dof: DegreesOfFreedom = SURGE_SWAY_YAW,
 ) -> dict[str, Any]:
     """Return protocols, selection and scales of a config, for logs by split.
 
     Test logs do not influence the selection protocol: if they are shorter than its free runs, a
-    shorter protocol is added for them.
+    shorter protocol is added for them. The scales are those of the training logs.
 
     Args:
         splits: `train`, `validation` and `test`.
         usable_durations: duration of the longest gap-free segment of each log, s.
         correlation_time: correlation time of the motion, s.
+        masks: rules that exclude samples from the scales.
+        dof: degrees of freedom of the model.
     """
     window_duration = choose_window_length(
         usable_durations["validation"] or usable_durations["train"], correlation_time
     )
     protocol_settings = make_protocols(window_duration)
-    training_and_validation_logs = [*splits["train"], *splits["validation"]]
     evaluation_settings = {
         "selection": next(iter(protocol_settings)),
-        "scales": make_scales(training_and_validation_logs, dof),
+        "scales": make_scales(splits["train"], masks, dof),
     }
     if (
         usable_durations["test"]
@@ -727,13 +743,55 @@ def make_protocols(window_duration: float) -> dict[str, Any]:
     }
 
 
-def make_scales(logs: Sequence[Log], dof: DegreesOfFreedom = SURGE_SWAY_YAW) -> dict[str, Any]:
-    """Return the standard deviations of what lives of the motion, in units that read well."""
+def make_scales(
+    logs: Sequence[Log], masks: Sequence[MaskRule] = (), dof: DegreesOfFreedom = SURGE_SWAY_YAW
+) -> dict[str, Any]:
+    """Return the scale of each dynamic state in display units: its winsorized standard deviation.
+
+    Samples that are excluded from fits and scores (`masks`, spikes) do not count.
+
+    Args:
+        logs: training logs.
+        masks: rules that exclude samples.
+        dof: degrees of freedom of the model.
+    """
     min_scale = 1e-4
+    scored_logs = [blank_masked_samples(log, masks, dof) for log in logs]
     scale_texts = {}
     for name in dof.active_states:
-        std = max(float(np.nanstd(np.concatenate([log[name] for log in logs]))), min_scale)
+        samples = np.concatenate([log[name] for log in scored_logs])
+        scale = max(compute_winsorized_std(samples), min_scale)
         unit = CHANNEL_UNITS[name]
-        display_value = np.degrees(std) if unit.startswith("rad") else std
+        display_value = np.degrees(scale) if unit.startswith("rad") else scale
         scale_texts[name] = f"{display_value:.3g} {unit.replace('rad', 'deg')}"
     return scale_texts
+
+
+def blank_masked_samples(log: Log, masks: Sequence[MaskRule], dof: DegreesOfFreedom) -> Log:
+    """Return a log whose dynamic states are NaN at spikes and at samples that rules exclude."""
+    masked_log = apply_masks(bridge_spikes(log, dof.active_states), masks)
+    is_scored = find_scored_samples(masked_log)
+    if is_scored.all():
+        return log
+    scored_states = {
+        name: np.where(is_scored, masked_log[name], np.nan)
+        for name in dof.active_states
+        if name in masked_log.channels
+    }
+    return masked_log.replace(channels={**masked_log.channels, **scored_states})
+
+
+def compute_winsorized_std(values: np.ndarray, tail_share: float = TAIL_SHARE) -> float:
+    """Return the standard deviation of values [T], limited to two quantiles; NaN is ignored.
+
+    Values beyond the quantiles `tail_share` and 1 - `tail_share` are replaced by these quantiles
+    (Wilcox 2012, Introduction to Robust Estimation and Hypothesis Testing, section 2.4). At least
+    one value at either end is replaced, so that a single outlier has no influence in short logs.
+    """
+    finite_values = values[np.isfinite(values)]
+    if not finite_values.size:
+        return 0.0
+    # both quantiles are samples, rounded inwards
+    lower = np.quantile(finite_values, tail_share, method="higher")
+    upper = np.quantile(finite_values, 1.0 - tail_share, method="lower")
+    return float(np.clip(finite_values, lower, max(lower, upper)).std())

@@ -20,7 +20,7 @@ from residnet.core.samples import Samples
 from residnet.core.stretches import number_runs
 from residnet.physics.signals import Signals
 from residnet.preprocessing.align import GridConfig, align_to_grid
-from residnet.preprocessing.channel_values import bridge_spikes, is_implausible
+from residnet.preprocessing.channel_values import SPIKE_REASON, bridge_spikes, is_implausible
 from residnet.preprocessing.derivatives import DerivativeConfig, SavitzkyGolay
 from residnet.preprocessing.masks import (
     HARD_PREFIX,
@@ -31,8 +31,8 @@ from residnet.preprocessing.masks import (
 )
 from residnet.preprocessing.motion import MotionConfig, complete_motion, fill_sparse
 
-# share of samples at either end of the range of a velocity that may be outliers
-_TAIL_SHARE = 0.005
+TAIL_SHARE = 0.005
+"""Share of samples at either end of the range of a velocity that may be outliers."""
 
 
 class PrepareConfig(Config):
@@ -54,9 +54,11 @@ class PrepareConfig(Config):
             the derivative filter, with the weights of the filter. With `means` the derivative does
             not lag a step of an input, and short oscillations are attenuated equally on both sides
             of the equation.
-        dead_commands: treatment of stretches in which all inputs are constant while the vessel
-            moves as no model of the other logs explains: manual control, or a stopped recorder.
-            `mask` splits the log there, `keep` includes them.
+        dead_commands: treatment of stretches of training logs in which all inputs are constant
+            while the vessel moves as no model of the other logs explains: a steady manoeuvre,
+            manual control, or a stopped recorder. `residnet inspect` asks the user which it was.
+            `keep` trains on them, `mask` splits training logs there. Validation and test logs are
+            never masked, since errors of unexplained motion are errors of the models.
     """
 
     grid: GridConfig
@@ -66,7 +68,7 @@ class PrepareConfig(Config):
     trim: Seconds = Field(default=0.0, ge=0)
     hold: Literal["start", "mean"] = "start"
     beside: Literal["samples", "means"] = "samples"
-    dead_commands: Literal["mask", "keep"] = "mask"
+    dead_commands: Literal["mask", "keep"] = "keep"
 
 
 @dataclass(frozen=True)
@@ -204,8 +206,11 @@ def prepare_log(
             f"log {log.name}: no sample is usable ({reasons_text}); check the masks and the"
             f" channels {', '.join((*dof.state_names, *input_names))}"
         )
-    # a segment ends at each masked sample, so that no derivative depends on it
-    clean_segment = number_runs(np.where(log.usable & usable, segment, -1))
+    # a segment ends at each masked sample, so that no derivative depends on it; only interpolated
+    # spikes are crossed, since a gap of one sample would change derivatives more than they do
+    other_masks = {reason: mask for reason, mask in log.masks.items() if reason != SPIKE_REASON}
+    is_clean = log.replace(masks=other_masks).usable & (segment >= 0)
+    clean_segment = number_runs(np.where(is_clean, segment, -1))
     nu = y[:, dof.dynamic_columns]
     smoothed_nu, nu_dot, has_derivative = config.derivative.derive(
         nu, config.grid.step, clean_segment
@@ -238,7 +243,7 @@ def prepare_log(
     is_inside_trim = (log.t >= log.t[0] + config.trim - 1e-9) & (
         log.t <= log.t[-1] - config.trim + 1e-9
     )
-    trainable = usable & has_derivative & is_inside_trim
+    trainable = usable & log.usable & has_derivative & is_inside_trim
     prepared = PreparedLog(
         log, split, y, smoothed, nu_dot, held_inputs, rate_inputs, segment, usable, trainable, dof
     )
@@ -333,7 +338,7 @@ def compute_training_ranges(logs: Sequence[PreparedLog]) -> tuple[np.ndarray, np
         upper = values.max()
         # a few outliers must not widen the range in which a free run is valid
         low_quantile, high_quantile = np.quantile(
-            values, (_TAIL_SHARE, 1.0 - _TAIL_SHARE), overwrite_input=True
+            values, (TAIL_SHARE, 1.0 - TAIL_SHARE), overwrite_input=True
         )
         velocity_bounds.append(
             (

@@ -571,18 +571,21 @@ _ACTIONS = {
     "between",
     "dead_commands",
     "note",
-    fix="a fit excludes these stretches (prepare.dead_commands: keep would include them)",
+    fix="if the record is wrong there, prepare.dead_commands: mask excludes it from training",
 )
 def check_unexplained_idle(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Report motion that no recorded input explains while all inputs are constant."""
+    """Ask about motion that no recorded input explains while all inputs are constant.
+
+    Steady turns and full-power runs look the same, so the user decides.
+    """
     consensus = logs.consensus
     for i in consensus.fleet.usable if consensus else ():
         log = logs.logs[i]
         for start, stop in consensus.find_unexplained_idle(i) if consensus else ():
             text = (
                 f"{log.name}: from t = {log.t[start]:.1f} to {log.t[stop]:.1f} s all inputs are"
-                " constant and the vessel moves as no other log explains: manual control, or a"
-                " dead record"
+                " constant and no other log explains the motion: was this a manoeuvre (steady turn,"
+                " full power), or manual control or a stopped recorder?"
             )
             seconds = log.t[stop] - log.t[start]
             yield make_finding(text, {"t": log.t[start], "seconds": seconds})

@@ -180,10 +180,16 @@ def draft_fit_config(
         choose_integrator,
         make_evaluation_settings,
     )
+    from residnet.preprocessing.prepare import PrepareConfig
     from residnet.tasks.fit.config import FitConfig
 
+    mask_settings: dict[str, Any] = {}
+    if "frozen" in finding_codes:
+        mask_channels = {"channels": list(dof.active_states)} if dof.fixed_states else {}
+        mask_settings = {"masks": [{"kind": "frozen", **mask_channels}]}
+    masks = validate_config({"grid": {"step": 1.0}, **mask_settings}, PrepareConfig, "draft").masks
     preparation_recipe = PreparationPlan.from_logs(
-        list(draft_logs.complete_logs.values()), inputs, dof
+        list(draft_logs.complete_logs.values()), inputs, dof, masks
     )
     signals = {"inputs": list(inputs)}
     if not dof.is_planar:
@@ -217,9 +223,7 @@ def draft_fit_config(
     preparation = preparation_recipe.to_config()
     for text in quality_warnings:
         draft_notes.add_note(("data",), f"data doctor: {text}")
-    if "frozen" in finding_codes:
-        mask_channels = {"channels": list(dof.active_states)} if dof.fixed_states else {}
-        preparation |= {"masks": [{"kind": "frozen", **mask_channels}]}
+    preparation |= mask_settings
     usable_logs = draft_logs.select_usable(
         (*inputs, *preparation_recipe.wind_channels), preparation
     )
@@ -233,7 +237,7 @@ def draft_fit_config(
     splits = {name: [log for _, log, _ in members] for name, members in split_entries.items()}
     durations = {name: [time for *_, time in members] for name, members in split_entries.items()}
     evaluation_settings = make_evaluation_settings(
-        splits, durations, preparation_recipe.correlation_time, dof
+        splits, durations, preparation_recipe.correlation_time, masks, dof
     )
     draft_notes.add_note(("prepare", "grid"), preparation_recipe.reason)
     draft_notes.add_note(
@@ -243,7 +247,7 @@ def draft_fit_config(
         " model selection on validation logs",
     )
     draft_notes.add_note(
-        ("evaluation", "scales"), "standard deviations over training and validation logs"
+        ("evaluation", "scales"), "winsorized standard deviations over the training logs"
     )
     draft_notes.add_note(
         ("recipe",), "a portfolio of models, whose terms and sizes follow from the logs"

@@ -1,0 +1,154 @@
+"""Reported figures include all windows and do not depend on single faulty samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from fleets import drawn
+from random_vessels import small_boat_logs
+
+import residnet
+from residnet.core.log import Log
+from residnet.core.progress import on_progress
+from residnet.identification.prepared import mask_unexplained_idle
+from residnet.identification.recipe import compute_winsorized_std
+from residnet.preprocessing.align import GridConfig
+from residnet.preprocessing.masks import UNEXPLAINED_IDLE
+from residnet.preprocessing.prepare import PrepareConfig
+
+INPUTS = ("n_port", "n_stbd")
+Splits = dict[str, list[Log]]
+Fault = Callable[[Log], Log]
+
+
+@pytest.fixture(scope="module")
+def splits() -> Splits:
+    """Eight logs of a boat with two propellers."""
+    logs = small_boat_logs("twin", 3, 8, 60.0)
+    return {"train": logs[:5], "validation": logs[5:6], "test": logs[6:]}
+
+
+@pytest.fixture(scope="module")
+def figures_of_clean_logs(splits: Splits) -> pd.DataFrame:
+    return report_figures(splits)
+
+
+def report_figures(splits: Splits, **settings: object) -> pd.DataFrame:
+    """Return the errors of all models on validation and test logs."""
+    data = residnet.prepare(splits, list(INPUTS), **settings)
+    models = residnet.fit(data, "regressors")
+    rows = models.metrics
+    rows = rows[(rows["split"] != "train") & (rows["manoeuvre"] == "all")]
+    columns = ["nrmse_mean", "nrmse_u", "nrmse_v", "nrmse_r", "rmse_r", "position_error_end"]
+    return rows.set_index(["model", "split", "protocol"])[["windows", *columns]]
+
+
+def insert_spike(log: Log) -> Log:
+    yaw_rate = log["r"].copy()
+    yaw_rate[len(log) // 3] = -99.0
+    return log.replace(channels={**log.channels, "r": yaw_rate})
+
+
+def insert_fill_value(log: Log) -> Log:
+    channels = {name: values.copy() for name, values in log.channels.items()}
+    channels["u"][len(log) // 3] = -9999.0
+    return log.replace(channels=channels)
+
+
+def write_and_read(log: Log, folder: Path) -> Log:
+    """Return a log as it is read from a table."""
+    pd.DataFrame({"t": log.t, **log.channels}).to_csv(folder / f"{log.name}.csv", index=False)
+    (read_log,) = residnet.read_logs(folder / f"{log.name}.csv")
+    return read_log
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+@pytest.mark.parametrize("insert_fault", [insert_spike, insert_fill_value])
+def test_one_faulty_sample_changes_no_figure_by_more_than_two_per_cent(
+    splits: Splits,
+    figures_of_clean_logs: pd.DataFrame,
+    insert_fault: Fault,
+    split: str,
+    tmp_path: Path,
+) -> None:
+    faulty_log = write_and_read(insert_fault(splits[split][0]), tmp_path)
+    figures = report_figures({**splits, split: [faulty_log, *splits[split][1:]]})
+    pd.testing.assert_frame_equal(figures, figures_of_clean_logs, rtol=0.02)
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_values_of_a_masked_stretch_enter_no_figure(splits: Splits, split: str) -> None:
+    """A receiver drifts by twenty standard deviations for 3 s, and the stretch is masked."""
+    log = splits[split][0]
+    n_masked = round(3.0 / float(np.median(np.diff(log.t))))
+    rows = slice(len(log) // 3, len(log) // 3 + n_masked)
+    is_masked = np.zeros(len(log), dtype=bool)
+    is_masked[rows] = True
+    masked_log = log.replace(masks={"receiver": is_masked})
+    channels = {name: values.copy() for name, values in log.channels.items()}
+    # the yaw rate does not depend on the receiver, and is scored at all samples
+    for name in ("u", "v"):
+        channels[name][rows] += np.linspace(0.0, 20.0, n_masked) * np.std(log[name])
+    faulty_log = masked_log.replace(channels=channels)
+    figures, reference = (
+        report_figures({**splits, split: [first_log, *splits[split][1:]]})
+        for first_log in (faulty_log, masked_log)
+    )
+    pd.testing.assert_frame_equal(figures, reference, rtol=0.02)
+
+
+def test_winsorized_std_equals_the_standard_deviation_and_ignores_a_spike() -> None:
+    values = np.random.default_rng(0).normal(2.0, 0.3, 3000)
+    assert compute_winsorized_std(values) == pytest.approx(np.std(values), rel=0.02)
+    for outlier in (-99.0, 1e20):
+        spiked = np.append(values, outlier)
+        assert compute_winsorized_std(spiked) == pytest.approx(np.std(values), rel=0.02)
+    few = np.append(values[:40], -99.0)
+    assert compute_winsorized_std(few) == pytest.approx(np.std(values[:40]), rel=0.1)
+    assert compute_winsorized_std(np.full(3, np.nan)) == 0.0
+    assert compute_winsorized_std(np.array([4.0])) == 0.0
+
+
+def rest_inputs(log: Log) -> Log:
+    """Replace the inputs of a stretch by zero, as a dead record does."""
+    channels = {name: values.copy() for name, values in log.channels.items()}
+    rows = slice(len(log) // 2, len(log) // 2 + round(0.15 * len(log)))
+    for name in INPUTS:
+        channels[name][rows] = 0.0
+    return log.replace(channels=channels)
+
+
+@pytest.fixture(scope="module")
+def idle_splits() -> Splits:
+    """Every split has a log with a stretch of zero inputs that do not explain the motion."""
+    logs = drawn("twin", 11, 3)[2].logs
+    return {
+        "train": [rest_inputs(logs[2]), *logs[3:]],
+        "validation": [rest_inputs(logs[1])],
+        "test": [rest_inputs(logs[0])],
+    }
+
+
+def test_unexplained_stretches_are_masked_in_training_only_and_only_on_request(
+    idle_splits: Splits,
+) -> None:
+    keep = PrepareConfig(grid=GridConfig(step=0.1))
+    assert mask_unexplained_idle(idle_splits, keep, INPUTS) == idle_splits
+    messages: list[str] = []
+    with on_progress(lambda event: messages.append(str(event))):
+        masked = mask_unexplained_idle(
+            idle_splits, keep.model_copy(update={"dead_commands": "mask"}), INPUTS
+        )
+    assert masked["train"][0].masks[UNEXPLAINED_IDLE].any()
+    assert masked["validation"] == idle_splits["validation"]
+    assert masked["test"] == idle_splits["test"]
+    assert "excluded from training" in " ".join(messages)
+    findings = residnet.inspect(idle_splits["train"], inputs=INPUTS)
+    (row,) = findings[findings["code"] == "dead_commands"].to_dict("records")
+    assert row["level"] == "note"
+    assert "?" in row["text"]
+    assert "prepare.dead_commands: mask" in row["action"]
