@@ -70,7 +70,11 @@ HALF_STEP = np.where(np.arange(300) == 40, 0.5, np.repeat([0.0, 1.0], 150))
         (GapMask(longest=0.3), log_of(np.array([1.1, 1.2, 1.5]), u=np.ones(3)), []),
         (MissingValues(), log_of(u=[0, np.nan, 0], v=[0, 0, np.nan]), [1, 2]),
         (MissingValues(channels=("v",)), log_of(u=[0, np.nan, 0], v=[0, 0, np.nan]), [2]),
-        (JumpMask(channel="u", limit=1.0, before=2, after=3), log_of(u=STEP * 10), [*range(28, 33)]),  # noqa: E501
+        (
+            JumpMask(channel="u", limit=1.0, before=2, after=3),
+            log_of(u=STEP * 10),
+            [*range(28, 33)],
+        ),
         (JumpMask(channel="u", limit=5.0), log_of(u=STEP * 10), []),
         (JumpMask(channel="psi", limit=0.5), log_of(psi=[3.1, 3.14, -3.1, -3.0]), []),
         (InputJumpMask(**AROUND, limit=0.1), log_of(d=STEP), [*range(25, 41)]),

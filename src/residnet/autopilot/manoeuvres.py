@@ -105,10 +105,19 @@ _RIGHT_ANGLE = math.pi / 2
 _HALF_RIGHT_ANGLE = math.pi / 4
 # Table 4.1 prints the twelve twice (correction J12); headings are followed as written (J13)
 SEGMENTS: tuple[Waypoint, ...] = (
-    (0.0, -15.0, -_RIGHT_ANGLE), (15.0, -15.0, 0.0), (15.0, 0.0, 0.0), (30.0, 0.0, 0.0), (30.0, -15.0, 0.0),  # noqa: E501
-    (30.0, -15.0, 2 * _RIGHT_ANGLE), (15.0, -15.0, 2 * _RIGHT_ANGLE), (15.0, 0.0, 3 * _HALF_RIGHT_ANGLE), (0.0, 0.0, 3 * _HALF_RIGHT_ANGLE),  # noqa: E501
-    (0.0, 0.0, -_HALF_RIGHT_ANGLE), (0.0, -15.0, -_HALF_RIGHT_ANGLE), (0.0, 0.0, 0.0),
-)  # fmt: skip
+    (0.0, -15.0, -_RIGHT_ANGLE),
+    (15.0, -15.0, 0.0),
+    (15.0, 0.0, 0.0),
+    (30.0, 0.0, 0.0),
+    (30.0, -15.0, 0.0),
+    (30.0, -15.0, 2 * _RIGHT_ANGLE),
+    (15.0, -15.0, 2 * _RIGHT_ANGLE),
+    (15.0, 0.0, 3 * _HALF_RIGHT_ANGLE),
+    (0.0, 0.0, 3 * _HALF_RIGHT_ANGLE),
+    (0.0, 0.0, -_HALF_RIGHT_ANGLE),
+    (0.0, -15.0, -_HALF_RIGHT_ANGLE),
+    (0.0, 0.0, 0.0),
+)
 
 
 class FourCorner(Manoeuvre):

@@ -415,10 +415,10 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
             f"{comparison_text} THAN CONSTANT VELOCITY: on {split} data the selected model"
             f" {model_name} has an NRMSE of"
             f" {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}, and the"
-            f" constant-velocity"
-            f" model"
-            f" {format_number(_mean_nrmse(constant_velocity_row))}{_format_paired_interval(evidence, CONSTANT_VELOCITY)}. DO NOT USE it for"  # noqa: E501
-            " prediction."
+            " constant-velocity model"
+            f" {format_number(_mean_nrmse(constant_velocity_row))}"
+            f"{_format_paired_interval(evidence, CONSTANT_VELOCITY)}."
+            " DO NOT USE it for prediction."
         )
     comparisons = []
     for reference_name, reference_row in (

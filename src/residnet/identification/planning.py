@@ -143,7 +143,10 @@ def propose_manoeuvres(
         if dof.has_heading:
             manoeuvres += [
                 Zigzag(
-                    name=f"zigzag_{angle:.0f}_steer_{round(100 * steer_share * max_steer)}_{drive_label}",  # noqa: E501
+                    name=(
+                        f"zigzag_{angle:.0f}_steer_{round(100 * steer_share * max_steer)}"
+                        f"_{drive_label}"
+                    ),
                     drive=drive,
                     steer=steer_share * max_steer,
                     heading=math.radians(angle),

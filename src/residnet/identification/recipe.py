@@ -120,9 +120,16 @@ class TrainingDataSummary:
             angle_std, rate_std = (float(std[channel_names.index(name)]) for name in ("phi", "p"))
             roll_time_per_radian = angle_std / max(rate_std, 1e-9)
         return cls(
-            channel_names, tuple(varying_channels), tuple(reversing_inputs), dt, free_run_length, history, median_segment_duration, len(samples),  # noqa: E501
+            channel_names,
+            tuple(varying_channels),
+            tuple(reversing_inputs),
+            dt,
+            free_run_length,
+            history,
+            median_segment_duration,
+            len(samples),
             roll_time_per_radian,
-        )  # fmt: skip
+        )
 
     @property
     def max_free_run_length(self) -> float:

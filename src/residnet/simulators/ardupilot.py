@@ -77,7 +77,8 @@ def assign_servos(vehicle: Vehicle, servo_texts: Sequence[str] = ()) -> list[Ser
         except ValueError:
             raise UsageError(
                 f"servo '{text}': expected COMMAND=OUTPUT:LOW:HIGH, for example"
-                f" {names[0]}=1:{float(vehicle.lower_commands[0]):g}:{float(vehicle.upper_commands[0]):g}"  # noqa: E501
+                f" {names[0]}=1:{float(vehicle.lower_commands[0]):g}"
+                f":{float(vehicle.upper_commands[0]):g}"
             ) from None
         if name not in names:
             raise UsageError(f"servo '{text}': no command '{name}'{suggest_name(name, names)}")

@@ -270,9 +270,18 @@ def _describe_steering(source: Sequence[str | Path]) -> SteeringDescription:
         relative_range = (1.0 - _DEFAULT_UNCERTAINTY, 1.0 + _DEFAULT_UNCERTAINTY)
         bias = math.radians(_DEFAULT_BIAS_DEG)
         return SteeringDescription(
-            gain, time_constant, None, math.nan, math.radians(20.0), relative_range, relative_range, _DEFAULT_DELAY, bias, None,  # noqa: E501
+            gain,
+            time_constant,
+            None,
+            math.nan,
+            math.radians(20.0),
+            relative_range,
+            relative_range,
+            _DEFAULT_DELAY,
+            bias,
+            None,
             f"K = {gain:g} 1/s and T = {time_constant:g} s as given",
-        )  # fmt: skip
+        )
     logs, name = _read_source_logs([Path(item) for item in source])
     identified = identify_steering(logs)
     response = identified.response
@@ -357,9 +366,9 @@ def _build_autopilot_config(
 ) -> dict[str, Any]:
     """Return the content of the config."""
     nomoto = NomotoModel(steering.gain, steering.time_constant, steering.speed)
-    pace = float(
-        f"{minimum_turn_time(nomoto, steering.rudder, steering.rate) / minimum_turn_time(*REFERENCE_STEERING, None):.2g}"  # noqa: E501
-    )
+    turn_time = minimum_turn_time(nomoto, steering.rudder, steering.rate)
+    # two digits, as a person would write them into the config
+    pace = float(f"{turn_time / minimum_turn_time(*REFERENCE_STEERING, None):.2g}")
     noise = (_DEFAULT_NOISE_DEG, _DEFAULT_NOISE_DEG)
     if steering.noise is not None:
         heading, rate, dt = steering.noise

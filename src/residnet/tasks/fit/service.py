@@ -328,8 +328,7 @@ class RefitResult:
         lines = [
             f"refit: {changed_parameter.change.name} {changed_parameter.estimated_size:+.3g} +-"
             f" {changed_parameter.standard_error:.2g} {changed_parameter.change.unit}, after"
-            f" each log"
-            f" {', '.join(f'{size_after_log:+.3g}' for size_after_log in changed_parameter.size_by_log)}"  # noqa: E501
+            f" each log {', '.join(f'{size:+.3g}' for size in changed_parameter.size_by_log)}"
             for changed_parameter in self.recursive_refit.identified_changes
         ]
         lines.append(f"refit: ended since {self.recursive_refit.stopping_reason}")
