@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -163,18 +163,26 @@ def main() -> None:
             rest = [log for log in logs[1:] if len(planted) == 1]
             hit = named(fault, host, [*planted, *rest])
             table.setdefault((fault.name, host.ship.name), []).append(hit)
-    print(f"{'fault':28s}" + "".join(f"{name:>11s}" for name in names) + "        all")
-    every: list[bool] = []
-    for fault in faults:
-        row = [table.get((fault.name, name), []) for name in names]
-        joined = [hit for hits in row for hit in hits]
-        every += joined
-        cells = [f"{sum(hits)}/{len(hits)}" if hits else "-" for hits in (*row, joined)]
-        print(f"{fault.name:28s}" + "".join(f"{cell:>11s}" for cell in cells))
-    if every:
-        print(f"\nplanted faults found: {sum(every)} of {len(every)}, {np.mean(every):.1%}")
+    print_table(table, faults, names)
     if checked:
         print(f"clean logs with a finding above a note: {loud} of {checked}, {loud / checked:.1%}")
+
+
+def print_table(
+    table: Mapping[tuple[str, str], Sequence[bool]], faults: Sequence[Fault], ships: Sequence[str]
+) -> None:
+    """Print how often each planted fault was found, by ship and in total."""
+    print(f"{'fault':28s}" + "".join(f"{name:>11s}" for name in ships) + "        all")
+    all_hits: list[bool] = []
+    for fault in faults:
+        row = [table.get((fault.name, name), []) for name in ships]
+        hits_of_fault = [hit for hits in row for hit in hits]
+        all_hits += hits_of_fault
+        cells = [f"{sum(hits)}/{len(hits)}" if hits else "-" for hits in (*row, hits_of_fault)]
+        print(f"{fault.name:28s}" + "".join(f"{cell:>11s}" for cell in cells))
+    if all_hits:
+        n_found = sum(all_hits)
+        print(f"\nplanted faults found: {n_found} of {len(all_hits)}, {np.mean(all_hits):.1%}")
 
 
 if __name__ == "__main__":

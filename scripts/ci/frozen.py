@@ -161,24 +161,33 @@ def differences(old: Any, new: Any, tolerance: float, where: str = "") -> Iterat
             else:
                 yield from differences(old[key], new[key], tolerance, f"{where}.{key}")
     elif isinstance(old, list) and isinstance(new, list):
-        if all(isinstance(line, str) for line in (*old, *new)):
-            yield from (f"{where}: gone: {line[:200]}" for line in old if line not in new)
-            yield from (f"{where}: new:  {line[:200]}" for line in new if line not in old)
-        elif all(isinstance(one, int | float) for one in (*old, *new)):
-            yield from differences(np.array(old), np.array(new), tolerance, where)
-        else:
-            left = dict(enumerate(old))
-            right = dict(enumerate(new))
-            yield from differences(left, right, tolerance, where)
+        yield from list_differences(old, new, tolerance, where)
     elif isinstance(old, np.ndarray | int | float) and type(old) is type(new):
-        a, b = np.asarray(old, dtype=float), np.asarray(new, dtype=float)
-        if a.shape != b.shape:
-            yield f"{where}: shape {a.shape}, now {b.shape}"
-        elif not np.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True):
-            apart = np.nanmax(np.abs(a - b))
-            yield f"{where}: differs by up to {apart:.3g}" + f" ({old!r})" * (a.ndim == 0)
+        yield from number_differences(old, new, tolerance, where)
     elif old != new:
         yield f"{where}: {str(old)[:160]!r}, now {str(new)[:160]!r}"
+
+
+def list_differences(old: list[Any], new: list[Any], tolerance: float, where: str) -> Iterator[str]:
+    """Yield the lines that only one of two texts has, or the differences of other lists."""
+    if all(isinstance(line, str) for line in (*old, *new)):
+        yield from (f"{where}: gone: {line[:200]}" for line in old if line not in new)
+        yield from (f"{where}: new:  {line[:200]}" for line in new if line not in old)
+    elif all(isinstance(number, int | float) for number in (*old, *new)):
+        yield from differences(np.array(old), np.array(new), tolerance, where)
+    else:
+        yield from differences(dict(enumerate(old)), dict(enumerate(new)), tolerance, where)
+
+
+def number_differences(old: Any, new: Any, tolerance: float, where: str) -> Iterator[str]:
+    """Yield the largest difference of two numbers or arrays if it exceeds the tolerance."""
+    a = np.asarray(old, dtype=float)
+    b = np.asarray(new, dtype=float)
+    if a.shape != b.shape:
+        yield f"{where}: shape {a.shape}, now {b.shape}"
+    elif not np.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True):
+        difference = np.nanmax(np.abs(a - b))
+        yield f"{where}: differs by up to {difference:.3g}" + f" ({old!r})" * (a.ndim == 0)
 
 
 PARTS = {"logs": logs, "doctor": doctor, "runs": runs, "exports": exports}

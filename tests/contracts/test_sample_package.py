@@ -82,7 +82,7 @@ def test_its_parts_pass_the_contracts_and_the_broken_one_is_caught(
     write_knots(tmp_path / "log.txt")
     done = python(site, "-c", CHECKS, tmp_path / "log.txt")
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("head crowded: the answer for a row depends on the other rows")
+    assert done.stdout.startswith("head crowded: the residual of a row depends on the other rows")
 
 
 @pytest.mark.long

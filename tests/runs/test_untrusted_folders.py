@@ -91,6 +91,31 @@ def _edit_json(path: Path, rng: random.Random) -> None:
     path.write_text(json.dumps(content))
 
 
+def _flip_bytes(content: bytes, rng: random.Random) -> bytes:
+    """Return a file with up to eight bytes replaced; an empty file stays empty."""
+    damaged = bytearray(content)
+    for _ in range(rng.randrange(1, 9) if content else 0):
+        damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+    return bytes(damaged)
+
+
+def _replace_by_link(kind: str, run: Path, path: Path, victim: Path, rng: random.Random) -> None:
+    """Replace a file, or a folder of the run, by a symbolic link, or a file by a pipe."""
+    if kind == "folder_link":
+        folder = rng.choice([place for place in run.rglob("*") if place.is_dir()])
+        shutil.rmtree(folder)
+        folder.symlink_to(rng.choice([victim.parent, run, Path("/")]))
+        return
+    files = [file for file in sorted(run.rglob("*")) if file.is_file()]
+    path.unlink()
+    if kind == "link":
+        path.symlink_to(rng.choice([victim, rng.choice(files), Path("nowhere"), path]))
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        os.mkfifo(path)
+
+
 def mutate(run: Path, victim: Path, rng: random.Random) -> str:
     """Change one file of a run folder; returns what was done."""
     files = [path for path in sorted(run.rglob("*")) if path.is_file()]
@@ -107,27 +132,13 @@ def mutate(run: Path, victim: Path, rng: random.Random) -> str:
         other = rng.choice(files)
         path.write_bytes(other.read_bytes())
         other.write_bytes(content)
-    elif kind == "link":
-        path.unlink()
-        path.symlink_to(rng.choice([victim, rng.choice(files), Path("nowhere"), path]))
-    elif kind == "folder_link":
-        folder = rng.choice([place for place in run.rglob("*") if place.is_dir()])
-        shutil.rmtree(folder)
-        folder.symlink_to(rng.choice([victim.parent, run, Path("/")]))
-    elif kind == "device":
-        path.unlink()
-        path.symlink_to("/dev/zero")
-    elif kind == "fifo":
-        path.unlink()
-        os.mkfifo(path)
+    elif kind in ("link", "folder_link", "device", "fifo"):
+        _replace_by_link(kind, run, path, victim, rng)
     elif kind == "enlarge":
         with path.open("r+b") as file:
             file.truncate(rng.choice([len(content) + 7, 300_000_000]))
-    elif kind == "flip" and content:
-        damaged = bytearray(content)
-        for _ in range(rng.randrange(1, 9)):
-            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
-        path.write_bytes(damaged)
+    elif kind == "flip":
+        path.write_bytes(_flip_bytes(content, rng))
     elif kind == "delete":
         path.unlink()
     elif kind == "edit":

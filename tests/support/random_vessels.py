@@ -182,23 +182,45 @@ def fly(
             )
             side = side + np.clip(turn - side, -0.5 * dt, 0.5 * dt)
             drive = drive + dt / 0.3 * (power - drive)
-            thrust = 1.4 * drive * np.abs(drive) - 0.4 * drive * u
-            if kind == "twin":
-                steer = 0.8 * drive * side
-            else:
-                flow = (1.0 - vessels.race) * u * np.abs(u) + vessels.race * drive * np.abs(drive)
-                steer = flow * np.sin(side)
-            du = vessels.surge * (thrust - u * np.abs(u)) + 0.6 * v * r + gusts[0]
-            du = du - vessels.brake * u * np.abs(u) * side**2
-            dv = -vessels.sway * np.abs(u) * v - vessels.cross * v * np.abs(v)
-            dv = dv - vessels.drift * u * r - vessels.rudder_sway * steer + gusts[1]
-            dr = -vessels.yaw * np.abs(u) * r - vessels.yaw_square * r * np.abs(r)
-            dr = dr - vessels.munk * u * v + vessels.rudder_yaw * steer + gusts[2]
+            du, dv, dr = accelerations(vessels, kind, (u, v, r), (side, drive), gusts)
             u, v, r = u + dt * du, v + dt * dv, r + dt * dr
             x = x + dt * (u * np.cos(psi) - v * np.sin(psi))
             y = y + dt * (u * np.sin(psi) + v * np.cos(psi))
             psi = psi + dt * r
     return out
+
+
+def accelerations(
+    vessels: Vessels,
+    kind: str,
+    velocities: tuple[np.ndarray, np.ndarray, np.ndarray],
+    actuators: tuple[np.ndarray, np.ndarray],
+    gusts: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the accelerations in surge, sway and yaw in units of length and speed, [B] each.
+
+    Args:
+        vessels: parameters of the vessels.
+        kind: `twin` for two propellers that steer by their difference, `boat` for a rudder.
+        velocities: u, v, r.
+        actuators: rudder angle or relative difference of the propellers, and thrust setting.
+        gusts: accelerations by gusts [3, B].
+    """
+    u, v, r = velocities
+    side, drive = actuators
+    thrust = 1.4 * drive * np.abs(drive) - 0.4 * drive * u
+    if kind == "twin":
+        steer = 0.8 * drive * side
+    else:
+        flow = (1.0 - vessels.race) * u * np.abs(u) + vessels.race * drive * np.abs(drive)
+        steer = flow * np.sin(side)
+    du = vessels.surge * (thrust - u * np.abs(u)) + 0.6 * v * r + gusts[0]
+    du = du - vessels.brake * u * np.abs(u) * side**2
+    dv = -vessels.sway * np.abs(u) * v - vessels.cross * v * np.abs(v)
+    dv = dv - vessels.drift * u * r - vessels.rudder_sway * steer + gusts[1]
+    dr = -vessels.yaw * np.abs(u) * r - vessels.yaw_square * r * np.abs(r)
+    dr = dr - vessels.munk * u * v + vessels.rudder_yaw * steer + gusts[2]
+    return du, dv, dr
 
 
 def log_of(

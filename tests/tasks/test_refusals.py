@@ -76,7 +76,10 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("'baseline={kind: linear_steady, speed: [spiral]}'", "linear_steady"),
         ("prepare.grid.step=0.2", "must equal data.step (0.1 s)"),
         ("current.baseline=bseline", "did you mean 'baseline'"),
-        ("current.baseline=held baselines.held.kind=still", "no regressors to tell a current by"),
+        (
+            "current.baseline=held baselines.held.kind=still",
+            "no regressors to estimate a current with",
+        ),
     ],
     "csv": [
         ("training.mlp.one_step.window=99.0", "no training log holds a window of 990 samples"),

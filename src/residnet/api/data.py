@@ -99,7 +99,6 @@ def read_logs(
         files = find_log_files(
             [file for source_entry in entries for file in _expand_glob(source_entry)]
         )
-        logs = dict[Path, Log]()
         settings: Any = None if reader is None else parse_part(reader, "reader")
         if channels is not None:
             settings = {
@@ -111,30 +110,37 @@ def read_logs(
                 },
                 "manoeuvre": manoeuvre,
             }
-        if settings is None:
-            for draft_result in read_mixed_formats(files):
-                for error in draft_result.errors.values():
-                    raise error
-                if {"channels", "parts"} & set(draft_result.reader):
-                    log_message(
-                        f"{next(iter(draft_result.logs))}: guessed channel map, please check"
-                    )
-                    content = {"data": {"reader": draft_result.reader}}
-                    for line in dump_commented_yaml(
-                        content, draft_result.draft_notes.comments_at
-                    ).splitlines():
-                        log_message(f"  {line}")
-                logs |= draft_result.logs
-        else:
-            configured_reader = validate_config(
-                to_builtin(settings), ReaderConfig, "read_logs"
-            ).build()
-            for number, file in enumerate(configured_reader.select_logs(files)):
-                report_progress("reading logs", number, len(files))
-                logs[file] = configured_reader.read(file)
-            report_progress("reading logs", len(files), len(files))
+        logs = _read_drafted_logs(files) if settings is None else _read_with(settings, files)
     names = assign_log_names(logs)
     return [logs[file].replace(name=names[file]) for file in files if file in logs]
+
+
+def _read_with(reader_settings: Any, files: Sequence[Path]) -> dict[Path, Log]:
+    """Read files with a reader that the caller describes; other files are skipped."""
+    reader = validate_config(to_builtin(reader_settings), ReaderConfig, "read_logs").build()
+    logs = dict[Path, Log]()
+    for number, file in enumerate(reader.select_logs(files)):
+        report_progress("reading logs", number, len(files))
+        logs[file] = reader.read(file)
+    report_progress("reading logs", len(files), len(files))
+    return logs
+
+
+def _read_drafted_logs(files: Sequence[Path]) -> dict[Path, Log]:
+    """Read files with drafted readers, and log each channel map that was guessed."""
+    logs = dict[Path, Log]()
+    for draft_result in read_mixed_formats(files):
+        for error in draft_result.errors.values():
+            raise error
+        # only these readers have a channel map; other formats describe their channels themselves
+        if {"channels", "parts"} & set(draft_result.reader):
+            log_message(f"{next(iter(draft_result.logs))}: guessed channel map, please check")
+            content = {"data": {"reader": draft_result.reader}}
+            yaml_text = dump_commented_yaml(content, draft_result.draft_notes.comments_at)
+            for line in yaml_text.splitlines():
+                log_message(f"  {line}")
+        logs |= draft_result.logs
+    return logs
 
 
 def _expand_glob(source_entry: Any) -> list[Path]:

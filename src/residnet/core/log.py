@@ -201,9 +201,6 @@ class Log:
             UsageError: if the file is missing or not a canonical log.
             DataError: if its metadata are damaged.
         """
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
         if not path.is_file():
             raise UsageError(f"{path}: no such file")
         if path.suffix.lower() != ".parquet":
@@ -211,58 +208,9 @@ class Log:
                 f"{path}: is not a log that residnet wrote (.parquet);"
                 " the task `import` turns others into such logs"
             )
-        try:
-            table = pq.read_table(path)
-        except UnicodeError as error:
-            raise DataError(
-                f"{path}: the name of a column is not UTF-8 text; rename the column in the program"
-                " that wrote it"
-            ) from error
-        except (pa.ArrowException, OSError) as error:
-            raise UsageError(
-                f"{path}: not a Parquet file ({str(error).splitlines()[0]})"
-            ) from error
-        try:
-            metadata = json.loads((table.schema.metadata or {}).get(b"residnet", b"{}"))
-        except (ValueError, RecursionError) as error:
-            raise DataError(f"{path}: damaged ({error}); write the file again") from error
-        if not isinstance(metadata, dict) or metadata.get("schema") != SCHEMA:
-            raise UsageError(
-                f"{path}: not a residnet log ({SCHEMA}); give a channel map to read a foreign table"
-            )
-        required = {key: metadata.get(key) for key in ("name", "manoeuvre", "units", "meta")}
-        meta = required["meta"] if isinstance(required["meta"], dict) else {}
-        stored = {**required, **{key: value for key, value in meta.items() if key in _FIELD_TYPES}}
-        damaged = [key for key, value in stored.items() if not isinstance(value, _FIELD_TYPES[key])]
-        if not damaged and not all(isinstance(unit, str) for unit in metadata["units"].values()):
-            damaged = ["units"]
-        for finding in meta.get("findings", ()) if not damaged else ():
-            is_valid_finding = isinstance(finding, dict) and isinstance(
-                finding.get("figures", {}), dict
-            )
-            if not is_valid_finding or not all(
-                isinstance(finding.get(field_name), str) for field_name in ("level", "code", "text")
-            ):
-                damaged = ["findings"]
-        if damaged:
-            raise DataError(
-                f"{path}: canonical log whose '{damaged[0]}' is missing or damaged; write the file"
-                " again"
-            )
-        columns: dict[str, np.ndarray] = {}
-        for name in table.column_names:
-            values = table.column(name).to_numpy()
-            if values.dtype.kind not in "fiub":
-                raise DataError(
-                    f"{path}: column '{name}' holds no numbers ({values.dtype}); the file is"
-                    " damaged, write it again"
-                )
-            if name in columns:
-                raise DataError(f"{path}: column '{name}' occurs twice; write the file again")
-            dtype = bool if name.startswith("mask:") else np.float64
-            columns[name] = np.asarray(values, dtype=dtype)
-        if "t" not in columns:
-            raise DataError(f"{path}: canonical log without a column 't'; write the file again")
+        table = _read_parquet(path)
+        metadata = _parse_metadata(path, table)
+        columns = _extract_columns(path, table)
         masks = {
             column_name.removeprefix("mask:"): column_values
             for column_name, column_values in columns.items()
@@ -282,3 +230,87 @@ class Log:
             masks,
             metadata["meta"],
         )
+
+
+def _read_parquet(path: Path) -> Any:
+    """Read a Parquet file as a table of pyarrow.
+
+    Raises:
+        UsageError: if it is no Parquet file.
+        DataError: if the name of a column is not UTF-8.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.read_table(path)
+    except UnicodeError as error:
+        raise DataError(
+            f"{path}: the name of a column is not UTF-8 text; rename the column in the program"
+            " that wrote it"
+        ) from error
+    except (pa.ArrowException, OSError) as error:
+        raise UsageError(f"{path}: not a Parquet file ({str(error).splitlines()[0]})") from error
+
+
+def _parse_metadata(path: Path, table: Any) -> dict[str, Any]:
+    """Return the validated metadata of a canonical log: name, manoeuvre, units and `meta`.
+
+    Raises:
+        UsageError: if the table is no canonical log.
+        DataError: if a field is missing or damaged.
+    """
+    try:
+        metadata = json.loads((table.schema.metadata or {}).get(b"residnet", b"{}"))
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: damaged ({error}); write the file again") from error
+    if not isinstance(metadata, dict) or metadata.get("schema") != SCHEMA:
+        raise UsageError(
+            f"{path}: not a residnet log ({SCHEMA}); give a channel map to read a foreign table"
+        )
+    required = {key: metadata.get(key) for key in ("name", "manoeuvre", "units", "meta")}
+    meta = required["meta"] if isinstance(required["meta"], dict) else {}
+    stored = {**required, **{key: value for key, value in meta.items() if key in _FIELD_TYPES}}
+    damaged = [key for key, value in stored.items() if not isinstance(value, _FIELD_TYPES[key])]
+    if not damaged and not all(isinstance(unit, str) for unit in metadata["units"].values()):
+        damaged = ["units"]
+    if not damaged and not all(map(_is_valid_finding, meta.get("findings", ()))):
+        damaged = ["findings"]
+    if damaged:
+        raise DataError(
+            f"{path}: canonical log whose '{damaged[0]}' is missing or damaged; write the file"
+            " again"
+        )
+    return metadata
+
+
+def _is_valid_finding(finding: Any) -> bool:
+    """Return whether an entry of `meta["findings"]` has the fields of `make_remark`."""
+    return (
+        isinstance(finding, dict)
+        and isinstance(finding.get("figures", {}), dict)
+        and all(isinstance(finding.get(key), str) for key in ("level", "code", "text"))
+    )
+
+
+def _extract_columns(path: Path, table: Any) -> dict[str, np.ndarray]:
+    """Return the columns of a canonical log: float64, masks as bool.
+
+    Raises:
+        DataError: if a column has no numbers or occurs twice, or the time is missing.
+    """
+    columns: dict[str, np.ndarray] = {}
+    for name in table.column_names:
+        values = table.column(name).to_numpy()
+        if values.dtype.kind not in "fiub":
+            raise DataError(
+                f"{path}: column '{name}' holds no numbers ({values.dtype}); the file is"
+                " damaged, write it again"
+            )
+        if name in columns:
+            raise DataError(f"{path}: column '{name}' occurs twice; write the file again")
+        dtype = bool if name.startswith("mask:") else np.float64
+        columns[name] = np.asarray(values, dtype=dtype)
+    if "t" not in columns:
+        raise DataError(f"{path}: canonical log without a column 't'; write the file again")
+    return columns

@@ -32,7 +32,7 @@ from residnet.engine.c_code import (
     write_literal,
 )
 from residnet.engine.rollout import Rollout
-from residnet.engine.trace import StepParts, split_step, to_scalar_function
+from residnet.engine.trace import RowProduct, StepParts, split_step, to_scalar_function
 
 _MAX_INSTRUCTIONS = 20_000
 """Most scalar operations of a step: a compiler takes minutes for more."""
@@ -366,27 +366,16 @@ def _write_source(
     def local(name: str) -> str:
         return f"REAL {name}[{sizes_by_name[name]} * LANES] __attribute__((aligned(BYTES)));"
 
-    def calls(function_name: str, start: str, suffix: str) -> Calls:
-        statements: dict[str, list[tuple[str, str]]] = {}
-        for k, product in products.items():
-            source = start.format(k)
-            target = suffix.format(k)
-            source = shared_slopes.get(source, source)
-            n_source = sizes_by_name[source] // product.n_repeats
-            n_target = sizes_by_name[target] // product.n_repeats
-            text = "".join(
-                f"{function_name}(tables + {table_offsets[k]}, {n_source}, {n_target},"
-                f" {source} + {r * n_source} * LANES,"
-                f" {target} + {r * n_target} * LANES);"
-                for r in range(product.n_repeats)
-            )
-            if product.activation:
-                value = "" if function_name == "times" else f"product_{k}, "
-                text = (
-                    f"{function_name}_{product.activation}({value}{source}, {target}, {n_source});"
-                )
-            statements.setdefault(source, []).append((target, text))
-        return statements
+    def calls(function_name: str, source_format: str, target_format: str) -> Calls:
+        return _write_product_calls(
+            products,
+            sizes_by_name,
+            table_offsets,
+            shared_slopes,
+            function_name,
+            source_format,
+            target_format,
+        )
 
     forward_storage = dict[str, slice]()
     backward_storage = dict[str, slice]()
@@ -467,6 +456,50 @@ def _write_source(
         forward_storage,
         backward_storage,
     )
+
+
+def _write_product_calls(
+    products: Mapping[int, RowProduct],
+    sizes: Mapping[str, int],
+    table_offsets: Sequence[int],
+    shared_slopes: Mapping[str, str],
+    function_name: str,
+    source_format: str,
+    target_format: str,
+) -> Calls:
+    """Write the calls of the loops over products, or over their transposes for a gradient.
+
+    Args:
+        products: the products of the step by number.
+        sizes: number of entries of each quantity.
+        table_offsets: offset of the matrix of each product in the table.
+        shared_slopes: quantity that stands for an equal cotangent.
+        function_name: `times`, or `back_times` for the vector-Jacobian product.
+        source_format: format of the name of the multiplied vector, with the number of the product.
+        target_format: format of the name of the result.
+
+    Returns:
+        For each source, the results that are computed once it is complete, with their statements.
+    """
+    statements: dict[str, list[tuple[str, str]]] = {}
+    for k, product in products.items():
+        source = source_format.format(k)
+        target = target_format.format(k)
+        source = shared_slopes.get(source, source)
+        n_source = sizes[source] // product.n_repeats
+        n_target = sizes[target] // product.n_repeats
+        text = "".join(
+            f"{function_name}(tables + {table_offsets[k]}, {n_source}, {n_target},"
+            f" {source} + {r * n_source} * LANES,"
+            f" {target} + {r * n_target} * LANES);"
+            for r in range(product.n_repeats)
+        )
+        if product.activation:
+            # the derivative of an activation is a function of its value
+            value = "" if function_name == "times" else f"product_{k}, "
+            text = f"{function_name}_{product.activation}({value}{source}, {target}, {n_source});"
+        statements.setdefault(source, []).append((target, text))
+    return statements
 
 
 _STEP_ARGUMENTS = ("x", "w", "s", "q", "own", "theta")

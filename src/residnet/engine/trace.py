@@ -244,9 +244,108 @@ def split_step(
     """
     graph = record_graph(step, [*(example for _, example in rows), *shared], what)
     _require_deterministic(graph, what)
+    shared_part = _extract_shared_part(graph, [example for _, example in rows], shared)
+    columns = [ca.MX.sym(name, example.shape[1]) for name, example in rows]
+    theta = ca.MX.sym(
+        "theta", sum(shared_part.tensors[k].numel() for k in shared_part.theta_indices)
+    )
+    values: dict[Node, Any] = {
+        placeholder: _TracedValue(example, column)
+        for placeholder, (_, example), column in zip(
+            _get_placeholders(graph), rows, columns, strict=False
+        )
+    }
+    values |= shared_part.bind_to(theta)
+    extraction = _ProductExtraction(shared_part)
+    outputs = _lower_graph(graph, values, what, extraction.replace_operation)
+    detached_columns = [column for _, column in extraction.detached]
+    results_columns = extraction.drop_unused_units(
+        [*extraction.factors, *outputs, *detached_columns]
+    )
+    n_products = len(extraction.products)
+    detached_names = [f"detached_{k}" for k in range(len(extraction.detached))]
+    argument_names = [
+        *(name for name, _ in rows),
+        "theta",
+        *(f"product_{k}" for k in range(n_products)),
+        *detached_names,
+    ]
+    result_names = [
+        *(f"factor_{k}" for k in range(n_products)),
+        *results,
+        *(f"{name}_value" for name in detached_names),
+    ]
+    detached_symbols = [symbol for symbol, _ in extraction.detached]
+    function = ca.Function(
+        "step",
+        [*columns, theta, *extraction.symbols, *detached_symbols],
+        results_columns,
+        argument_names,
+        result_names,
+    )
+    return StepParts(function, shared_part.prepare, shared_part.theta_indices, extraction.products)
+
+
+@dataclass(frozen=True)
+class _SharedPart:
+    """The part of a graph that depends on shared tensors alone.
+
+    Attributes:
+        nodes: nodes of this part.
+        boundary: those of them that other nodes use; `prepare` returns their values.
+        prepare: computes these values from the shared tensors.
+        tensors: the values at the examples.
+        theta_indices: indices in `boundary` of what is concatenated to `theta`: all but the
+            matrices of products, which are stored as tables.
+    """
+
+    nodes: Mapping[Node, None]
+    boundary: Sequence[Node]
+    prepare: GraphModule
+    tensors: Sequence[Tensor]
+    theta_indices: Sequence[int]
+
+    def matrix_of(self, node: Node) -> Node | None:
+        """Return the shared matrix that a node multiplies rows with; None for other nodes."""
+        return _find_shared_matrix(node, self.nodes)
+
+    def bind_to(self, theta: Any) -> dict[Node, Any]:
+        """Return the values of the shared nodes as entries of the CasADi symbol `theta`."""
+        # `prepare` computes the nodes inside this part; they have no value in a step
+        values: dict[Node, Any] = dict.fromkeys(self.nodes)
+        offset = 0
+        for k, (node, example) in enumerate(zip(self.boundary, self.tensors, strict=True)):
+            if k in self.theta_indices:
+                values[node] = _TracedValue(example, theta[offset : offset + example.numel()])
+                offset += example.numel()
+            else:
+                values[node] = _TracedValue(example)
+        return values
+
+
+def _find_shared_matrix(node: Node, shared_nodes: Mapping[Node, None]) -> Node | None:
+    """Return the shared matrix that a node multiplies rows with; None for other nodes."""
+    if node in shared_nodes or node.target not in _MATRIX_PRODUCTS or node.kwargs:
+        return None
+    a, b = node.args[-2:]
+    is_shared = isinstance(b, Node) and b in shared_nodes and a not in shared_nodes
+    return b if isinstance(b, Node) and is_shared and b.meta["size"] >= _MIN_MATRIX_SIZE else None
+
+
+def _extract_shared_part(
+    graph: Graph, row_examples: Sequence[Tensor], shared: Sequence[Tensor]
+) -> _SharedPart:
+    """Separate the nodes that depend on shared tensors alone from the nodes of a row.
+
+    Args:
+        graph: the recorded step; the size of each boundary node is added to its `meta`.
+        row_examples: examples of the arguments of a row, which come first in the graph.
+        shared: the shared tensors.
+    """
     placeholders = _get_placeholders(graph)
-    # nodes that depend on shared tensors alone, and nodes that depend on nothing
-    shared_nodes: dict[Node, None] = dict.fromkeys(placeholders[len(rows) :])
+    shared_placeholders = placeholders[len(row_examples) :]
+    shared_nodes: dict[Node, None] = dict.fromkeys(shared_placeholders)
+    # constants depend on nothing: they must not make a node of a row a shared one, or vice versa
     constant_nodes: dict[Node, None] = {}
     for node in graph.nodes:
         inputs = node.all_input_nodes
@@ -259,142 +358,127 @@ def split_step(
                 constant_nodes[node] = None
             elif all(source in shared_nodes or source in constant_nodes for source in inputs):
                 shared_nodes[node] = None
-
-    def shared_matrix_of(node: Node) -> Node | None:
-        """Return the shared matrix that a node multiplies rows with; None for other nodes."""
-        if node in shared_nodes or node.target not in _MATRIX_PRODUCTS or node.kwargs:
-            return None
-        a, b = node.args[-2:]
-        is_shared = isinstance(b, Node) and b in shared_nodes and a not in shared_nodes
-        return (
-            b if isinstance(b, Node) and is_shared and b.meta["size"] >= _MIN_MATRIX_SIZE else None
-        )
-
-    # shared nodes that other nodes use: these are what `prepare` returns
     boundary = [
         node for node in shared_nodes if any(user not in shared_nodes for user in node.users)
     ]
     constant_graph = _extract_subgraph(graph, placeholders, list(constant_nodes))
     with torch.no_grad():
-        constants = constant_graph(*(example for _, example in rows), *shared)
+        constants = constant_graph(*row_examples, *shared)
         prepare = _extract_subgraph(
             graph,
-            placeholders[len(rows) :],
+            shared_placeholders,
             boundary,
             dict(zip(constant_nodes, constants, strict=True)),
         )
-        prepared = prepare(*shared)
-    for node, example in zip(boundary, prepared, strict=True):
+        tensors = prepare(*shared)
+    for node, example in zip(boundary, tensors, strict=True):
         node.meta["size"] = example.numel()
-    # matrices of products are stored as tables; all other entries form `theta`
     theta_indices = [
         k
         for k, node in enumerate(boundary)
         if any(
-            user not in shared_nodes and shared_matrix_of(user) is not node for user in node.users
+            user not in shared_nodes and _find_shared_matrix(user, shared_nodes) is not node
+            for user in node.users
         )
     ]
-    columns = [ca.MX.sym(name, example.shape[1]) for name, example in rows]
-    theta = ca.MX.sym("theta", sum(prepared[k].numel() for k in theta_indices))
-    values: dict[Node, Any] = {
-        placeholder: _TracedValue(example, column)
-        for placeholder, (_, example), column in zip(placeholders, rows, columns, strict=False)
-    }
-    # `prepare` computes the shared nodes; they have no value here
-    values.update(dict.fromkeys(shared_nodes))
-    offset = 0
-    for k, (node, example) in enumerate(zip(boundary, prepared, strict=True)):
-        if k in theta_indices:
-            values[node] = _TracedValue(example, theta[offset : offset + example.numel()])
-            offset += example.numel()
-        else:
-            values[node] = _TracedValue(example)
-    symbols: list[Any] = []
-    factors: list[Any] = []
-    products: list[RowProduct] = []
-    detached: list[tuple[Any, Any]] = []
+    return _SharedPart(shared_nodes, boundary, prepare, tensors, theta_indices)
 
-    def replace_operation(node: Node, args: Any) -> _TracedValue | None:
-        if (shared_matrix := shared_matrix_of(node)) is not None:
-            bias, a, b = (None, *args) if len(args) == 2 else args
-            example = a.example @ b.example
-            (n_repeats, n_inputs) = a.example.shape[-2:]
-            n_outputs = b.example.shape[-1]
-            first = len(products)
-            count = b.example.numel() // (n_inputs * n_outputs)
-            for member in range(count):
-                product = RowProduct(
-                    n_repeats, n_inputs, n_outputs, boundary.index(shared_matrix), member
-                )
-                symbols.append(ca.MX.sym(f"product_{len(products)}", n_repeats * n_outputs))
-                factors.append(
-                    a.column[member * n_repeats * n_inputs : (member + 1) * n_repeats * n_inputs]
-                )
-                products.append(product)
-            value = _TracedValue(example, ca.vertcat(*symbols[first:]))
-            return (
-                value
-                if bias is None
-                else _lower_elementwise("add", example + bias.example, value, bias)
-            )
-        activation = _operation_name(node.target)
-        if (
-            activation in ACTIVATIONS
-            and not args[0].is_constant
-            and args[0].column.numel() >= _MIN_UNITS
-        ):
-            count = args[0].column.numel()
-            symbols.append(ca.MX.sym(f"product_{len(products)}", count))
-            factors.append(args[0].column)
-            products.append(RowProduct(1, count, count, activation=activation))
-            return _TracedValue(getattr(torch, activation)(args[0].example), symbols[-1])
+
+class _ProductExtraction:
+    """Collects matrix products, activations and detached values while a graph is lowered.
+
+    Each becomes a symbol, so that the remaining step is a small function of scalars.
+
+    Attributes:
+        symbols: symbols of the results of the products, in order of execution.
+        factors: columns that are multiplied, or that the activation is applied to.
+        products: shapes of the products.
+        detached: symbol and column of each detached value.
+    """
+
+    def __init__(self, shared_part: _SharedPart) -> None:
+        self._shared_part = shared_part
+        self.symbols: list[Any] = []
+        self.factors: list[Any] = []
+        self.products: list[RowProduct] = []
+        self.detached: list[tuple[Any, Any]] = []
+
+    def replace_operation(self, node: Node, args: Any) -> _TracedValue | None:
+        """Return the symbol that replaces the result of a node; None for other operations."""
+        if (matrix := self._shared_part.matrix_of(node)) is not None:
+            return self._replace_product(matrix, args)
         if node.target is torch.ops.aten.detach.default and not args[0].is_constant:
-            symbol = ca.MX.sym(f"detached_{len(detached)}", args[0].column.numel())
-            detached.append((symbol, args[0].column))
+            symbol = ca.MX.sym(f"detached_{len(self.detached)}", args[0].column.numel())
+            self.detached.append((symbol, args[0].column))
             return _TracedValue(args[0].example, symbol)
-        return None
+        activation = _operation_name(node.target)
+        if activation not in ACTIVATIONS or args[0].is_constant:
+            return None
+        n_units = args[0].column.numel()
+        if n_units < _MIN_UNITS:
+            return None
+        product = RowProduct(1, n_units, n_units, activation=activation)
+        symbol = self._append(product, args[0].column)
+        return _TracedValue(getattr(torch, activation)(args[0].example), symbol)
 
-    outputs = _lower_graph(graph, values, what, replace_operation)
-    results_columns = [*factors, *outputs, *(column for _, column in detached)]
-    for k, product in enumerate(list(products)):
-        if not product.activation:
-            continue
-        used_units = np.flatnonzero(
-            ca.which_depends(ca.veccat(*results_columns), symbols[k])
-        ).tolist()
-        if len(used_units) < product.n_inputs:
-            # networks evaluate more units than they use, for example all gates at once
-            reduced = ca.MX.sym(symbols[k].name(), len(used_units))
+    def _replace_product(self, matrix: Node, args: Any) -> _TracedValue:
+        """Return the symbol of a product of rows with a shared matrix, plus its bias."""
+        bias, a, b = (None, *args) if len(args) == 2 else args
+        example = a.example @ b.example
+        (n_repeats, n_inputs) = a.example.shape[-2:]
+        n_outputs = b.example.shape[-1]
+        matrix_index = self._shared_part.boundary.index(matrix)
+        # a batched product (bmm) has several matrices in one tensor
+        n_matrices = b.example.numel() // (n_inputs * n_outputs)
+        n_factors = n_repeats * n_inputs
+        symbols = [
+            self._append(
+                RowProduct(n_repeats, n_inputs, n_outputs, matrix_index, member),
+                a.column[member * n_factors : (member + 1) * n_factors],
+            )
+            for member in range(n_matrices)
+        ]
+        value = _TracedValue(example, ca.vertcat(*symbols))
+        if bias is None:
+            return value
+        return _lower_elementwise("add", example + bias.example, value, bias)
+
+    def _append(self, product: RowProduct, factor: Any) -> Any:
+        """Append a product and return the symbol of its result."""
+        symbol = ca.MX.sym(f"product_{len(self.products)}", product.n_repeats * product.n_outputs)
+        self.symbols.append(symbol)
+        self.factors.append(factor)
+        self.products.append(product)
+        return symbol
+
+    def drop_unused_units(self, columns: list[Any]) -> list[Any]:
+        """Remove the units of activations that no column depends on.
+
+        Networks evaluate more units than they use, for example all gates at once.
+
+        Args:
+            columns: all results of the step; the factors of the products come first.
+
+        Returns:
+            The columns as functions of the reduced symbols.
+        """
+        for k, product in enumerate(list(self.products)):
+            if not product.activation:
+                continue
+            is_used = ca.which_depends(ca.veccat(*columns), self.symbols[k])
+            used_units = np.flatnonzero(is_used).tolist()
+            if len(used_units) == product.n_inputs:
+                continue
+            reduced = ca.MX.sym(self.symbols[k].name(), len(used_units))
             expanded = ca.MX.zeros(product.n_inputs)
             expanded[used_units] = reduced
-            results_columns = ca.substitute(results_columns, [symbols[k]], [expanded])
-            results_columns[k] = results_columns[k][used_units]
-            symbols[k], products[k] = (
-                reduced,
-                RowProduct(1, len(used_units), len(used_units), activation=product.activation),
+            columns = ca.substitute(columns, [self.symbols[k]], [expanded])
+            columns[k] = columns[k][used_units]
+            self.symbols[k] = reduced
+            self.products[k] = RowProduct(
+                1, len(used_units), len(used_units), activation=product.activation
             )
-    names = [f"detached_{k}" for k in range(len(detached))]
-    return StepParts(
-        ca.Function(
-            "step",
-            [*columns, theta, *symbols, *(symbol for symbol, _ in detached)],
-            results_columns,
-            [
-                *(name for name, _ in rows),
-                "theta",
-                *(f"product_{k}" for k in range(len(products))),
-                *names,
-            ],
-            [
-                *(f"factor_{k}" for k in range(len(products))),
-                *results,
-                *(f"{name}_value" for name in names),
-            ],
-        ),
-        prepare,
-        theta_indices,
-        products,
-    )
+        return columns
 
 
 _MATRIX_PRODUCTS: Final = tuple(

@@ -166,39 +166,59 @@ def decode(content: bytes, pipelines: Sequence[Sequence[tuple[str, Any]]], width
     except (SafetensorError, KeyError, ValueError, RecursionError) as error:
         raise StateError(f"is not a stored pipeline ({error})") from None
 
-    def restore(value: Any, depth: int = 0) -> Any:
-        if depth > 8:
-            raise StateError("is nested too deeply")
-        if isinstance(value, list):
-            return [restore(part, depth + 1) for part in value]
-        if isinstance(value, dict):
-            if set(value) == {"array"} and value["array"] in arrays:
-                return arrays[value["array"]]
-            if set(value) == {"mapping"} and isinstance(value["mapping"], dict):
-                return {key: restore(part, depth + 1) for key, part in value["mapping"].items()}
-            raise StateError("refers to an array that is missing")
-        return value
-
     if not isinstance(index, list) or len(index) != len(pipelines):
         raise StateError(f"does not contain {len(pipelines)} pipelines")
     for stored, steps in zip(index, pipelines, strict=True):
         names = [part.get("class") if isinstance(part, dict) else None for part in stored]
         if names != [name for name, _ in steps]:
             raise StateError(f"contains {names}, expected {[name for name, _ in steps]}")
-        columns = width
+        n_columns = width
         for part, (name, estimator) in zip(stored, steps, strict=True):
-            state = part.get("state")
-            if not isinstance(state, dict):
-                raise StateError(f"{name} has no state")
-            try:
-                _fill(estimator, name, {key: restore(v) for key, v in state.items()}, columns)
-                columns = _width_after(estimator, columns)
-            except StateError as error:
-                raise StateError(f"{name} {error}") from None
-            except Exception as error:
-                # scikit-learn raises errors of many types on an inconsistent state
-                first_line = next(iter(str(error).splitlines()), "")
-                raise StateError(f"{name} cannot be restored ({first_line})") from None
+            n_columns = _restore_step(estimator, name, part.get("state"), arrays, n_columns)
+
+
+def _restore_step(
+    estimator: Any, name: str, state: Any, arrays: Mapping[str, np.ndarray], n_columns: int
+) -> int:
+    """Restore one step of a pipeline and return its number of output columns.
+
+    Raises:
+        StateError: with the name of the step, if the state does not match it.
+    """
+    if not isinstance(state, dict):
+        raise StateError(f"{name} has no state")
+    try:
+        values = {key: _insert_arrays(value, arrays) for key, value in state.items()}
+        _fill(estimator, name, values, n_columns)
+        return _width_after(estimator, n_columns)
+    except StateError as error:
+        raise StateError(f"{name} {error}") from None
+    except Exception as error:
+        # scikit-learn raises errors of many types on an inconsistent state
+        first_line = next(iter(str(error).splitlines()), "")
+        raise StateError(f"{name} cannot be restored ({first_line})") from None
+
+
+def _insert_arrays(value: Any, arrays: Mapping[str, np.ndarray], depth: int = 0) -> Any:
+    """Replace the references to arrays that `encode` wrote in a stored value.
+
+    Raises:
+        StateError: if a reference is unknown, or the value is nested more than eight levels.
+    """
+    # a file from a stranger must not exhaust the stack
+    if depth > 8:
+        raise StateError("is nested too deeply")
+    if isinstance(value, list):
+        return [_insert_arrays(part, arrays, depth + 1) for part in value]
+    if not isinstance(value, dict):
+        return value
+    if set(value) == {"array"} and value["array"] in arrays:
+        return arrays[value["array"]]
+    if set(value) == {"mapping"} and isinstance(value["mapping"], dict):
+        return {
+            key: _insert_arrays(part, arrays, depth + 1) for key, part in value["mapping"].items()
+        }
+    raise StateError("refers to an array that is missing")
 
 
 def _width_after(estimator: Any, columns: int) -> int:

@@ -55,24 +55,32 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
                 )
             if log.split != "train":
                 check_window_fits(log, settings)
-    all_logs = [log for logs in prepared.values() for log in logs]
+    _report_sources([log for logs in prepared.values() for log in logs])
+    return prepared
+
+
+def _report_sources(logs: Sequence[PreparedLog]) -> None:
+    """Log which channels were not measured, and where spikes were removed."""
     for key, source_text in (
         ("smoothed", "come from a smoother of the measured motion"),
-        ("integrated", "are integrated from the velocities: their errors are those of no place"),
+        (
+            "integrated",
+            "are integrated from the velocities: their errors are not errors of a measured"
+            " position",
+        ),
     ):
         derived_channel_texts = [
-            ", ".join(log.log.meta[key]) for log in all_logs if key in log.log.meta
+            ", ".join(log.log.meta[key]) for log in logs if key in log.log.meta
         ]
         for names in dict.fromkeys(derived_channel_texts):
             log_message(f"  {names} of {derived_channel_texts.count(names)} logs {source_text}")
-    for log in all_logs:
+    for log in logs:
         spike_counts = log.log.meta.get("spikes", {})
         if spike_counts:
             counts_text = ", ".join(f"{name} {count}" for name, count in spike_counts.items())
             log_message(
-                f"  {log.log.name}: spikes are bridged and left out (samples: {counts_text})"
+                f"  {log.log.name}: spikes are interpolated and masked (samples: {counts_text})"
             )
-    return prepared
 
 
 def mask_unexplained_idle(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
@@ -181,30 +181,43 @@ class FitSettings(ModelPartsConfig):
                 head.set_inertia(baseline.inertia_matrix())
             except ConfigError as error:
                 raise ValueError(f"heads.{part_name}: {error}") from None
+        self._check_ensemble_members(channel_names)
+        self._check_refits_and_current(channel_names)
+
+    def _check_ensemble_members(self, channel_names: Sequence[str]) -> None:
+        """Refuse heads that read an innovation as members of an ensemble.
+
+        The accelerations of the members are averaged at one common state in each step. The
+        innovation of a head compares this state to the one that its own model predicted.
+        """
         for ensemble, members in self.ensembles.items():
             for name in members:
-                if (
-                    name in self.heads
-                    and self.heads[name].build(channel_names).innovation_time_constant > 0.0
-                ):
+                if name not in self.heads:
+                    continue
+                head = self.heads[name].build(channel_names)
+                if head.innovation_time_constant > 0.0:
                     raise ValueError(
-                        f"ensembles.{ensemble}: '{name}' runs on states of its own, whose"
-                        " accelerations have no mean; name the ensemble under `means`"
+                        f"ensembles.{ensemble}: '{name}' reads the innovation of its own predicted"
+                        " velocities, so that its accelerations cannot be averaged with those of"
+                        " other models; list it under `means`, which averages trajectories"
                     )
+
+    def _check_refits_and_current(self, channel_names: Sequence[str]) -> None:
+        """Refuse a refit or an estimate of currents with a baseline that does not support it."""
+        baselines = self.all_baselines
         for name in self.refit:
-            if not isinstance(self.all_baselines[name].build(channel_names), ParametricBaseline):
+            if not isinstance(baselines[name].build(channel_names), ParametricBaseline):
                 raise ValueError(
                     f"refit.{name}: a refit through rollouts needs a baseline of kind 'regressors',"
                     " 'linear_steady', 'mmg', 'nomoto' or 'nomoto_sideslip'"
                 )
         if self.current is not None:
             name = self.current.baseline
-            baselines = self.all_baselines
             check_known_names("current.baseline", (name,), baselines, "baseline")
             if not isinstance(baselines[name].build(channel_names), RegressorBaseline):
                 raise ValueError(
-                    f"current.baseline: '{name}' has no regressors to tell a current by; name a"
-                    " baseline that has"
+                    f"current.baseline: '{name}' has no regressors to estimate a current with;"
+                    " name a baseline of kind 'regressors' or 'linear_steady'"
                 )
 
     @property

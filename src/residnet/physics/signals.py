@@ -68,6 +68,17 @@ class SignalsConfig(Config):
     def _validate_combination(self) -> SignalsConfig:
         for name in self.inputs:
             require_plain_name(name)
+        self._validate_exogenous()
+        if self.with_thrusters().forces is not None and len(self.inputs) != 2:
+            raise ValueError(
+                f"forces: expected the inputs of two thrusters, got {list(self.inputs)}"
+            )
+        self._validate_velocities()
+        self._validate_input_names()
+        return self
+
+    def _validate_exogenous(self) -> None:
+        """Refuse exogenous channels other than the speed and direction of the wind together."""
         for name in self.exogenous:
             if name not in WIND_INPUTS:
                 raise ValueError(
@@ -77,10 +88,9 @@ class SignalsConfig(Config):
             raise ValueError(
                 f"exogenous: expected both {' and '.join(WIND_INPUTS)}, got {list(self.exogenous)}"
             )
-        if self.with_thrusters().forces is not None and len(self.inputs) != 2:
-            raise ValueError(
-                f"forces: expected the inputs of two thrusters, got {list(self.inputs)}"
-            )
+
+    def _validate_velocities(self) -> None:
+        """Refuse sets of velocities that no model of this package has."""
         if self.dof.is_six_dof:
             vertical_plane = tuple(
                 name for name in VERTICAL_PLANE_VELOCITIES if name in self.velocities
@@ -95,19 +105,23 @@ class SignalsConfig(Config):
                     "velocities: a model in six degrees of freedom supports neither wind nor forces"
                     " of two thrusters; remove exogenous and forces"
                 )
-        elif list(self.velocities) != [
-            velocity for velocity in ROLL_LAYOUT.velocities if velocity in self.velocities
-        ]:
+            return
+        in_order = [name for name in ROLL_LAYOUT.velocities if name in self.velocities]
+        if list(self.velocities) != in_order:
             raise ValueError(
                 f"velocities: expected a subset of u, v, r, p in this order, got {self.velocities}"
             )
-        if not self.dof.is_six_dof and not set(self.velocities) & set(PLANAR_LAYOUT.velocities):
+        if not set(self.velocities) & set(PLANAR_LAYOUT.velocities):
             raise ValueError("velocities: expected at least one of u, v, r, got [p]")
+        # the wind relative to the vessel follows from heading and horizontal velocity
         if self.exogenous and self.dof.fixed_states:
             raise ValueError(
                 "exogenous: wind needs u, v, r and a heading; remove it, or give logs with all of"
                 " these"
             )
+
+    def _validate_input_names(self) -> None:
+        """Refuse inputs that occur twice or have the name of a computed channel."""
         duplicates = {
             name for name in self.inputs if name in self.exogenous or self.inputs.count(name) > 1
         }
@@ -127,10 +141,8 @@ class SignalsConfig(Config):
         if conflicting := [name for name in self.inputs if name in computed]:
             raise ValueError(
                 f"input '{conflicting[0]}' is a state or a computed channel of the model;"
-                " remove it"
-                " or rename it in the channel map"
+                " remove it or rename it in the channel map"
             )
-        return self
 
     @property
     def input_columns(self) -> tuple[str, ...]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -118,8 +118,6 @@ def render_matplotlib(
 def _draw_panel(
     axes: Any, figure: Figure, case: Case, number: int, handles: dict[str, Any]
 ) -> None:
-    from matplotlib.ticker import LogFormatter
-
     panel = figure.panels[number]
     for name in figure.panel_names(number):
         style = figure.styles[name]
@@ -134,39 +132,54 @@ def _draw_panel(
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.08)
         axes.locator_params(axis="x", nbins=6)
-    for direction, log, limits, names in (
-        ("x", panel.x_log, panel.x_limits, panel.x_names),
-        ("y", panel.y_log, panel.y_limits, panel.y_names),
-    ):
-        if log:
-            getattr(axes, f"set_{direction}scale")("log")
-            axis = axes.xaxis if direction == "x" else axes.yaxis
-            axis.set_major_formatter(LogFormatter())
-            axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.6)))
-        if names:
-            ticks = (
-                {"rotation": 60, "ha": "right", "fontsize": 7}
-                if direction == "x" and sum(map(len, names.values())) > 40
-                else {}
-            )
-            getattr(axes, f"set_{direction}ticks")(
-                [float(tick) for tick in names], list(names.values()), **ticks
-            )
-            axes.grid(visible=False, axis=direction)
-        if limits:
-            getattr(axes, f"set_{direction}lim")(*limits)
+    _format_axis(axes, "x", panel.x_log, panel.x_limits, panel.x_names)
+    _format_axis(axes, "y", panel.y_log, panel.y_limits, panel.y_names)
     if not panel.x_names and not panel.x_log and figure.has_integer_axis(number):
         axes.xaxis.get_major_locator().set_params(integer=True)
     for panel_number, x_position, y_position, text in case.texts:
         if panel_number == number:
+            # a text without a height is placed at the top of the panel
             is_at_top = not np.isfinite(y_position)
             axes.annotate(
-                text, (x_position, 1.0 if is_at_top else y_position), (0 if is_at_top else 3, 2),
-                fontsize=7.5, color="0.25",
-                xycoords=("data", "axes fraction") if is_at_top else "data", textcoords="offset"
-                                                                                        " points",
+                text,
+                (x_position, 1.0 if is_at_top else y_position),
+                (0 if is_at_top else 3, 2),
+                fontsize=7.5,
+                color="0.25",
+                xycoords=("data", "axes fraction") if is_at_top else "data",
+                textcoords="offset points",
                 ha="center" if is_at_top else "left",
-            )  # fmt: skip
+            )
+
+
+def _format_axis(
+    axes: Any,
+    direction: Literal["x", "y"],
+    is_logarithmic: bool,
+    limits: Sequence[float],
+    tick_names: Mapping[str, str],
+) -> None:
+    """Set the scale, the named ticks and the limits of one axis of a panel."""
+    from matplotlib.ticker import LogFormatter
+
+    if is_logarithmic:
+        getattr(axes, f"set_{direction}scale")("log")
+        axis = axes.xaxis if direction == "x" else axes.yaxis
+        axis.set_major_formatter(LogFormatter())
+        axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.6)))
+    if tick_names:
+        # long names overlap side by side
+        tick_style = (
+            {"rotation": 60, "ha": "right", "fontsize": 7}
+            if direction == "x" and sum(map(len, tick_names.values())) > 40
+            else {}
+        )
+        getattr(axes, f"set_{direction}ticks")(
+            [float(tick) for tick in tick_names], list(tick_names.values()), **tick_style
+        )
+        axes.grid(visible=False, axis=direction)
+    if limits:
+        getattr(axes, f"set_{direction}lim")(*limits)
 
 
 def _draw_curve(axes: Any, style: GlyphStyle, x: np.ndarray, y: np.ndarray) -> Any:

@@ -85,14 +85,7 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
     results = dict[Path, Log | ResidnetError]()
     channel_map_lines = list[str]()
     if configured_reader is None:
-        for draft in read_mixed_formats(files):
-            results |= {**draft.logs, **draft.errors}
-            if {"channels", "parts"} & set(draft.reader):
-                drafted_config = {"data": {"kind": "measured", "reader": draft.reader}}
-                channel_map_lines += ["channel map as guessed, to check and paste into a config:"]
-                channel_map_lines += dump_commented_yaml(
-                    drafted_config, draft.draft_notes.comments_at
-                ).splitlines()
+        results, channel_map_lines = _read_drafted_results(files)
     else:
         reader = configured_reader.build()
         for file in reader.select_logs(files):
@@ -140,6 +133,28 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
     return InspectionResult(
         "\n".join((*summarize_inspection(content).sentences, *lines, *channel_map_lines)), content
     )
+
+
+def _read_drafted_results(
+    files: Sequence[Path],
+) -> tuple[dict[Path, Log | ResidnetError], list[str]]:
+    """Read files with drafted readers.
+
+    Returns:
+        The log or the error of each file, and the guessed channel maps as lines of YAML.
+    """
+    results = dict[Path, Log | ResidnetError]()
+    channel_map_lines = list[str]()
+    for draft in read_mixed_formats(files):
+        results |= {**draft.logs, **draft.errors}
+        # only these readers have a channel map; other formats describe their channels themselves
+        if {"channels", "parts"} & set(draft.reader):
+            drafted_config = {"data": {"kind": "measured", "reader": draft.reader}}
+            channel_map_lines += ["channel map as guessed, to check and paste into a config:"]
+            channel_map_lines += dump_commented_yaml(
+                drafted_config, draft.draft_notes.comments_at
+            ).splitlines()
+    return results, channel_map_lines
 
 
 def _load_logs_task(config: Path) -> tuple[Any, FitConfig | None]:

@@ -10,6 +10,7 @@ import functools
 import math
 import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ from residnet.export.guard import GuardedDynamics
 from residnet.export.torchscript import trace_function
 from residnet.export.vessel import ExportedVessel
 from residnet.heads import HeadConfig
-from residnet.heads.base import ClosedFormHead, FeatureConfig
+from residnet.heads.base import ClosedFormHead, FeatureConfig, ResidualHead
 from residnet.heads.linear import RidgeConfig
 from residnet.heads.lstm import LstmConfig
 from residnet.io.readers.base import LogReader
@@ -276,141 +277,204 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
     subject = f"head {get_kind(type(config))}"
     # an example model with this head, fitted and stored below
     spec = make_example_spec(config, signals)
-    n_dynamic = signals.dof.n_dynamic
     _check_round_trip(config, HeadConfig, subject)
     fitted_model = make_example_model(spec)
     samples = make_example_samples(signals=signals).z
     # the checks change the precision of the copy
     model = copy.deepcopy(fitted_model)
-    head = model.head.eval()
-    # channel sequences [_N_ROWS, _N_STEPS, nz] of the example samples
     start_rows = torch.arange(_N_ROWS) * (len(samples) // _N_ROWS) + 30
     z = samples[start_rows[:, None] + torch.arange(_N_STEPS)[None]]
+    case = _HeadCase(subject, model.head.eval(), z, signals.dof.n_dynamic)
+    with torch.no_grad():
+        _check_single_steps(case)
+        max_inside = _check_sequences(case)
+        _check_traced_steps(case)
+        # tracing was in single precision
+        case.head.double()
+        _check_extrapolation(case, samples, max_inside)
+        _check_free_run(case, model)
+    _check_gradient(case)
+    _check_reported_values(case)
+    _check_storage(case, spec, fitted_model)
 
-    def zero_memory(n_rows: int, dtype: torch.dtype) -> Tensor:
-        return torch.zeros(n_rows, head.n_state, dtype=dtype)
 
-    def run_steps(module: Any, channel_steps: Tensor) -> tuple[Tensor, Tensor]:
-        s = zero_memory(len(channel_steps), channel_steps.dtype)
+@dataclass(frozen=True)
+class _HeadCase:
+    """A fitted head and the example channels of its checks.
+
+    Attributes:
+        subject: name of the head in messages.
+        head: the head in eval mode.
+        z: sequences of channels [_N_ROWS, _N_STEPS, nz].
+        n_dynamic: number of velocities of the model.
+    """
+
+    subject: str
+    head: ResidualHead
+    z: Tensor
+    n_dynamic: int
+
+    def zero_memory(self, n_rows: int, dtype: torch.dtype) -> Tensor:
+        """Return the memory without a past."""
+        return torch.zeros(n_rows, self.head.n_state, dtype=dtype)
+
+    def run_steps(self, module: Any, channel_steps: Tensor) -> tuple[Tensor, Tensor]:
+        """Call a head step by step; returns the residuals and the last memory."""
+        s = self.zero_memory(len(channel_steps), channel_steps.dtype)
         residuals = []
         for k in range(channel_steps.shape[1]):
             rho, s = module(channel_steps[:, k], s)
             residuals.append(rho)
         return torch.stack(residuals, dim=1), s
 
-    with torch.no_grad():
-        # shape, dtype and determinism of a step in both precisions
-        for dtype in (torch.float32, torch.float64):
-            first_channels = z[:, 0].to(dtype)
-            s = zero_memory(_N_ROWS, dtype)
-            (rho, next_memory), (repeated, _) = (
-                head.to(dtype)(first_channels, s) for _ in range(2)
-            )
-            shapes = {
-                "residual": (rho.shape, n_dynamic),
-                "memory": (next_memory.shape, head.n_state),
-            }
-            for name, (shape, n_columns) in shapes.items():
-                expected_shape = (
-                    f"[B, {n_dynamic}]" if name == "residual" else f"[B, n_state = {n_columns}]"
-                )
-                message = f"{subject}: the {name} has the shape {shape}, not {expected_shape}"
-                assert_true(shape == (_N_ROWS, n_columns), message)
-            assert_true(
-                rho.dtype == next_memory.dtype == dtype,
-                f"{subject}: returns {rho.dtype} and {next_memory.dtype} for inputs in {dtype}",
-            )
-            assert_finite(rho, f"{subject}: the residual at a training sample is not finite")
-            assert_true(float(rho.abs().max()) > 0, f"{subject}: the residual is zero everywhere")
-            message = (
-                f"{subject}: two calls with equal inputs differ; is dropout active in eval mode?"
-            )
-            assert_true(torch.equal(rho, repeated), message)
-        # sequences, warm-up and rows of a batch agree with single steps
-        residuals, memory = run_steps(head, z)
-        sequence_residuals = head.teacher_forced_residuals(z)
-        assert_close(sequence_residuals, residuals, 1e-9, f"{subject}: sequence differs from steps")
-        assert_close(
-            head.warmup(z), memory, 1e-9, f"{subject}: warmup differs from the steps' memory"
+
+def _check_single_steps(case: _HeadCase) -> None:
+    """Check shape, dtype and determinism of a step in both precisions."""
+    subject = case.subject
+    for dtype in (torch.float32, torch.float64):
+        first_channels = case.z[:, 0].to(dtype)
+        s = case.zero_memory(_N_ROWS, dtype)
+        (rho, next_memory), (repeated, _) = (
+            case.head.to(dtype)(first_channels, s) for _ in range(2)
         )
-        message = f"{subject}: the memory without a past is not zeros [B, {head.n_state}]"
-        assert_close(head.warmup(z[:, :0]), zero_memory(_N_ROWS, z.dtype), 0.0, message)
-        message = f"{subject}: the answer for a row depends on the other rows of the batch"
-        for i in range(_N_ROWS):
-            single_row = z[i : i + 1]
-            assert_close(
-                head.teacher_forced_residuals(single_row),
-                sequence_residuals[i : i + 1],
-                1e-9,
-                message,
+        shapes = {
+            "residual": (rho.shape, case.n_dynamic),
+            "memory": (next_memory.shape, case.head.n_state),
+        }
+        for name, (shape, n_columns) in shapes.items():
+            expected_shape = (
+                f"[B, {case.n_dynamic}]" if name == "residual" else f"[B, n_state = {n_columns}]"
             )
-            assert_close(run_steps(head, single_row)[0], residuals[i : i + 1], 1e-9, message)
-        # the traced head agrees with the module
-        single_precision = z.float()
-        rho, memory = run_steps(head.float(), single_precision)
-        examples = (single_precision[:, 0], zero_memory(_N_ROWS, torch.float32))
-        traced = head if head.export_error else _trace_module(head, examples, subject)
-        scripted_residuals, next_memory = run_steps(traced, single_precision)
-        assert_close(
-            scripted_residuals, rho, 1e-5, f"{subject}: the traced head gives other residuals"
+            message = f"{subject}: the {name} has the shape {shape}, not {expected_shape}"
+            assert_true(shape == (_N_ROWS, n_columns), message)
+        assert_true(
+            rho.dtype == next_memory.dtype == dtype,
+            f"{subject}: returns {rho.dtype} and {next_memory.dtype} for inputs in {dtype}",
         )
-        assert_close(
-            next_memory, memory, 1e-5, f"{subject}: the traced head returns another memory"
-        )
-        # extrapolation far outside the training range, and a free run
-        head.double()
-        far_channels, farther_channels = (
-            samples.mean(0) + std_multiple * samples.std(0) for std_multiple in (1e6, 1e9)
-        )
-        rho, memory = head(far_channels[None], zero_memory(1, z.dtype))
-        far_residual, _ = head(farther_channels[None], zero_memory(1, z.dtype))
-        far_sequence = head.teacher_forced_residuals(far_channels.expand(1, 200, -1))
-        x = torch.cat((torch.zeros_like(z[:, 0, :3]), z[:, 0, :n_dynamic]), dim=-1)
-        w = z[..., n_dynamic : n_dynamic + model.signals.n_inputs]
-        s = torch.rand(_N_ROWS, model.n_state).to(z)
-        rollout = Rollout(model.double())
-        model.has_position = False
-        states, _, memory = rollout(x, w, s)
-        for k in range(_N_STEPS):
-            x, s = model.step(x, w[:, k], s)
-        message = f"{subject}: a free run differs from its steps"
-        assert_close(states[:, -1], x, 1e-9, message)
-        assert_close(memory, s, 1e-9, f"{message}' memory")
+        assert_finite(rho, f"{subject}: the residual at a training sample is not finite")
+        assert_true(float(rho.abs().max()) > 0, f"{subject}: the residual is zero everywhere")
+        message = f"{subject}: two calls with equal inputs differ; is dropout active in eval mode?"
+        assert_true(torch.equal(rho, repeated), message)
+
+
+def _check_sequences(case: _HeadCase) -> float:
+    """Check that sequences, warm-up and rows of a batch agree with single steps.
+
+    Returns:
+        The largest residual at the training samples.
+    """
+    subject = case.subject
+    head = case.head
+    z = case.z
+    residuals, memory = case.run_steps(head, z)
+    sequence_residuals = head.teacher_forced_residuals(z)
+    assert_close(sequence_residuals, residuals, 1e-9, f"{subject}: sequence differs from steps")
+    assert_close(head.warmup(z), memory, 1e-9, f"{subject}: warmup differs from the steps' memory")
+    message = f"{subject}: the memory without a past is not zeros [B, {head.n_state}]"
+    assert_close(head.warmup(z[:, :0]), case.zero_memory(_N_ROWS, z.dtype), 0.0, message)
+    message = f"{subject}: the residual of a row depends on the other rows of the batch"
+    for i in range(_N_ROWS):
+        row = z[i : i + 1]
+        row_sequence_residuals = head.teacher_forced_residuals(row)
+        assert_close(row_sequence_residuals, sequence_residuals[i : i + 1], 1e-9, message)
+        assert_close(case.run_steps(head, row)[0], residuals[i : i + 1], 1e-9, message)
+    return float(sequence_residuals.abs().max())
+
+
+def _check_traced_steps(case: _HeadCase) -> None:
+    """Check that the traced head agrees with the module; the head is in float32 afterwards."""
+    subject = case.subject
+    z = case.z.float()
+    residuals, memory = case.run_steps(case.head.float(), z)
+    examples = (z[:, 0], case.zero_memory(_N_ROWS, torch.float32))
+    traced = case.head if case.head.export_error else _trace_module(case.head, examples, subject)
+    traced_residuals, traced_memory = case.run_steps(traced, z)
+    assert_close(
+        traced_residuals, residuals, 1e-5, f"{subject}: the traced head gives other residuals"
+    )
+    assert_close(traced_memory, memory, 1e-5, f"{subject}: the traced head returns another memory")
+
+
+def _check_extrapolation(case: _HeadCase, samples: Tensor, max_inside: float) -> None:
+    """Check that residuals and memory stay bounded far outside the training range.
+
+    Args:
+        case: the head.
+        samples: training samples of the channels [N, nz].
+        max_inside: largest residual at training samples.
+    """
+    subject = case.subject
+    head = case.head
+    far_channels, farther_channels = (
+        samples.mean(0) + std_multiple * samples.std(0) for std_multiple in (1e6, 1e9)
+    )
+    rho, memory = head(far_channels[None], case.zero_memory(1, samples.dtype))
+    far_residual, _ = head(farther_channels[None], case.zero_memory(1, samples.dtype))
+    far_sequence = head.teacher_forced_residuals(far_channels.expand(1, 200, -1))
     assert_finite(
         torch.cat((rho, far_residual)), f"{subject}: not finite far outside the training range"
     )
     assert_finite(memory, f"{subject}: its memory is not finite far outside the training range")
     assert_finite(far_sequence, f"{subject}: not finite after 200 steps outside the training range")
-    max_inside = float(sequence_residuals.abs().max())
     max_outside = float(far_sequence.abs().max())
+    # a linear head without clamped features would be larger by a factor of 1e6
     assert_true(
         max_outside < 50 * max_inside + 10,
         f"{subject}: diverges outside the training range ({max_outside:.3g}, inside"
         f" {max_inside:.3g}); clamp the features (residnet.heads.base.Features)",
     )
-    # gradients, and the values that losses and reports use
-    first_channels = z[:, 0].clone().requires_grad_()
-    head(first_channels, zero_memory(_N_ROWS, z.dtype))[0].sum().backward()
-    gradient = first_channels.grad
+
+
+def _check_free_run(case: _HeadCase, model: HybridDynamics) -> None:
+    """Check that a rollout agrees with single steps of the model."""
+    z = case.z
+    x = torch.cat((torch.zeros_like(z[:, 0, :3]), z[:, 0, : case.n_dynamic]), dim=-1)
+    w = z[..., case.n_dynamic : case.n_dynamic + model.signals.n_inputs]
+    s = torch.rand(_N_ROWS, model.n_state).to(z)
+    rollout = Rollout(model.double())
+    # the head reads no position; without one the rollout is shorter
+    model.has_position = False
+    states, _, memory = rollout(x, w, s)
+    for k in range(_N_STEPS):
+        x, s = model.step(x, w[:, k], s)
+    message = f"{case.subject}: a free run differs from its steps"
+    assert_close(states[:, -1], x, 1e-9, message)
+    assert_close(memory, s, 1e-9, f"{message}' memory")
+
+
+def _check_gradient(case: _HeadCase) -> None:
+    """Check that the residual has a finite, nonzero gradient with respect to the channels."""
+    subject = case.subject
+    channels = case.z[:, 0].clone().requires_grad_()
+    case.head(channels, case.zero_memory(_N_ROWS, channels.dtype))[0].sum().backward()
+    gradient = channels.grad
     assert_true(
         gradient is not None, f"{subject}: cannot be differentiated with respect to the channels"
     )
     assert gradient is not None
     assert_finite(gradient, f"{subject}: its gradient with respect to the channels is not finite")
     assert_true(float(gradient.abs().max()) > 0, f"{subject}: its gradient is zero everywhere")
-    parameter_counts = head.parameter_counts()
-    residual_std = head.residual_scale()
+
+
+def _check_reported_values(case: _HeadCase) -> None:
+    """Check the values that losses and reports read: numbers of parameters and scales."""
+    parameter_counts = case.head.parameter_counts()
+    residual_std = case.head.residual_scale()
     assert_true(
-        len(parameter_counts) == n_dynamic
-        and all(parameter_count >= 0 for parameter_count in parameter_counts),
-        f"{subject}: parameter_counts returns {parameter_counts}, expected {n_dynamic} numbers",
+        len(parameter_counts) == case.n_dynamic and all(count >= 0 for count in parameter_counts),
+        f"{case.subject}: parameter_counts returns {parameter_counts}, expected"
+        f" {case.n_dynamic} numbers",
     )
     assert_true(
-        residual_std.shape == (n_dynamic,) and bool((residual_std > 0).all()),
-        f"{subject}: residual_scale returns {residual_std.tolist()}, expected {n_dynamic} positive"
-        " numbers",
+        residual_std.shape == (case.n_dynamic,) and bool((residual_std > 0).all()),
+        f"{case.subject}: residual_scale returns {residual_std.tolist()}, expected"
+        f" {case.n_dynamic} positive numbers",
     )
-    # a stored model has the same state and results
+
+
+def _check_storage(case: _HeadCase, spec: ModelSpec, fitted_model: HybridDynamics) -> None:
+    """Check that a stored model has the same description, state and residuals."""
+    subject = case.subject
     with tempfile.TemporaryDirectory() as folder:
         save_model(Path(folder) / "example", spec, fitted_model)
         stored_spec, stored = load_model(Path(folder) / "example")
@@ -423,15 +487,11 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
         assert_true(is_unchanged, f"{subject}: '{name}' changes when the model is stored")
     with torch.no_grad():
         stored_residuals, fitted_residuals = (
-            evaluated_model.head.double().eval().teacher_forced_residuals(z)
+            evaluated_model.head.double().eval().teacher_forced_residuals(case.z)
             for evaluated_model in (stored, fitted_model)
         )
-    assert_close(
-        stored_residuals,
-        fitted_residuals,
-        0.0,
-        f"{subject}: the stored model gives other residuals",
-    )
+    message = f"{subject}: the stored model gives other residuals"
+    assert_close(stored_residuals, fitted_residuals, 0.0, message)
 
 
 def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> None:

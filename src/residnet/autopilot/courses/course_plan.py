@@ -232,71 +232,99 @@ def _find_course(
     If the courses of an outline violate a circle, the next outline has more clearance from it.
     """
     tried_outlines: set[tuple[object, ...]] = set()
-    radius = request.turns.min_radius
     extra_clearance = np.zeros(len(request.circles))
-
-    def first_valid_course(candidates: list[tuple[RouteProblem, RouteSolution]]) -> Course | None:
-        candidates.sort(key=lambda one: one[1].time)
-        for problem, solution in (
-            candidates
-            if turn_maker is None
-            else refine_turns(request.turns, candidates, turn_maker)
-        ):
-            if _passes_check(request, problem, solution, step, reasons):
-                return _sample_route(problem.route, solution.z, step, extension_length)
-            if solution.max_violation <= _DISTANCE_TOLERANCE * radius:
-                solution = problem.solve_with_hard_penalty(solution.z, _REPAIR_STEP)
-                if _passes_check(request, problem, solution, step, reasons):
-                    return _sample_route(problem.route, solution.z, step, extension_length)
-        return None
-
     for round_number, searches in enumerate(
         (_INITIAL_SEARCHES, *(_EXTENDED_SEARCHES,) * _MAX_CLEARANCE_ROUNDS)
     ):
         report_progress("planning", round_number, 1 + _MAX_CLEARANCE_ROUNDS)
-        candidates: list[tuple[RouteProblem, RouteSolution]] = []
         n_previous_reasons = len(reasons)
-        n_evaluations = 0
-        for room_share, radius_multiple, rings in searches:
-            if n_evaluations > _MAX_EVALUATIONS:
-                break
-            sketch = _search_outline(
-                request, extra_clearance, room_share, radius_multiple, RINGS[:rings]
-            )
-            for outline in () if sketch is None else _simplified_outlines(request, sketch):
-                if (outline_key := _outline_key(outline)) in tried_outlines:
-                    continue
-                tried_outlines.add(outline_key)
-                solutions = _solve_outline(request, outline)
-                valid = [
-                    candidate
-                    for candidate in solutions
-                    if _passes_check(request, *candidate, step, reasons)
-                ]
-                feasible = [
-                    candidate
-                    for candidate in solutions
-                    if candidate[1].max_violation <= _DISTANCE_TOLERANCE * radius
-                ]
-                if feasible and not valid:
-                    # what is passed out of its turn may be on the wrong side there
-                    problem, solution = min(feasible, key=lambda one: one[1].time)
-                    solution = problem.solve_with_hard_penalty(solution.z)
-                    valid = (
-                        [(problem, solution)]
-                        if _passes_check(request, problem, solution, step, reasons)
-                        else []
-                    )
-                candidates += valid
-                n_evaluations += sum(problem.n_evaluations for problem, _ in solutions)
-                if candidates:
-                    break
-        if (course := first_valid_course(candidates)) is not None:
-            return course
+        candidates = _solve_new_outlines(
+            request, searches, extra_clearance, tried_outlines, step, reasons
+        )
+        route = _first_valid_route(request, candidates, turn_maker, step, reasons)
+        if route is not None:
+            problem, solution = route
+            return _sample_route(problem.route, solution.z, step, extension_length)
         worst = min(reasons[n_previous_reasons:] or reasons, default=None)
         if worst is None:
             return None
-        extra_clearance[worst[1]] += _CLEARANCE_STEP * radius
+        extra_clearance[worst[1]] += _CLEARANCE_STEP * request.turns.min_radius
+    return None
+
+
+def _solve_new_outlines(
+    request: CourseRequest,
+    searches: Sequence[tuple[float, float, int]],
+    extra_clearance: Array,
+    tried_outlines: set[tuple[object, ...]],
+    step: float,
+    reasons: list[tuple[float, int, str]],
+) -> list[tuple[RouteProblem, RouteSolution]]:
+    """Return the valid routes of outlines that were not tried before, which are added to these.
+
+    Each search stops at its first outline with a valid route, and all of them at a limit of
+    evaluations.
+    """
+    candidates: list[tuple[RouteProblem, RouteSolution]] = []
+    n_evaluations = 0
+    for room_share, radius_multiple, rings in searches:
+        if n_evaluations > _MAX_EVALUATIONS:
+            break
+        sketch = _search_outline(
+            request, extra_clearance, room_share, radius_multiple, RINGS[:rings]
+        )
+        for outline in () if sketch is None else _simplified_outlines(request, sketch):
+            if (outline_key := _outline_key(outline)) in tried_outlines:
+                continue
+            tried_outlines.add(outline_key)
+            solutions = _solve_outline(request, outline)
+            candidates += _select_valid_routes(request, solutions, step, reasons)
+            n_evaluations += sum(problem.n_evaluations for problem, _ in solutions)
+            if candidates:
+                break
+    return candidates
+
+
+def _select_valid_routes(
+    request: CourseRequest,
+    solutions: Sequence[tuple[RouteProblem, RouteSolution]],
+    step: float,
+    reasons: list[tuple[float, int, str]],
+) -> list[tuple[RouteProblem, RouteSolution]]:
+    """Return the solutions that pass the check, after one repair if all feasible ones fail it."""
+    valid = [
+        candidate for candidate in solutions if _passes_check(request, *candidate, step, reasons)
+    ]
+    max_violation = _DISTANCE_TOLERANCE * request.turns.min_radius
+    feasible = [candidate for candidate in solutions if candidate[1].max_violation <= max_violation]
+    if valid or not feasible:
+        return valid
+    # the soft constraints hold the side of buoys that the route passes before or after their turn
+    problem, solution = min(feasible, key=lambda candidate: candidate[1].time)
+    solution = problem.solve_with_hard_penalty(solution.z)
+    return [(problem, solution)] if _passes_check(request, problem, solution, step, reasons) else []
+
+
+def _first_valid_route(
+    request: CourseRequest,
+    candidates: list[tuple[RouteProblem, RouteSolution]],
+    turn_maker: TurnMaker | None,
+    step: float,
+    reasons: list[tuple[float, int, str]],
+) -> tuple[RouteProblem, RouteSolution] | None:
+    """Return the quickest candidate that is valid with the turns of the vessel, or None."""
+    max_violation = _DISTANCE_TOLERANCE * request.turns.min_radius
+    candidates.sort(key=lambda candidate: candidate[1].time)
+    for problem, solution in (
+        candidates if turn_maker is None else refine_turns(request.turns, candidates, turn_maker)
+    ):
+        if _passes_check(request, problem, solution, step, reasons):
+            return problem, solution
+        if solution.max_violation <= max_violation:
+            # all hard constraints are met: a short move with harder penalties may be enough
+            repaired = problem.solve_with_hard_penalty(solution.z, _REPAIR_STEP)
+            if _passes_check(request, problem, repaired, step, reasons):
+                return problem, repaired
     return None
 
 

@@ -115,6 +115,22 @@ class RouteSolution(NamedTuple):
     worst_buoy: int
 
 
+class _TrialStep(NamedTuple):
+    """A step of the sequential linear program, before it is accepted or rejected.
+
+    Attributes:
+        z: route after the step.
+        linearized: problem linearised there.
+        gain: decrease of the merit function.
+        predicted_gain: its decrease in the linear program.
+    """
+
+    z: Array
+    linearized: LinearizedProblem
+    gain: float
+    predicted_gain: float
+
+
 class _NearestPoints(NamedTuple):
     """Points of closest approach of M parts of a route to one buoy each.
 
@@ -444,46 +460,64 @@ class RouteProblem:
         correction.
         """
         trust_radius = _TRUST_RADII[1]
-        (lower, upper) = self.bounds()
         self.refresh_constraints(z)
         linearized = self.linearize(z)
-
-        def evaluate_step(step: Array) -> tuple[Array, LinearizedProblem, float]:
-            candidate_z = np.clip(z + step, lower, upper)
-            candidate = self.linearize(candidate_z)
-            return candidate_z, candidate, linearized.merit_value() - candidate.merit_value()
-
         for iteration in range(1, _MAX_ITERATIONS + 1):
             if iteration % _ACTIVE_SET_INTERVAL == 0:
                 self.refresh_constraints(z)
                 linearized = self.linearize(z)
-            step_lower = np.maximum(lower - z, -trust_radius)
-            step_upper = np.minimum(upper - z, trust_radius)
-            if not self.is_heading_free:
-                step_lower[0] = step_upper[0] = 0.0
-            step, predicted_gain = linearized.solve_linear_program(step_lower, step_upper)
-            if predicted_gain < _MIN_PREDICTED_GAIN:
+            trial = self._make_trial_step(z, linearized, trust_radius)
+            if trial.predicted_gain < _MIN_PREDICTED_GAIN:
                 break
-            candidate_z, candidate, actual_gain = evaluate_step(step)
-            if actual_gain < _GAIN_RATIOS[0] * predicted_gain:
-                corrected = linearized._replace(
-                    constraints=candidate.constraints
-                    - linearized.constraint_jacobian @ (candidate_z - z)
-                )
-                corrected_step = evaluate_step(
-                    corrected.solve_linear_program(step_lower, step_upper)[0]
-                )
-                if corrected_step[2] > actual_gain:
-                    candidate_z, candidate, actual_gain = corrected_step
-            step_size = float(np.abs(candidate_z - z).max())
-            if actual_gain > _GAIN_RATIOS[0] * predicted_gain:
-                z = candidate_z
-                linearized = candidate
-            if actual_gain < _GAIN_RATIOS[1] * predicted_gain:
+            step_size = float(np.abs(trial.z - z).max())
+            if trial.gain > _GAIN_RATIOS[0] * trial.predicted_gain:
+                z = trial.z
+                linearized = trial.linearized
+            # the linearisation was too optimistic: shrink; it was accurate: grow
+            if trial.gain < _GAIN_RATIOS[1] * trial.predicted_gain:
                 trust_radius = 0.4 * min(trust_radius, step_size)
-            elif actual_gain > _GAIN_RATIOS[2] * predicted_gain:
+            elif trial.gain > _GAIN_RATIOS[2] * trial.predicted_gain:
                 trust_radius = min(2.0 * trust_radius, _TRUST_RADII[2])
             if trust_radius < _TRUST_RADII[0]:
                 break
         self.refresh_constraints(z)
         return z
+
+    def _make_trial_step(
+        self, z: Array, linearized: LinearizedProblem, trust_radius: float
+    ) -> _TrialStep:
+        """Solve the linear program around z, with one second-order correction if it gains little.
+
+        Args:
+            z: present route.
+            linearized: problem linearised at z.
+            trust_radius: largest change of an entry of z.
+        """
+        lower, upper = self.bounds()
+        step_lower = np.maximum(lower - z, -trust_radius)
+        step_upper = np.minimum(upper - z, trust_radius)
+        if not self.is_heading_free:
+            step_lower[0] = step_upper[0] = 0.0
+
+        def evaluate_step(step: Array) -> _TrialStep:
+            trial_z = np.clip(z + step, lower, upper)
+            trial = self.linearize(trial_z)
+            gain = linearized.merit_value() - trial.merit_value()
+            return _TrialStep(trial_z, trial, gain, predicted_gain)
+
+        step, predicted_gain = linearized.solve_linear_program(step_lower, step_upper)
+        if predicted_gain < _MIN_PREDICTED_GAIN:
+            return _TrialStep(z, linearized, 0.0, predicted_gain)
+        trial = evaluate_step(step)
+        if trial.gain < _GAIN_RATIOS[0] * predicted_gain:
+            # the constraints at the trial point contain the curvature that the first program lacks
+            corrected = linearized._replace(
+                constraints=trial.linearized.constraints
+                - linearized.constraint_jacobian @ (trial.z - z)
+            )
+            corrected_trial = evaluate_step(
+                corrected.solve_linear_program(step_lower, step_upper)[0]
+            )
+            if corrected_trial.gain > trial.gain:
+                return corrected_trial
+        return trial

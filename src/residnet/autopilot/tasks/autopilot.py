@@ -217,6 +217,22 @@ class AutopilotConfig(ComputingTask):
         self._validate_axis()
         if self.floor is not None and not isinstance(self.peers.get(self.floor), BangBangConfig):
             raise ValueError(f"floor: '{self.floor}' must name a peer of kind bang_bang")
+        self._validate_policies()
+        if self.conditions is None:
+            self._validate_without_conditions()
+            return self
+        if self.pace != 1.0 and self.predictive:
+            raise ValueError("pace: give the times of 'predictive' as the vessel needs them")
+        for name, conditions in self.conditions.all_conditions.items():
+            if conditions.dt != self.test.dt:
+                raise ValueError(
+                    f"conditions.{name}: dt must be that of test, {self.test.dt:g} s, got"
+                    f" {conditions.dt:g} s"
+                )
+        return self
+
+    def _validate_policies(self) -> None:
+        """Refuse policies without conditions, and initial controllers without an observer."""
         for name, policy in self.policies.items():
             if self.conditions is None:
                 raise ValueError(f"policies.{name}: give 'conditions' to train it under")
@@ -227,24 +243,16 @@ class AutopilotConfig(ComputingTask):
                     f"policies.{name}.start: '{policy.start}' must name a peer of kind ptos or"
                     " lqr_observer, or of kind depth with such a pitch"
                 )
-        if self.conditions is None:
-            for name, peer in self.peers.items():
-                if isinstance(peer, TunableConfig) and None in peer.parameter_values().values():
-                    raise ValueError(
-                        f"peers.{name}: give all constants, or 'conditions' to tune them under"
-                    )
-            if self.pace != 1.0:
-                raise ValueError("pace: give 'conditions', whose times have a pace")
-            return self
-        if self.pace != 1.0 and self.predictive:
-            raise ValueError("pace: give the times of 'predictive' as the vessel needs them")
-        for name, conditions in self.conditions.all_conditions.items():
-            if conditions.dt != self.test.dt:
+
+    def _validate_without_conditions(self) -> None:
+        """Refuse what needs evaluation conditions: tuned constants and a pace."""
+        for name, peer in self.peers.items():
+            if isinstance(peer, TunableConfig) and None in peer.parameter_values().values():
                 raise ValueError(
-                    f"conditions.{name}: dt must be that of test, {self.test.dt:g} s, given"
-                    f" {conditions.dt:g} s"
+                    f"peers.{name}: give all constants, or 'conditions' to tune them under"
                 )
-        return self
+        if self.pace != 1.0:
+            raise ValueError("pace: give 'conditions', whose times have a pace")
 
     def _validate_axis(self) -> None:
         is_depth = self.test.depth is not None

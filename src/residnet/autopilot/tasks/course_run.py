@@ -81,28 +81,7 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
                 f"buoy {circle['buoy']}: {circle['radius']:.4g} m cannot be followed; the smallest"
                 f" radius possible is {circle['smallest']:.2f} m"
             )
-    trained_policy = load_policy(autopilot_run, config.policy)
-    controller_adapter: TypeAdapter[AnyController] = TypeAdapter(AnyController)
-    policies: dict[str, Policy] = {}
-    for name in config.peers:
-        if name in autopilot_run.autopilot.predictive:
-            policies[name] = load_predictive_controller(
-                name,
-                autopilot_run.autopilot.predictive[name],
-                autopilot_run.steering,
-                autopilot_run.run,
-            )
-        else:
-            policies[name] = controller_adapter.validate_python(
-                autopilot_run.peer_notes[name]["config"]
-            ).build(autopilot_run.steering)
-    policies |= {
-        name: policy.build(autopilot_run.steering) for name, policy in config.others.items()
-    }
-    controllers = {
-        config.policy: trained_policy,
-        **{name: policy.double() for name, policy in policies.items()},
-    }
+    controllers = _load_controllers(config, autopilot_run)
     results = _CourseResults([], [], [])
     plans: list[pd.DataFrame] = []
     exports: dict[str, Callable[[], Path]] = {}
@@ -110,8 +89,7 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
         planned_course, guidance = plan_with_guidance(config, autopilot_run, protocol)
         log_message(
             f"{protocol}: planned {planned_course.course.length:.1f} m; the reference of arcs and"
-            " lines"
-            f" has {planned_course.reference_length:.1f} m"
+            f" lines has {planned_course.reference_length:.1f} m"
         )
         plans.append(tabulate_plan(planned_course))
         for name in controllers:
@@ -143,10 +121,44 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
         folder.write_table(
             folder.path / SPREAD_FILE, pd.concat(results.spread_tables, ignore_index=True)
         )
+    verdict, summary_metrics = _summarize_policy(config, results.rows)
+    return TaskOutcome(verdict, summary_metrics, tables_text(results.rows), exports=exports)
+
+
+def _load_controllers(config: CourseTaskConfig, autopilot_run: AutopilotRun) -> dict[str, Policy]:
+    """Return the trained policy, the peers of the autopilot run and other controllers by name."""
+    trained_policy = load_policy(autopilot_run, config.policy)
+    controller_adapter: TypeAdapter[AnyController] = TypeAdapter(AnyController)
+    policies: dict[str, Policy] = {}
+    for name in config.peers:
+        if name in autopilot_run.autopilot.predictive:
+            policies[name] = load_predictive_controller(
+                name,
+                autopilot_run.autopilot.predictive[name],
+                autopilot_run.steering,
+                autopilot_run.run,
+            )
+        else:
+            # the constants as the autopilot run tuned them
+            policies[name] = controller_adapter.validate_python(
+                autopilot_run.peer_notes[name]["config"]
+            ).build(autopilot_run.steering)
+    policies |= {
+        name: policy.build(autopilot_run.steering) for name, policy in config.others.items()
+    }
+    return {
+        config.policy: trained_policy,
+        **{name: policy.double() for name, policy in policies.items()},
+    }
+
+
+def _summarize_policy(
+    config: CourseTaskConfig, rows: list[dict[str, Any]]
+) -> tuple[list[str], dict[str, SummaryMetric]]:
+    """Return sentences and metrics of the policy on the nominal vessel along each plan."""
     verdict = []
     summary_metrics = dict[str, SummaryMetric]()
-    for result_row in results.rows:
-        # the policy on the nominal vessel along the plan
+    for result_row in rows:
         row_key = (result_row["model"], result_row["guidance"], result_row["split"])
         if row_key != (config.policy, "course", "simulated"):
             continue
@@ -160,11 +172,11 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
         verdict.append(
             f"{protocol}: '{config.policy}' needs {result_row['course_time']:.1f} s,"
             f" {result_row['ratio']:.3f} times the time of the reference, {passing_text}"
-            f" {len(config.course.buoys)} buoys as the protocol asks."
+            f" {len(config.course.buoys)} buoys as the protocol requires."
             if result_row["finished"]
-            else f"{protocol}: '{config.policy}' did not come to the end of the course."
+            else f"{protocol}: '{config.policy}' did not reach the end of the course."
         )
-    return TaskOutcome(verdict, summary_metrics, tables_text(results.rows), exports=exports)
+    return verdict, summary_metrics
 
 
 class AutopilotRun(NamedTuple):

@@ -105,7 +105,22 @@ def repair_clock(
         remarks = [make_remark("note", "clock_packed", text)]
         t = unpacked
         step = np.diff(t)
-    # counter overflow and daylight saving time
+    t = t + _estimate_jump_correction(t, step, clock_resolution, median_step, remarks)
+    return _spread_shared_stamps(t, columns, remarks), remarks
+
+
+def _estimate_jump_correction(
+    t: np.ndarray,
+    step: np.ndarray,
+    clock_resolution: float | None,
+    median_step: float,
+    remarks: list[Remark],
+) -> np.ndarray:
+    """Return the correction [T] in s for counter overflows and daylight saving time.
+
+    A jump is accepted if the step without it is at most `_MAX_WRAP_STEPS` median steps, so that
+    interruptions of the recording stay. A remark for each kind of jump is appended to `remarks`.
+    """
     wrap_lengths: dict[str, float] = {}
     if clock_resolution is None:
         wrap_lengths = {"one hour (end of daylight saving time)": 3600.0}
@@ -138,24 +153,33 @@ def repair_clock(
                 " saving time); the jump is removed"
             )
             remarks.append(make_remark("note", "clock_leaps", text, count=float(is_leap.sum())))
-    t = t + correction
-    # rows that share a stamp
+    return correction
+
+
+def _spread_shared_stamps(
+    t: np.ndarray, columns: Iterable[np.ndarray], remarks: list[Remark]
+) -> np.ndarray:
+    """Spread rows that share a time stamp evenly over the time to the next stamp.
+
+    Times are unchanged if stamps repeat only now and then, or if the rows are copies. A remark is
+    appended to `remarks` if rows were spread.
+    """
     repeated_rows = np.flatnonzero(np.diff(t) == 0.0) + 1
     if not repeated_rows.size:
-        return t, remarks
+        return t
     stamps, first_rows, counts = np.unique(t, return_index=True, return_counts=True)
     rows_per_stamp = int(np.median(counts))
     if stamps.size < 3 or rows_per_stamp < 2 or (np.diff(t) < 0.0).any():
-        return t, remarks
+        return t
     if repeats_previous_row(columns, repeated_rows).mean() > 0.5:
-        return t, remarks
+        return t
     stamp_step = float(np.median(np.diff(stamps)))
     # the last stamp has no successor; the first one may be incomplete, its rows are its last ones
     stamp_gaps = np.minimum(np.append(np.diff(stamps), stamp_step), 2.0 * stamp_step)
     position_in_stamp = np.arange(t.size) - np.repeat(first_rows, counts)
     rows_in_stamp = np.maximum(counts, rows_per_stamp)
     position_in_stamp[: counts[0]] += rows_in_stamp[0] - counts[0]
-    spread_times = t + position_in_stamp * np.repeat(stamp_gaps / rows_in_stamp, counts)
+    spread_times: np.ndarray = t + position_in_stamp * np.repeat(stamp_gaps / rows_in_stamp, counts)
     text = (
         f"about {rows_per_stamp} rows share each time stamp (a stamp every {stamp_step:.4g} s);"
         " they are spread evenly to the next stamp"
@@ -163,4 +187,4 @@ def repair_clock(
     remarks.append(
         make_remark("note", "coarse_stamps", text, rows=float(rows_per_stamp), step=stamp_step)
     )
-    return spread_times, remarks
+    return spread_times

@@ -10,6 +10,7 @@ import codecs
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
@@ -126,6 +127,31 @@ class TimeColumn(Config):
         return (self.column,) if self.date is None else (self.column, self.date)
 
 
+@dataclass
+class _ParsedTable:
+    """The numbers of a table before rows are selected and units converted.
+
+    Attributes:
+        t: times [T] in s, NaN in rows without a time.
+        start_ns: Unix time in ns that `t` counts from; None for a clock without dates.
+        raw: channel -> values [T] in the unit of its column, NaN for empty cells.
+        is_measured: whether a row has a value of any channel [T].
+        findings: remarks on the contents.
+        n_lines_above: lines above the values minus one header, to number rows in messages.
+        n_rows: number of rows in the file.
+        is_truncated: whether the file ends within a row, which is dropped.
+    """
+
+    t: np.ndarray
+    start_ns: int | None
+    raw: dict[str, np.ndarray]
+    is_measured: np.ndarray
+    findings: list[Remark]
+    n_lines_above: int
+    n_rows: int
+    is_truncated: bool
+
+
 class TableConfig(ConfiguredReader, ABC):
     """Base class of the readers of tables.
 
@@ -184,9 +210,51 @@ class TableConfig(ConfiguredReader, ABC):
         rows, and rows without a measurement at both ends, are dropped and counted. In other rows a
         channel without a measurement is NaN.
         """
-        import pandas as pd
-
         require_file(path)
+        channel_maps = self.channels
+        table = self._parse_table(path)
+        findings = table.findings
+        n_lines_above = table.n_lines_above
+        sample_rows = self._select_sample_rows(path, table)
+        clock_resolution = None if self.time.unit == DATE_UNIT else to_si(self.time.unit)
+        clock, new_findings = repair_clock(
+            table.t[sample_rows],
+            (_take_rows(values, sample_rows) for values in table.raw.values()),
+            clock_resolution,
+        )
+        findings += new_findings
+        require_increasing(
+            path, clock, lambda i: self._format_row(int(sample_rows[i]) + n_lines_above)
+        )
+        channels = self._convert_channels(path, table, sample_rows)
+        channels, new_findings = _to_local_plane(path, channels, channel_maps)
+        findings += new_findings
+        _add_yaw_of_quaternion(path, channels, channel_maps)
+        _add_angles_of_components(channels)
+        derived_units = {"x": "m", "y": "m"}
+        units = {
+            n: channel_maps[n].si_unit_of(n) if n in channel_maps else derived_units.get(n, "rad")
+            for n in channels
+        }
+        if table.is_truncated:
+            text = "the file ends within its last line, which is left out"
+            findings.append(make_remark("note", "cut_line", text))
+        meta = describe_provenance(path, table.n_rows, table.n_rows - sample_rows.size)
+        meta |= {"findings": findings} if findings else {}
+        if table.start_ns is not None:
+            first_epoch_ns = table.start_ns + int(np.rint(clock[0] * 1e9))
+            meta |= {"epoch": first_epoch_ns * 1e-9, "epoch_ns": first_epoch_ns}
+        manoeuvre = self.manoeuvre
+        manoeuvre = path.resolve().parent.name if manoeuvre == "folder" else manoeuvre
+        log = Log(path.stem, clock, channels, units, manoeuvre or "unknown", meta=meta)
+        return add_true_wind(log)
+
+    def _parse_table(self, path: Path) -> _ParsedTable:
+        """Load the configured columns and convert their cells to numbers.
+
+        Raises:
+            DataError: if a row has measurements but no time, or a cell cannot be parsed.
+        """
         time = self.time
         channel_maps = self.channels
         columns = [*time.columns, *(entry.column for entry in channel_maps.values())]
@@ -200,7 +268,7 @@ class TableConfig(ConfiguredReader, ABC):
         table.attrs = {}
         n_lines_above = attributes.get("n_lines_above", 0)
         is_truncated = bool(attributes.get("is_truncated"))
-        rows = len(table) + is_truncated
+        n_rows = len(table) + is_truncated
         cells = dict(
             zip([*columns, *hemisphere_columns], (cells for _, cells in table.items()), strict=True)
         )
@@ -209,10 +277,10 @@ class TableConfig(ConfiguredReader, ABC):
         raw = {name: self._parse_channel(path, name, cells, n_lines_above) for name in channel_maps}
         # free the table before the channels are copied
         del table, cells
-        measured = np.zeros(t.size, dtype=bool)
+        is_measured = np.zeros(t.size, dtype=bool)
         for values in raw.values():
-            measured |= np.isfinite(values)
-        undated_rows = np.flatnonzero(measured & ~np.isfinite(t))
+            is_measured |= np.isfinite(values)
+        undated_rows = np.flatnonzero(is_measured & ~np.isfinite(t))
         if undated_rows.size:
             raise DataError(
                 f"{path}: {self._format_row(undated_rows[0] + n_lines_above)} has measurements but"
@@ -222,26 +290,40 @@ class TableConfig(ConfiguredReader, ABC):
         for name, values in raw.items():
             raw[name], new_findings = self._mask_implausible(path, name, values, n_lines_above)
             findings += new_findings
-        first_and_last = np.flatnonzero(measured)[[0, -1]] if measured.any() else np.array([0, -1])
-        sample_rows = first_and_last[0] + np.flatnonzero(
-            np.isfinite(t[first_and_last[0] : first_and_last[1] + 1])
+        return _ParsedTable(
+            t, start_ns, raw, is_measured, findings, n_lines_above, n_rows, is_truncated
         )
+
+    def _select_sample_rows(self, path: Path, table: _ParsedTable) -> np.ndarray:
+        """Return the numbers of the rows that become samples, in order of time.
+
+        Channels with `hold` are filled in `table.raw`, and remarks are added to its findings.
+
+        Raises:
+            DataError: if there are too few rows.
+        """
+        import pandas as pd
+
+        raw = table.raw
+        is_measured = table.is_measured
+        ends = np.flatnonzero(is_measured)[[0, -1]] if is_measured.any() else np.array([0, -1])
+        is_timed = np.isfinite(table.t[ends[0] : ends[1] + 1])
+        sample_rows: np.ndarray = ends[0] + np.flatnonzero(is_timed)
         require_samples(path, sample_rows)
-        if (np.diff(t[sample_rows]) < 0.0).all():
+        if (np.diff(table.t[sample_rows]) < 0.0).all():
             sample_rows = sample_rows[::-1]
             text = "the rows are in reverse order of time; the order is corrected"
-            findings.append(make_remark("note", "newest_first", text))
-        raw_columns = [*raw.values()]
+            table.findings.append(make_remark("note", "newest_first", text))
         is_not_duplicate = find_unique_rows(
-            t[sample_rows], (_take_rows(values, sample_rows) for values in raw_columns)
+            table.t[sample_rows], (_take_rows(values, sample_rows) for values in raw.values())
         )
         if not is_not_duplicate.all():
             text = f"{int((~is_not_duplicate).sum())} rows repeat the previous row and are left out"
-            findings.append(
+            table.findings.append(
                 make_remark("note", "copied_rows", text, rows=float((~is_not_duplicate).sum()))
             )
             sample_rows = sample_rows[is_not_duplicate]
-        hold_names = [name for name in raw if channel_maps[name].hold]
+        hold_names = [name for name in raw if self.channels[name].hold]
         for name in hold_names:
             raw[name] = pd.Series(raw[name]).ffill().to_numpy()
         if hold_names and len(hold_names) < len(raw):
@@ -250,71 +332,30 @@ class TableConfig(ConfiguredReader, ABC):
                 values[sample_rows] for name, values in raw.items() if name not in hold_names
             ]
             sample_rows = sample_rows[np.isfinite(np.stack(measured_channels)).any(axis=0)]
-        clock_resolution = None if time.unit == DATE_UNIT else to_si(time.unit)
-        clock, new_findings = repair_clock(
-            t[sample_rows],
-            (_take_rows(values, sample_rows) for values in raw_columns),
-            clock_resolution,
-        )
-        findings += new_findings
-        del raw_columns, values
-        require_increasing(
-            path, clock, lambda i: self._format_row(int(sample_rows[i]) + n_lines_above)
-        )
+        return sample_rows
+
+    def _convert_channels(
+        self, path: Path, table: _ParsedTable, sample_rows: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Convert the sampled rows of each channel to SI units; `table.raw` is emptied.
+
+        Raises:
+            DataError: if a channel has no values.
+        """
         channels: dict[str, np.ndarray] = {}
-        for name in channel_maps:
-            raw_channel = _take_rows(raw.pop(name), sample_rows)
-            channels[name] = channel_maps[name].convert(name, raw_channel)
-            require_values(path, name, channel_maps[name].column, channels[name])
+        for name, channel_map in self.channels.items():
+            # the raw channel is removed, so that two copies of one channel exist at most
+            raw_channel = _take_rows(table.raw.pop(name), sample_rows)
+            channels[name] = channel_map.convert(name, raw_channel)
+            require_values(path, name, channel_map.column, channels[name])
             n_interpolated = int((np.isfinite(raw_channel) & ~np.isfinite(channels[name])).sum())
             if name == "psi" and n_interpolated:
                 text = (
                     f"{n_interpolated} headings were interpolated by the recorder from 359 deg"
                     " over 180 deg to 1 deg; they count as missing"
                 )
-                findings.append(make_remark("note", "heading_interpolated", text))
-        channels, new_findings = _to_local_plane(path, channels, channel_maps)
-        findings += new_findings
-        if channels.keys() >= {*QUATERNION} and "psi" not in channels:
-            # the frame of a quaternion is set at qw: in `enu` yaw is counter-clockwise from east
-            yaw = quaternion_yaw(
-                *normalize_quaternion(*(channels.pop(name) for name in QUATERNION))
-            )
-            if not np.isfinite(yaw).any():
-                columns = [channel_maps[name].column for name in QUATERNION]
-                raise DataError(
-                    f"{path}: {', '.join(columns)} contain no quaternion, all rows are empty;"
-                    " remove them from the channel map"
-                )
-            channels["psi"] = unwrap_angle(
-                np.pi / 2.0 - yaw if channel_maps["qw"].frame == "enu" else yaw
-            )
-        for name in [
-            cosine_name.removesuffix(COSINE_SUFFIX)
-            for cosine_name in channels
-            if cosine_name.endswith(COSINE_SUFFIX)
-        ]:
-            if name + SINE_SUFFIX in channels and name not in channels:
-                sine = channels.pop(name + SINE_SUFFIX)
-                cosine = channels.pop(name + COSINE_SUFFIX)
-                channels[name] = unwrap_angle(np.arctan2(sine, cosine))
-        derived_units = {"x": "m", "y": "m"}
-        units = {
-            n: channel_maps[n].si_unit_of(n) if n in channel_maps else derived_units.get(n, "rad")
-            for n in channels
-        }
-        if is_truncated:
-            text = "the file ends within its last line, which is left out"
-            findings.append(make_remark("note", "cut_line", text))
-        meta = describe_provenance(path, rows, rows - sample_rows.size)
-        meta |= {"findings": findings} if findings else {}
-        if start_ns is not None:
-            first_epoch_ns = start_ns + int(np.rint(clock[0] * 1e9))
-            meta |= {"epoch": first_epoch_ns * 1e-9, "epoch_ns": first_epoch_ns}
-        manoeuvre = self.manoeuvre
-        manoeuvre = path.resolve().parent.name if manoeuvre == "folder" else manoeuvre
-        log = Log(path.stem, clock, channels, units, manoeuvre or "unknown", meta=meta)
-        return add_true_wind(log)
+                table.findings.append(make_remark("note", "heading_interpolated", text))
+        return channels
 
     def _require_matching_units(self, path: Path, cell_units: Sequence[str]) -> None:
         """Raise `DataError` if cells contain another unit than the channel map declares.
@@ -556,6 +597,41 @@ def _take_rows(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return the values [T] at rows [K], without a copy if these are all rows in order."""
     is_identity = rows.size == values.size and rows[0] == 0
     return values if is_identity else np.asarray(values[rows])
+
+
+def _add_yaw_of_quaternion(
+    path: Path, channels: dict[str, np.ndarray], channel_maps: Mapping[str, ChannelMap]
+) -> None:
+    """Replace the four channels of a quaternion by the heading psi, unless psi is mapped.
+
+    Raises:
+        DataError: if no row has a quaternion.
+    """
+    if not channels.keys() >= {*QUATERNION} or "psi" in channels:
+        return
+    yaw = quaternion_yaw(*normalize_quaternion(*(channels.pop(name) for name in QUATERNION)))
+    if not np.isfinite(yaw).any():
+        columns = [channel_maps[name].column for name in QUATERNION]
+        raise DataError(
+            f"{path}: {', '.join(columns)} contain no quaternion, all rows are empty;"
+            " remove them from the channel map"
+        )
+    # the frame of a quaternion is set at qw: in `enu` yaw is counter-clockwise from east
+    channels["psi"] = unwrap_angle(np.pi / 2.0 - yaw if channel_maps["qw"].frame == "enu" else yaw)
+
+
+def _add_angles_of_components(channels: dict[str, np.ndarray]) -> None:
+    """Replace the cosine and sine of each angle by the angle, unless the angle is mapped."""
+    names = [
+        cosine_name.removesuffix(COSINE_SUFFIX)
+        for cosine_name in channels
+        if cosine_name.endswith(COSINE_SUFFIX)
+    ]
+    for name in names:
+        if name + SINE_SUFFIX in channels and name not in channels:
+            sine = channels.pop(name + SINE_SUFFIX)
+            cosine = channels.pop(name + COSINE_SUFFIX)
+            channels[name] = unwrap_angle(np.arctan2(sine, cosine))
 
 
 def _to_local_plane(

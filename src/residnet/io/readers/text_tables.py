@@ -456,6 +456,16 @@ def _is_value(cell: str) -> bool:
     return bool(_NUMBER.fullmatch(cell) or _TIME.match(cell) or _parse_trailing_unit(cell))
 
 
+def _iter_numbered_rows(stream: TextIO, delimiter: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the line number and the cells of each row of a text table."""
+    if delimiter == WHITESPACE_DELIMITER:
+        yield from enumerate((line.split() for line in stream), start=1)
+        return
+    reader = csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
+    for row in reader:
+        yield reader.line_num, [cell.strip() for cell in row]
+
+
 def _find_header_with_columns(
     path: Path, delimiter: str, file: Path, columns: Sequence[str]
 ) -> Header:
@@ -472,20 +482,12 @@ def _find_header_with_columns(
     """
     required_names = set(columns)
 
-    def iter_rows(stream: TextIO) -> Iterator[tuple[int, list[str]]]:
-        if delimiter == WHITESPACE_DELIMITER:
-            yield from enumerate((line.split() for line in stream), start=1)
-            return
-        reader = csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
-        for row in reader:
-            yield reader.line_num, [cell.strip() for cell in row]
-
     names: list[str] | None = None
     # line number, cells, and cells without the sign of a comment
     rows: list[tuple[int, list[str], list[str]]] = []
     with file.open(newline="", encoding="utf-8-sig") as stream:
         try:
-            for number, row in islice(iter_rows(stream), _HEADER_SEARCH_LINES):
+            for number, row in islice(_iter_numbered_rows(stream, delimiter), _HEADER_SEARCH_LINES):
                 uncommented_cells = _COMMENT_PREFIX.sub("", delimiter.join(row), count=1).split(
                     delimiter
                 )

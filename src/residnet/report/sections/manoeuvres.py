@@ -217,6 +217,28 @@ def index_tables(content: JsonObject) -> list[tuple[str, Table]]:
     ]
 
 
+def _limit_cell(
+    content: JsonObject, crafts: Mapping[str, Mapping[str, JsonObject]], name: str
+) -> Cell:
+    """Return the limit of an index, with a note whether all crafts meet it."""
+    limited_entries = [
+        craft_indices[name]
+        for craft_indices in crafts.values()
+        if "limit" in craft_indices.get(name, {})
+    ]
+    if not limited_entries:
+        return Cell("")
+    is_met = all(entry["kept"] for entry in limited_entries)
+    share_met = limited_entries[0].get("kept_share")
+    note = (
+        ("kept" if is_met else "exceeded")
+        if share_met is None
+        else f"kept by {100 * share_met:.0f} %"
+    )
+    limit_text = _format_index(content, name, limited_entries[0], "limit")[0]
+    return Cell(limit_text, note, "" if is_met else "bad")
+
+
 def _table_by_index(content: JsonObject, crafts: Mapping[str, Mapping[str, JsonObject]]) -> Table:
     """Return one row per index of a manoeuvre, with the second craft compared to the first.
 
@@ -242,27 +264,6 @@ def _table_by_index(content: JsonObject, crafts: Mapping[str, Mapping[str, JsonO
             content, name, {} if None in values else {"value": values[1] - values[0]}
         )[0]
 
-    def limit_cell(name: str) -> Cell:
-        limited_entries = [
-            craft_indices[name]
-            for craft_indices in crafts.values()
-            if "limit" in craft_indices.get(name, {})
-        ]
-        if not limited_entries:
-            return Cell("")
-        is_met = all(entry["kept"] for entry in limited_entries)
-        share_met = limited_entries[0].get("kept_share")
-        note = (
-            ("kept" if is_met else "exceeded")
-            if share_met is None
-            else f"kept by {100 * share_met:.0f} %"
-        )
-        return Cell(
-            _format_index(content, name, limited_entries[0], "limit")[0],
-            note,
-            "" if is_met else "bad",
-        )
-
     def interval_text(name: str) -> str:
         (craft_indices,) = crafts.values()
         return format_interval(
@@ -282,7 +283,7 @@ def _table_by_index(content: JsonObject, crafts: Mapping[str, Mapping[str, JsonO
     if float(content.get("scale", 1)) != 1:
         columns += [("ship", partial(format_value, craft, "ship"), str) for craft in crafts]
     if any("limit" in entry for entry in entries):
-        columns.append(("IMO limit", limit_cell))
+        columns.append(("IMO limit", partial(_limit_cell, content, crafts)))
     return build_table(
         dict.fromkeys(name for craft_indices in crafts.values() for name in craft_indices), columns
     )

@@ -247,8 +247,29 @@ def _build_tree_recording(
             f"{path}: has no vector {clock_description}; set time: {{column: ...}} (the file"
             f" contains {available})"
         )
+    fields, remarks = _assign_to_clocks(leaves, clocks, field_filter)
+    topics: dict[str, RawSeries] = {}
+    for group, (name, values) in clocks.items():
+        if field_filter(group or "/") and fields[group]:
+            try:
+                topics[group or "/"] = RawSeries("", fields[group], time.parse(values))
+            except DataError as error:
+                raise DataError(f"{path}: {name}: {error}") from error
+    unread_groups = [group or "/" for group in clocks if (group or "/") not in topics]
+    if not topics:
+        raise UsageError(
+            f"{path}: has none of the configured groups (it contains {', '.join(unread_groups)})"
+        )
+    return build_recording(path, topics, (path,), remarks, unread_groups)
+
+
+def _assign_to_clocks(
+    leaves: Mapping[str, _Vector],
+    clocks: Mapping[str, tuple[str, np.ndarray]],
+    field_filter: FieldFilter,
+) -> tuple[dict[str, dict[str, np.ndarray]], list[Remark]]:
+    """Return the accepted arrays by group of their time vector and name, and remarks."""
     fields: dict[str, dict[str, np.ndarray]] = {group: {} for group in clocks}
-    remarks: list[Remark] = []
     unassigned = []
     assigned_by_length = []
     for name, values in leaves.items():
@@ -267,6 +288,7 @@ def _build_tree_recording(
             fields[group] |= _split_matrix(relative_path, values, len(t))
             if not name.startswith(f"{group}/" if group else ""):
                 assigned_by_length.append(f"{name} by {clock}")
+    remarks = []
     for code, names, reason in (
         ("no_time", unassigned, "have no time vector ({}); left out"),
         (
@@ -279,19 +301,7 @@ def _build_tree_recording(
             name_list = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
             text = f"{len(names)} arrays {reason.format(name_list)}"
             remarks.append(make_remark("note", code, text, arrays=len(names)))
-    topics: dict[str, RawSeries] = {}
-    for group, (name, values) in clocks.items():
-        if field_filter(group or "/") and fields[group]:
-            try:
-                topics[group or "/"] = RawSeries("", fields[group], time.parse(values))
-            except DataError as error:
-                raise DataError(f"{path}: {name}: {error}") from error
-    unread_groups = [group or "/" for group in clocks if (group or "/") not in topics]
-    if not topics:
-        raise UsageError(
-            f"{path}: has none of the configured groups (it contains {', '.join(unread_groups)})"
-        )
-    return build_recording(path, topics, (path,), remarks, unread_groups)
+    return fields, remarks
 
 
 def _find_clocks(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, final
 
@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from residnet.core.errors import DataError
-from residnet.core.log import Level, Remark, make_remark
+from residnet.core.log import Remark, make_remark
 from residnet.core.names import truncate
 from residnet.io.header_vocabulary import ARRIVAL_COLUMN_NAMES, match_state_channel, parse_name
 from residnet.io.readers.base import (
@@ -318,14 +318,8 @@ def _parse_topic(
     Raises:
         DataError: if the column of arrival times has other cells.
     """
-    import pandas as pd
-
-    arrival = sender = header_stamps = None
+    arrival = header_stamps = None
     remarks: list[Remark] = []
-
-    def add_remark(level: Level, code: str, text: str, **figures: float) -> None:
-        remarks.append(make_remark(level, code, f"topic {name}: {text}", **figures))
-
     if clock_column is not None:
         try:
             arrival = parse_texts(columns[clock_column], unit=unit)
@@ -334,43 +328,16 @@ def _parse_topic(
                 raise
             columns = {column: cells.iloc[:-1] for column, cells in columns.items()}
             arrival = parse_texts(columns[clock_column], unit=unit)
-            add_remark("note", "cut_short", "the last row is incomplete; left out", rows=1.0)
-    numeric_columns: dict[str, np.ndarray] = {}
-    for column, cells in columns.items():
-        if column == clock_column:
-            continue
-        if pd.api.types.is_numeric_dtype(cells.dtype):
-            # int64 stamps in ns exceed the 53 bits of a float
-            numeric_columns[column] = cells.to_numpy(
-                dtype=None if cells.dtype.kind in "iu" else np.float64
-            )
-            continue
-        if _is_sender_column(column):
-            if sender is None:
-                # one string object per name instead of one per row
-                names = cells.fillna("").astype(str).astype("category")
-                sender = np.array(names.cat.categories, dtype=object)[names.cat.codes.to_numpy()]
-            continue
-        text_cells = cells.astype("string")
-        numeric_values = pd.to_numeric(text_cells, errors="coerce").to_numpy(
-            dtype=np.float64, na_value=np.nan
-        )
-        is_filled = cells.notna().to_numpy()
-        is_not_number = is_filled & np.isnan(numeric_values)
-        n_not_numbers = int(is_not_number.sum())
-        if 2 * n_not_numbers >= int(is_filled.sum()):
-            example = str(cells[is_not_number].iloc[0])
-            content_description = "structures" if example.startswith(("{", "[", "(")) else "text"
-            text = (
-                f"column '{column}' contains {content_description} ('{truncate(example, 40)}'), not"
-                " numbers; it is left out"
-            )
-            add_remark("note", "not_numbers", text, rows=float(len(cells)))
-            continue
-        numeric_columns[column] = numeric_values
-        if n_not_numbers:
-            text = f"column '{column}' has {n_not_numbers} cells that are not numbers; missing"
-            add_remark("will mislead", "not_numbers", text, cells=n_not_numbers)
+            text = f"topic {name}: the last row is incomplete; left out"
+            remarks.append(make_remark("note", "cut_short", text, rows=1.0))
+    value_columns = {column: cells for column, cells in columns.items() if column != clock_column}
+    sender = _parse_sender(value_columns)
+    numeric_columns = {}
+    for column, cells in value_columns.items():
+        numeric_values, column_remarks = _parse_numeric_column(name, column, cells)
+        remarks += column_remarks
+        if numeric_values is not None:
+            numeric_columns[column] = numeric_values
     if stamp_columns is not None and {*stamp_columns} <= numeric_columns.keys():
         seconds, nanoseconds = (numeric_columns[column] for column in stamp_columns)
         if np.isfinite(seconds).all() and np.isfinite(nanoseconds).all() and seconds.any():
@@ -385,6 +352,56 @@ def _parse_topic(
         for stamp_remark in () if stamps is None else stamps.remarks:
             remarks.append({**stamp_remark, "text": f"topic {name}: {stamp_remark['text']}"})
     return RawSeries("", _demultiplex(fields), header_stamps, arrival, sender, tuple(remarks))
+
+
+def _parse_sender(columns: Mapping[str, pd.Series]) -> np.ndarray | None:
+    """Return the sender of each row from the first column of frame names in text, or None."""
+    import pandas as pd
+
+    for column, cells in columns.items():
+        if _is_sender_column(column) and not pd.api.types.is_numeric_dtype(cells.dtype):
+            # one string object per name instead of one per row
+            names = cells.fillna("").astype(str).astype("category")
+            return np.array(names.cat.categories, dtype=object)[names.cat.codes.to_numpy()]
+    return None
+
+
+def _parse_numeric_column(
+    topic: str, column: str, cells: pd.Series
+) -> tuple[np.ndarray | None, list[Remark]]:
+    """Convert the cells of a column to numbers.
+
+    Returns:
+        The numbers [T], NaN for other cells; None if half of the cells or more are text, or if the
+        column contains senders. Remarks on cells that are not numbers.
+    """
+    import pandas as pd
+
+    if pd.api.types.is_numeric_dtype(cells.dtype):
+        # int64 stamps in ns exceed the 53 bits of a float
+        return cells.to_numpy(dtype=None if cells.dtype.kind in "iu" else np.float64), []
+    if _is_sender_column(column):
+        return None, []
+    numeric_values = pd.to_numeric(cells.astype("string"), errors="coerce").to_numpy(
+        dtype=np.float64, na_value=np.nan
+    )
+    is_filled = cells.notna().to_numpy()
+    is_not_number = is_filled & np.isnan(numeric_values)
+    n_not_numbers = int(is_not_number.sum())
+    if 2 * n_not_numbers >= int(is_filled.sum()):
+        example = str(cells[is_not_number].iloc[0])
+        content_description = "structures" if example.startswith(("{", "[", "(")) else "text"
+        text = (
+            f"topic {topic}: column '{column}' contains {content_description}"
+            f" ('{truncate(example, 40)}'), not numbers; it is left out"
+        )
+        return None, [make_remark("note", "not_numbers", text, rows=float(len(cells)))]
+    if not n_not_numbers:
+        return numeric_values, []
+    text = (
+        f"topic {topic}: column '{column}' has {n_not_numbers} cells that are not numbers; missing"
+    )
+    return numeric_values, [make_remark("will mislead", "not_numbers", text, cells=n_not_numbers)]
 
 
 def _demultiplex(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
