@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -633,6 +633,38 @@ def estimate_delays(
     return delays_by_input
 
 
+def _find_local_minima(sum_of_squares_by_shift: Mapping[int, float]) -> list[int]:
+    """Return the shifts of the local minima among the evaluated shifts, the lowest first."""
+    shifts = sorted(sum_of_squares_by_shift)
+    sums_of_squares = np.array([sum_of_squares_by_shift[shift] for shift in shifts])
+    padded = np.concatenate(([np.inf], sums_of_squares, [np.inf]))
+    minimum_indices = np.flatnonzero(
+        (sums_of_squares <= padded[:-2]) & (sums_of_squares <= padded[2:])
+    )
+    return [shifts[i] for i in minimum_indices[np.argsort(sums_of_squares[minimum_indices])]]
+
+
+def _fit_residuals(x: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the residuals of S least-squares fits.
+
+    Args:
+        x: regressors [S, K, n]; NaN where unknown.
+        target: target of all fits [K]; NaN where unknown.
+
+    Returns:
+        Residuals [S, K], zero in rows with unknown values, and whether a row is known [S, K].
+    """
+    is_finite = np.isfinite(x).all(axis=2) & np.isfinite(target)
+    regressors = np.where(is_finite[..., None], x, 0.0)
+    known_target = np.where(is_finite, target, 0.0)[..., None]
+    # columns of unit length make the small ridge relative; it keeps collinear terms solvable
+    regressors /= np.maximum(np.linalg.norm(regressors, axis=1, keepdims=True), 1e-300)
+    transposed = regressors.transpose(0, 2, 1)
+    gram = transposed @ regressors + 1e-9 * np.eye(regressors.shape[2])
+    solution = np.linalg.solve(gram, transposed @ known_target)
+    return (known_target - regressors @ solution)[..., 0], is_finite
+
+
 def estimate_delay(log: LogStatistics, names: Sequence[str], velocity: str) -> ResponseDelay | None:
     """Estimate the delay of inputs by the time shift with the smallest one-step residual.
 
@@ -705,29 +737,13 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], velocity: str) -> R
             x = np.concatenate(
                 (fixed_terms.repeat(shift_batch.size, axis=1), shifted_terms), axis=2
             ).transpose(1, 0, 2)
-            is_finite = np.isfinite(x).all(axis=2) & np.isfinite(velocity_changes)
-            regressors = np.where(is_finite[..., None], x, 0.0)
-            target = np.where(is_finite, velocity_changes, 0.0)[..., None]
-            regressors /= np.maximum(np.linalg.norm(regressors, axis=1, keepdims=True), 1e-300)
-            transposed = regressors.transpose(0, 2, 1)
-            gram = transposed @ regressors + 1e-9 * np.eye(regressors.shape[2])
-            residuals = (target - regressors @ np.linalg.solve(gram, transposed @ target))[..., 0]
+            residuals, is_finite = _fit_residuals(x, velocity_changes)
             squared_residuals_by_shift.update(
                 zip(shift_batch.tolist(), np.where(is_finite, residuals**2, np.nan), strict=True)
             )
             sum_of_squares_by_shift.update(
                 zip(shift_batch.tolist(), (residuals**2).sum(axis=1).tolist(), strict=True)
             )
-
-    def find_minima() -> list[int]:
-        """Return the shifts of the local minima evaluated so far, the lowest first."""
-        shifts = sorted(sum_of_squares_by_shift)
-        sums_of_squares = np.array([sum_of_squares_by_shift[shift] for shift in shifts])
-        padded = np.concatenate(([np.inf], sums_of_squares, [np.inf]))
-        minimum_indices = np.flatnonzero(
-            (sums_of_squares <= padded[:-2]) & (sums_of_squares <= padded[2:])
-        )
-        return [shifts[i] for i in minimum_indices[np.argsort(sums_of_squares[minimum_indices])]]
 
     evaluate_shifts(
         round(k * max_shift / _N_SHIFTS_PER_SIDE)
@@ -736,7 +752,7 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], velocity: str) -> R
     coarse_spacing = max(round(max_shift / _N_SHIFTS_PER_SIDE), 1)
     evaluate_shifts(
         min_shift + round(k * coarse_spacing / 6)
-        for min_shift in find_minima()[:_N_MINIMA]
+        for min_shift in _find_local_minima(sum_of_squares_by_shift)[:_N_MINIMA]
         for k in range(-6, 7)
     )
     # among equivalent minima the smallest causal shift counts: a periodic input, as in a zigzag,
@@ -744,7 +760,7 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], velocity: str) -> R
     min_sum_of_squares = max(min(sum_of_squares_by_shift.values()), 1e-300)
     equivalent_shifts = [
         shift
-        for shift in find_minima()
+        for shift in _find_local_minima(sum_of_squares_by_shift)
         if sum_of_squares_by_shift[shift] <= _MAX_EQUIVALENT_RATIO * min_sum_of_squares
     ]
     best_shift = min(

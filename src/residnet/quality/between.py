@@ -107,46 +107,85 @@ def check_copies(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     """Report rows that occur in two logs, or at two places of one log."""
     velocities = [name for name in VELOCITY_NAMES if name in logs]
     names = velocities if len(velocities) > 1 else sorted(logs.channels)
-    candidate_logs = [log.log for log in logs.logs]
-    if names and (sampling_interval := row_sampling_interval(candidate_logs)) > 1:
-        # for very many rows, a sample by hash value selects the logs that may share rows: equal
-        # rows have equal hashes, so all copies of a row are sampled or none
-        hashes_by_log = (hash_rows(log, names) for log in candidate_logs)
-        sampled_hashes = [
-            hashes[hashes % np.uint64(sampling_interval) == 0] for hashes in hashes_by_log
-        ]
-        rows, n_occurrences = np.unique(np.concatenate(sampled_hashes), return_counts=True)
-        shared_hashes = rows[(n_occurrences > 1) & (n_occurrences <= 2 * len(candidate_logs))]
-        may_share_rows = [
-            int(np.isin(hashes_of_log, shared_hashes).sum()) * sampling_interval >= _MIN_COPIED_ROWS
-            for hashes_of_log in sampled_hashes
-        ]
-        candidate_logs = list(itertools.compress(candidate_logs, may_share_rows))
+    candidate_logs = _preselect_logs([log.log for log in logs.logs], names)
     if not names or not candidate_logs:
         return
+    for (i, j, offset), shared_places in sorted(_find_shared_rows(candidate_logs, names).items()):
+        # the longest uninterrupted copy with this distance between the rows
+        is_shared = np.zeros(len(candidate_logs[i]) + 1, dtype=bool)
+        is_shared[shared_places] = True
+        starts, stops = find_runs(is_shared)
+        longest_segment = int(np.argmax(stops - starts))
+        n_copied = int(stops[longest_segment] - starts[longest_segment])
+        start = int(starts[longest_segment])
+        # equal consecutive rows are reported as frozen measurements
+        if n_copied < _MIN_COPIED_ROWS or (i == j and offset == 1):
+            continue
+        figures = {"rows": n_copied, "first": start, "offset": offset}
+        a = candidate_logs[i]
+        if i == j:
+            text = (
+                f"{a.name}: rows {start} to {start + n_copied - 1} are repeated from row"
+                f" {start + offset} on"
+            )
+            yield make_finding(text, figures, code="repeated_block", fix="delete one of the copies")
+        else:
+            yield _describe_copy(logs, a, candidate_logs[j], figures, make_finding)
+
+
+def _preselect_logs(logs: list[Log], names: Sequence[str]) -> list[Log]:
+    """Return the logs that may share rows with each other, by a sample if there are many rows.
+
+    The sample is drawn by hash value: equal rows have equal hashes, so that all copies of a row
+    are sampled or none.
+    """
+    if not names or (sampling_interval := row_sampling_interval(logs)) <= 1:
+        return logs
+    sampled_hashes = [
+        hashes[hashes % np.uint64(sampling_interval) == 0]
+        for hashes in (hash_rows(log, names) for log in logs)
+    ]
+    rows, n_occurrences = np.unique(np.concatenate(sampled_hashes), return_counts=True)
+    shared_hashes = rows[(n_occurrences > 1) & (n_occurrences <= 2 * len(logs))]
+    may_share_rows = [
+        int(np.isin(hashes_of_log, shared_hashes).sum()) * sampling_interval >= _MIN_COPIED_ROWS
+        for hashes_of_log in sampled_hashes
+    ]
+    return list(itertools.compress(logs, may_share_rows))
+
+
+def _find_shared_rows(
+    logs: Sequence[Log], names: Sequence[str]
+) -> dict[tuple[int, int, int], list[int]]:
+    """Return the rows with equal values by indices of both logs and difference of row numbers.
+
+    Args:
+        logs: at least one log.
+        names: channels that are compared.
+
+    Returns:
+        (i, j, offset) -> row numbers in log i, whose copies are `offset` rows later in log j.
+    """
     # each row is hashed independently, so all logs can be hashed in one call
-    if len(candidate_logs) == 1:
-        joined_log = candidate_logs[0]
+    if len(logs) == 1:
+        # concatenating would copy all channels of a long log
+        joined_log = logs[0]
     else:
         joined_log = Log(
             "together",
-            np.concatenate([log.t for log in candidate_logs]),
-            {name: np.concatenate([log[name] for log in candidate_logs]) for name in names},
-            candidate_logs[0].units,
+            np.concatenate([log.t for log in logs]),
+            {name: np.concatenate([log[name] for log in logs]) for name in names},
+            logs[0].units,
         )
-    hashes = np.split(
-        hash_rows(joined_log, names), np.cumsum([len(log) for log in candidate_logs])[:-1]
-    )
-    log_indices = np.repeat(
-        np.arange(len(candidate_logs)), [hashes_of_log.size for hashes_of_log in hashes]
-    )
+    hashes = np.split(hash_rows(joined_log, names), np.cumsum([len(log) for log in logs])[:-1])
+    log_indices = np.repeat(np.arange(len(logs)), [hashes_of_log.size for hashes_of_log in hashes])
     row_indices = np.concatenate([np.arange(hashes_of_log.size) for hashes_of_log in hashes])
     _, hash_indices, n_occurrences = np.unique(
         np.concatenate(hashes), return_inverse=True, return_counts=True
     )
     # rows with many occurrences belong to a vessel at rest
     shared_rows = np.flatnonzero(
-        (n_occurrences[hash_indices] > 1) & (n_occurrences[hash_indices] <= 2 * len(candidate_logs))
+        (n_occurrences[hash_indices] > 1) & (n_occurrences[hash_indices] <= 2 * len(logs))
     )
     shared_rows = shared_rows[np.argsort(hash_indices[shared_rows], kind="stable")]
     rows_by_pair: dict[tuple[int, int, int], list[int]] = {}
@@ -156,45 +195,41 @@ def check_copies(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
         for i, j in itertools.combinations(sorted(equal_rows), 2):
             key = int(log_indices[i]), int(log_indices[j]), int(row_indices[j] - row_indices[i])
             rows_by_pair.setdefault(key, []).append(int(row_indices[i]))
+    return rows_by_pair
+
+
+def _describe_copy(
+    logs: LogSet, a: Log, b: Log, figures: Mapping[str, float], make_finding: Check
+) -> Finding:
+    """Return the finding on rows of log `a` that occur in log `b`.
+
+    Args:
+        logs: all logs, with their splits.
+        a: log with the first copy.
+        b: log with the second copy.
+        figures: number of rows, number of the first one in `a`, and difference to that in `b`.
+        make_finding: constructor of the finding.
+    """
+    n_copied = int(figures["rows"])
     records = {log.name: log for log in logs.logs}
-    for (i, j, offset), shared_places in sorted(rows_by_pair.items()):
-        is_shared = np.zeros(len(candidate_logs[i]) + 1, dtype=bool)
-        is_shared[shared_places] = True
-        starts, stops = find_runs(is_shared)
-        longest_segment = int(np.argmax(stops - starts))
-        n_copied = int(stops[longest_segment] - starts[longest_segment])
-        start = int(starts[longest_segment])
-        if n_copied < _MIN_COPIED_ROWS or (i == j and offset == 1):
-            continue
-        figures = {"rows": n_copied, "first": start, "offset": offset}
-        a = candidate_logs[i]
-        b = candidate_logs[j]
-        if i == j:
-            text = (
-                f"{a.name}: rows {start} to {start + n_copied - 1} are repeated from row"
-                f" {start + offset} on"
-            )
-            yield make_finding(text, figures, code="repeated_block", fix="delete one of the copies")
-            continue
-        split_conflict = logs.split_conflict(records[a.name], records[b.name])
-        level: Level = "fatal" if split_conflict else "will mislead"
-        if logs.splits and not {a.name, b.name} <= logs.splits.keys():
-            # the config already excludes one of the logs
-            level = "note"
-        conflict_text = f" ({split_conflict})" if split_conflict else ""
-        if n_copied >= max(len(a), len(b)) - 1:
-            text = f"{a.name} and {b.name} are the same{conflict_text}"
-            fix = "exclude one of them"
-            yield make_finding(text, figures, code="duplicate_log", level=level, fix=fix)
-            continue
-        first_row = start + offset
-        if len(b) < len(a):
-            a, b, first_row = b, a, start
-        text = (
-            f"{a.name} is in {format_share(n_copied / len(a))} a copy of rows {first_row} to"
-            f" {first_row + n_copied - 1} of {b.name}{conflict_text}"
-        )
-        yield make_finding(text, figures, level=level)
+    split_conflict = logs.split_conflict(records[a.name], records[b.name])
+    level: Level = "fatal" if split_conflict else "will mislead"
+    if logs.splits and not {a.name, b.name} <= logs.splits.keys():
+        # the config already excludes one of the logs
+        level = "note"
+    conflict_text = f" ({split_conflict})" if split_conflict else ""
+    if n_copied >= max(len(a), len(b)) - 1:
+        text = f"{a.name} and {b.name} are the same{conflict_text}"
+        fix = "exclude one of them"
+        return make_finding(text, figures, code="duplicate_log", level=level, fix=fix)
+    first_row = int(figures["first"] + figures["offset"])
+    if len(b) < len(a):
+        a, b, first_row = b, a, int(figures["first"])
+    text = (
+        f"{a.name} is in {format_share(n_copied / len(a))} a copy of rows {first_row} to"
+        f" {first_row + n_copied - 1} of {b.name}{conflict_text}"
+    )
+    return make_finding(text, figures, level=level)
 
 
 _COMPARED_STATES = ("x", "y", "u", "v", "r")

@@ -803,8 +803,7 @@ def rank_hypotheses(consensus: Consensus, i: int) -> list[Hypothesis]:
     fleet = consensus.fleet
     fit = consensus.fit_inliers(excluding=i)
     log = fleet.logs[i]
-    data = fleet.data[i]
-    penalty = fit.compute_leverage_penalty(data)
+    penalty = fit.compute_leverage_penalty(fleet.data[i])
 
     def deviance(channels: Mapping[str, np.ndarray]) -> float:
         return fit.compute_deviance(fleet.assemble_scaled(replace_channels(log, channels)))
@@ -820,80 +819,25 @@ def rank_hypotheses(consensus: Consensus, i: int) -> list[Hypothesis]:
         (*single_channels, *linked_channels, *([derived] if derived else []))
     ):
         name = channels[0]
-        is_input = name in fleet.actuators
-        label = " and ".join(channels)
-        unit = log.units[name]
-        if channels == derived:
-            label = "x, y"
-            unit = "m"
-        std = float(np.nanmedian([fleet.logs[j].std(name) for j in consensus.inliers])) or 1.0
-        if channels == (name,) and is_input and is_constant(fleet, i, name):
-            value = _deviance_with_free_input(consensus, fit, i, name, 0.01 * std) + penalty
+        if len(channels) == 1 and name in fleet.actuators and is_constant(fleet, i, name):
+            step = 0.01 * _typical_std(consensus, name)
+            value = _deviance_with_free_input(consensus, fit, i, name, step) + penalty
             text = f"the record of {name} is dead: it is constant while the vessel responds to it"
             hypotheses.append(Hypothesis("dead", name, 0.0, value, text))
-            continue
-        grids: dict[str, list[float]] = {
-            "scale": [1.0 / factor for factor in unit_confusions(unit)]
-        }
-        if channels != derived:
-            grids["sign"] = [-1.0]
-        if is_input:
-            grids["scale"] += SCALE_FACTORS
-            grids["late"] = [shift * fleet.block_seconds for shift in SHIFTS]
-            grids["offset"] = [shift * std for shift in SHIFTS]
-        for kind, grid in grids.items():
-            if not grid:
-                continue
-
-            def objective(
-                size: float, kind: str = kind, channels: Sequence[str] = channels
-            ) -> float:
-                value = deviance({n: _change_channel(kind, log[n], log.t, size) for n in channels})
-                # a scaled response has another density
-                jacobian = 0.0 if channels[0] in fleet.actuators else math.log(abs(size))
-                return value - 2.0 * len(channels) * jacobian
-
-            size, value = _minimize(objective, grid, 8 if is_input and kind != "sign" else 0)
-            text = f"{label} would have to {_CHANGES[kind](size, unit)}"
-            hypotheses.append(Hypothesis(kind, name, size, value, text))
+        else:
+            hypotheses += _rank_channel_changes(
+                consensus, log, channels, deviance, is_derived=channels == derived
+            )
     for port, stbd in port_starboard_pairs(fleet.actuators).items():
         value = deviance({port: log[stbd], stbd: log[port]})
         text = f"{port} and {stbd} would have to be exchanged"
         hypotheses.append(Hypothesis("exchanged", port, 0.0, value, text))
     if {"u", "v"} <= set(fleet.velocities):
-        velocity = log["u"] + 1j * log["v"]
-
-        def deviance_if_turned(angle: float) -> float:
-            rotated = velocity * np.exp(1j * angle)
-            return deviance({"u": rotated.real, "v": rotated.imag})
-
-        angles = [HEADING_STEP * k for k in range(-17, 19) if k]
-        angle, value = _minimize(deviance_if_turned, angles, 12)
-        text = (
-            f"psi would have to be {'larger' if angle < 0.0 else 'smaller'} by"
-            f" {abs(math.degrees(angle)):.3g} deg, or u and v turned by as much"
-        )
-        hypotheses.append(Hypothesis("heading", "psi", angle, value, text))
-        if "psi" in log:
-            to_body = np.exp(-1j * log["psi"])
-
-            def deviance_in_current(current: complex) -> float:
-                water = velocity - current * to_body
-                return deviance({"u": water.real, "v": water.imag})
-
-            usual = float(np.nanmedian([fleet.logs[j].rms_speed for j in consensus.inliers]))
-            current, value = _minimize_in_plane(deviance_in_current, usual)
-            if abs(current) >= 0.05 * usual:
-                towards = math.degrees(math.atan2(current.imag, current.real)) % 360.0
-                text = (
-                    f"it ran in a current of {abs(current):.2g} m/s towards {towards:.0f} deg, and"
-                    " u and v are over ground"
-                )
-                hypotheses.append(Hypothesis("current", "", abs(current), value, text))
+        hypotheses += _rank_velocity_changes(consensus, log, deviance)
     value = MANY_PARAMETERS_PENALTY * _deviance_with_free_factors(fleet, fit, i) + penalty
     text = (
         "it is another vessel or another loading, or something acted that was not recorded: no"
-        " single_channels change of a channel explains it"
+        " change of a single channel explains it"
     )
     hypotheses.append(Hypothesis("vessel", "", 0.0, value, text))
     # a hypothesis under which the log is still unlikely explains nothing
@@ -901,8 +845,102 @@ def rank_hypotheses(consensus: Consensus, i: int) -> list[Hypothesis]:
     return sorted(hypotheses, key=lambda h: (h.kind != "vessel" and h.deviance > worst, h.deviance))
 
 
+def _typical_std(consensus: Consensus, name: str) -> float:
+    """Return the median standard deviation of a channel over the inliers; 1 if it is zero."""
+    stds = [consensus.fleet.logs[j].std(name) for j in consensus.inliers]
+    return float(np.nanmedian(stds)) or 1.0
+
+
+def _rank_channel_changes(
+    consensus: Consensus,
+    log: LogStatistics,
+    channels: tuple[str, ...],
+    deviance: Callable[[Mapping[str, np.ndarray]], float],
+    *,
+    is_derived: bool,
+) -> list[Hypothesis]:
+    """Return the most likely scale, sign, delay and offset of channels that change together.
+
+    Args:
+        consensus: inliers and outliers of the fleet.
+        log: the outlier.
+        channels: channels with one common fault.
+        deviance: deviance of the outlier with some channels replaced.
+        is_derived: whether the channels are velocities derived from the position.
+    """
+    fleet = consensus.fleet
+    name = channels[0]
+    is_input = name in fleet.actuators
+    label = "x, y" if is_derived else " and ".join(channels)
+    unit = "m" if is_derived else log.units[name]
+    std = _typical_std(consensus, name)
+    grids: dict[str, list[float]] = {"scale": [1.0 / factor for factor in unit_confusions(unit)]}
+    if not is_derived:
+        grids["sign"] = [-1.0]
+    if is_input:
+        grids["scale"] += SCALE_FACTORS
+        grids["late"] = [shift * fleet.block_seconds for shift in SHIFTS]
+        grids["offset"] = [shift * std for shift in SHIFTS]
+    hypotheses = []
+    for kind, grid in grids.items():
+        if not grid:
+            continue
+
+        def objective(size: float, kind: str = kind) -> float:
+            value = deviance({n: _change_channel(kind, log[n], log.t, size) for n in channels})
+            # the density of a scaled response has the Jacobian of the scaling as a factor
+            log_jacobian = 0.0 if is_input else math.log(abs(size))
+            return value - 2.0 * len(channels) * log_jacobian
+
+        size, value = _minimize(objective, grid, 8 if is_input and kind != "sign" else 0)
+        text = f"{label} would have to {_CHANGES[kind](size, unit)}"
+        hypotheses.append(Hypothesis(kind, name, size, value, text))
+    return hypotheses
+
+
+def _rank_velocity_changes(
+    consensus: Consensus,
+    log: LogStatistics,
+    deviance: Callable[[Mapping[str, np.ndarray]], float],
+) -> list[Hypothesis]:
+    """Return the most likely error of the heading, and current, that change both u and v."""
+    velocity = log["u"] + 1j * log["v"]
+
+    def deviance_if_turned(angle: float) -> float:
+        rotated = velocity * np.exp(1j * angle)
+        return deviance({"u": rotated.real, "v": rotated.imag})
+
+    angles = [HEADING_STEP * k for k in range(-17, 19) if k]
+    angle, value = _minimize(deviance_if_turned, angles, 12)
+    text = (
+        f"psi would have to be {'larger' if angle < 0.0 else 'smaller'} by"
+        f" {abs(math.degrees(angle)):.3g} deg, or u and v turned by as much"
+    )
+    hypotheses = [Hypothesis("heading", "psi", angle, value, text)]
+    if "psi" in log:
+        to_body = np.exp(-1j * log["psi"])
+
+        def deviance_in_current(current: complex) -> float:
+            water = velocity - current * to_body
+            return deviance({"u": water.real, "v": water.imag})
+
+        typical_speed = float(
+            np.nanmedian([consensus.fleet.logs[j].rms_speed for j in consensus.inliers])
+        )
+        current, value = _minimize_in_plane(deviance_in_current, typical_speed)
+        # a weaker current than this cannot be distinguished from other errors
+        if abs(current) >= 0.05 * typical_speed:
+            towards = math.degrees(math.atan2(current.imag, current.real)) % 360.0
+            text = (
+                f"it ran in a current of {abs(current):.2g} m/s towards {towards:.0f} deg, and"
+                " u and v are over ground"
+            )
+            hypotheses.append(Hypothesis("current", "", abs(current), value, text))
+    return hypotheses
+
+
 def is_constant(fleet: Fleet, i: int, name: str) -> bool:
-    """Return whether an input is constant in a log though it varies in other_std."""
+    """Return whether an input is constant in a log though it varies in the other logs."""
     other_std = [log.std(name) for j, log in enumerate(fleet.logs) if j != i]
     return fleet.logs[i].std(name) <= MIN_RELATIVE_STD * max(float(np.median(other_std)), 1e-12)
 

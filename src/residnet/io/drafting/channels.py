@@ -753,6 +753,32 @@ class ChannelMapper:
 
     def _choose_heading_frame(self) -> None:
         """Choose unit and frame of the heading that are most consistent with the motion."""
+        score = self._search_heading_frame()
+        x, y = parse_name(self._names["x"]), parse_name(self._names["y"])
+        is_named_north_east = (
+            x.has_all("north") and y.has_all("east") and not (x.text == "x" or y.text == "y")
+        )
+        is_named_north_east = is_named_north_east or self._degrees_per_count > 0.0
+        if not is_named_north_east and not self._is_ros_pose and self._is_mirrored():
+            self._set_pose_frame(
+                PoseFrame(not self._pose_frame.is_swapped, not self._pose_frame.is_from_east)
+            )
+            text = "the mirrored motion is as consistent, but more thrust on port turns it to port"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
+        self._name_position_axes(score, is_named_north_east)
+        if self._pose_frame.is_from_east:
+            text = "the motion is consistent with the heading only if the heading is from east"
+            if self._is_ros_pose:
+                text = "the heading is assumed from east, as in a pose of ROS (REP 103)"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
+        if score < 0.5:
+            text = f"position, heading and velocities are inconsistent ({score:.2f} of 1)"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"{text}: check units and axes")
+        # swapped columns have been exchanged by name
+        self._pose_frame = PoseFrame(False, self._pose_frame.is_from_east)
+
+    def _search_heading_frame(self) -> float:
+        """Set the most consistent unit and frame of the heading; returns their score, at most 1."""
         header_unit = parse_header_unit(self._names["psi"], "rad")
         unit_from_size, _ = guess_unit_from_size("psi", self._concatenate_values("psi"))
         # an unwrapped heading in rad may be large, so that its size decides only without motion
@@ -770,6 +796,7 @@ class ChannelMapper:
             ):
                 motions = [estimate_motion(table, unit, frame) for table in self._logs]
                 score = self._score_consistency(motions)
+                # a later candidate must be clearly better: the first ones are the usual ones
                 if score > best_candidate[0] + 0.02:
                     best_candidate = (score, unit, frame)
                     self._motions = motions
@@ -777,20 +804,20 @@ class ChannelMapper:
         if header_unit is None:
             reason = f"position and heading are most consistent in {self._psi_unit}"
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"the header has no unit; {reason}")
-        x, y = parse_name(self._names["x"]), parse_name(self._names["y"])
-        is_named_north_east = (
-            x.has_all("north") and y.has_all("east") and not (x.text == "x" or y.text == "y")
-        )
-        is_named_north_east = is_named_north_east or self._degrees_per_count > 0.0
-        if not is_named_north_east and not self._is_ros_pose and self._is_mirrored():
-            self._pose_frame = PoseFrame(
-                not self._pose_frame.is_swapped, not self._pose_frame.is_from_east
-            )
-            self._motions = [
-                estimate_motion(table, self._psi_unit, self._pose_frame) for table in self._logs
-            ]
-            text = "the mirrored motion is as consistent, but more thrust on port turns it to port"
-            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
+        return score
+
+    def _set_pose_frame(self, frame: PoseFrame) -> None:
+        """Set the frame of position and heading, and estimate the motion in it."""
+        self._pose_frame = frame
+        self._motions = [estimate_motion(table, self._psi_unit, frame) for table in self._logs]
+
+    def _name_position_axes(self, score: float, is_named_north_east: bool) -> None:
+        """Assign the position columns to north and east by the frame, and note the guess.
+
+        Args:
+            score: consistency of position and heading, 1 at most.
+            is_named_north_east: whether the names of the columns define their axes.
+        """
         if self._pose_frame.is_swapped and not is_named_north_east:
             self._names["x"], self._names["y"] = self._names["y"], self._names["x"]
             text = "the motion is consistent with the heading only if the column called y is north"
@@ -799,22 +826,10 @@ class ChannelMapper:
             self._draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
         elif self._pose_frame.is_swapped:
             # columns named north and east are not exchanged: the heading is from east instead
-            self._pose_frame = PoseFrame(False, True)
-            self._motions = [
-                estimate_motion(table, self._psi_unit, self._pose_frame) for table in self._logs
-            ]
+            self._set_pose_frame(PoseFrame(False, True))
         elif not is_named_north_east and not self._pose_frame.is_from_east:
             text = f"x is assumed north and y east: consistent with the heading ({score:.2f} of 1)"
             self._draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
-        if self._pose_frame.is_from_east:
-            text = "the motion is consistent with the heading only if the heading is from east"
-            if self._is_ros_pose:
-                text = "the heading is assumed from east, as in a pose of ROS (REP 103)"
-            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
-        if score < 0.5:
-            text = f"position, heading and velocities are inconsistent ({score:.2f} of 1)"
-            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"{text}: check units and axes")
-        self._pose_frame = PoseFrame(False, self._pose_frame.is_from_east)
 
     def _is_mirrored(self) -> bool:
         """Return whether more thrust on the port side turns the vessel to port."""

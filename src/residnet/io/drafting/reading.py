@@ -134,7 +134,6 @@ def draft_recordings(
     except ResidnetError:
         log = None
     plan = extend_with_standard_messages(aligned[0], ChannelPlan())
-    has_pose = log is not None and {"x", "y", "psi"} <= set(log.channels)
     pose_sources = [source for source in (plan.position, plan.heading) if source is not None]
     used_fields = {(entry.topic or "", entry.field) for entry in plan.channels.values()}
     used_fields |= {
@@ -148,27 +147,13 @@ def draft_recordings(
     sample_step = max(min(steps), 0.02) if steps else 1.0
     if not steps and log is not None:
         sample_step = float(np.median(np.diff(log.t)))
-    sources = _MotionSources({}, used_fields, sample_step)
-    is_frame_fixed = any(is_ned_format(aligned[0][source.topic]) for source in pose_sources)
-    if named_sources := _find_named_table(aligned, draft_notes):
-        sources = named_sources
-    elif log is None or not has_pose or not _is_consistent(log, draft_notes):
-        pose_sources_found = None
-        if not (has_pose and is_frame_fixed):
-            pose_sources_found = _find_best_pose(
-                aligned[0], draft_notes, _MIN_CONSISTENCY if has_pose else 0.0
-            )
-        if pose_sources_found is None and has_pose:
-            text = "position, heading and velocities are inconsistent: check the frames"
-            draft_notes.add_guess(READER_KEY, text)
-        sources = pose_sources_found or sources
-    elif sources.step > _MAX_POSE_INTERVAL and not is_frame_fixed:
-        candidate_notes = DraftNotes()
-        pose_sources_found = _find_best_pose(aligned[0], candidate_notes, _MIN_CONSISTENCY)
-        # with the same pose the velocities of its messages would be lost
-        if pose_sources_found is not None and pose_sources_found.step < 0.9 * sources.step:
-            draft_notes.extend(candidate_notes)
-            sources = pose_sources_found
+    sources = _choose_motion_sources(
+        aligned,
+        log,
+        _MotionSources({}, used_fields, sample_step),
+        draft_notes,
+        is_frame_fixed=any(is_ned_format(aligned[0][source.topic]) for source in pose_sources),
+    )
     settings |= sources.settings
     settings["clock"] = {"kind": "uniform", "step": f"{float(f'{sources.step:.2g}'):g} s"}
     draft_notes.add_note((*READER_KEY, "clock"), "rate of the heading or of the position")
@@ -188,6 +173,45 @@ def draft_recordings(
         draft_notes.add_guess((*CHANNELS_KEY, name), reason)
         channels[name] = {"topic": topic, "field": field, **scaling.settings, "hold": True}
     return settings | ({"channels": channels} if channels else {}), recordings
+
+
+def _choose_motion_sources(
+    recordings: Sequence[Recording],
+    log: Log | None,
+    standard_sources: _MotionSources,
+    draft_notes: DraftNotes,
+    *,
+    is_frame_fixed: bool,
+) -> _MotionSources:
+    """Return the sources of position and heading: the standard messages, or better ones.
+
+    Args:
+        recordings: recordings with aligned clocks.
+        log: the first recording as its standard messages give it; None if they give no log.
+        standard_sources: fields of the standard messages.
+        draft_notes: receives guesses and notes.
+        is_frame_fixed: whether the format defines the frame of its poses.
+    """
+    has_pose = log is not None and {"x", "y", "psi"} <= set(log.channels)
+    if named_sources := _find_named_table(recordings, draft_notes):
+        return named_sources
+    if log is None or not has_pose or not _is_consistent(log, draft_notes):
+        other_sources = None
+        if not (has_pose and is_frame_fixed):
+            min_consistency = _MIN_CONSISTENCY if has_pose else 0.0
+            other_sources = _find_best_pose(recordings[0], draft_notes, min_consistency)
+        if other_sources is None and has_pose:
+            text = "position, heading and velocities are inconsistent: check the frames"
+            draft_notes.add_guess(READER_KEY, text)
+        return other_sources or standard_sources
+    if standard_sources.step > _MAX_POSE_INTERVAL and not is_frame_fixed:
+        candidate_notes = DraftNotes()
+        other_sources = _find_best_pose(recordings[0], candidate_notes, _MIN_CONSISTENCY)
+        # with the same pose the velocities of its messages would be lost
+        if other_sources is not None and other_sources.step < 0.9 * standard_sources.step:
+            draft_notes.extend(candidate_notes)
+            return other_sources
+    return standard_sources
 
 
 def _median_series_step(series: Series) -> float:
@@ -673,53 +697,17 @@ def read_drafted(
         UsageError: if the files have several formats.
         DataError: if no file can be read.
     """
-    kind_by_path = {path: detect_log_kind(path) for path in paths}
-    if len(set(kind_by_path.values())) > 1:
-        names_by_kind: dict[str, list[str]] = {}
-        for path, kind in sorted(kind_by_path.items(), key=lambda item: item[1]):
-            names_by_kind.setdefault(kind, []).append(path.name)
-        kinds_text = "; ".join(
-            f"{kind}: {', '.join(file_names)[:120]}" for kind, file_names in names_by_kind.items()
-        )
-        raise UsageError(
-            f"the logs have several formats, one was expected ({kinds_text}); give logs of one"
-            " format"
-        )
-    log_kind = kind_by_path[paths[0]]
+    log_kind = _detect_common_kind(paths)
     result = DraftResult({"kind": "canonical"}, draft_notes)
     recordings: dict[Path, Recording] = {}
     if log_kind == "table" and (trip_files := group_by_trip(paths)):
-        unpaired_paths = set(paths).difference(*trip_files.values())
-        part_settings: dict[str, dict[str, Any]] = {}
-        errors: dict[Path, ResidnetError] = {}
-        for part_name, files in trip_files.items():
-            part_notes = DraftNotes()
-            part_settings[part_name], part_errors = draft_tables(
-                files, part_notes, has_heading=True
-            )
-            errors |= part_errors
-            part_notes.move_key(READER_KEY, (*READER_KEY, "parts", part_name))
-            draft_notes.extend(part_notes)
-        part_order = sorted(
-            part_settings, key=lambda word: -len(_motion_channels(part_settings[word]["channels"]))
-        )
-        text = (
-            f"files whose names differ only in {' and '.join(part_order)} are joined as one trip;"
-            " without dates in both, the clock offset is estimated from the motion that the"
-            " commands explain"
-        )
-        draft_notes.add_guess((*READER_KEY, "parts"), text)
-        reader = {
-            "kind": "joined",
-            "parts": {part_name: part_settings[part_name] for part_name in part_order},
-        }
-        result.reader = reader
-        paths = [*trip_files[part_order[0]]]
-        result.errors = errors
+        result.reader, result.errors = _draft_trip_parts(trip_files, draft_notes)
         result.errors |= {
             path: DataError(f"{path}: another file of its trip is missing; leave it out")
-            for path in sorted(unpaired_paths)
+            for path in sorted(set(paths).difference(*trip_files.values()))
         }
+        # a trip has the name of its file with the most channels of the motion
+        paths = [*trip_files[next(iter(result.reader["parts"]))]]
     elif log_kind == "table":
         result.reader, result.errors = draft_tables(paths, draft_notes)
     elif log_kind != "canonical":
@@ -742,6 +730,61 @@ def read_drafted(
         raise next(iter(result.errors.values()))
     _correct_rudder_signs(result)
     return result
+
+
+def _detect_common_kind(paths: Sequence[Path]) -> str:
+    """Return the format of logs.
+
+    Raises:
+        UsageError: if they have several formats.
+    """
+    kind_by_path = {path: detect_log_kind(path) for path in paths}
+    if len(set(kind_by_path.values())) > 1:
+        names_by_kind: dict[str, list[str]] = {}
+        for path, kind in sorted(kind_by_path.items(), key=lambda item: item[1]):
+            names_by_kind.setdefault(kind, []).append(path.name)
+        kinds_text = "; ".join(
+            f"{kind}: {', '.join(file_names)[:120]}" for kind, file_names in names_by_kind.items()
+        )
+        raise UsageError(
+            f"the logs have several formats, one was expected ({kinds_text}); give logs of one"
+            " format"
+        )
+    return kind_by_path[paths[0]]
+
+
+def _draft_trip_parts(
+    trip_files: Mapping[str, Sequence[Path]], draft_notes: DraftNotes
+) -> tuple[dict[str, Any], dict[Path, ResidnetError]]:
+    """Draft a reader that joins several tables of each trip.
+
+    Args:
+        trip_files: files of each part in the order of the trips, see `group_by_trip`.
+        draft_notes: receives guesses and notes.
+
+    Returns:
+        Settings of the reader, the part with most channels of the motion first, and the error of
+        each table that cannot be read.
+    """
+    part_settings: dict[str, dict[str, Any]] = {}
+    errors: dict[Path, ResidnetError] = {}
+    for part_name, files in trip_files.items():
+        part_notes = DraftNotes()
+        part_settings[part_name], part_errors = draft_tables(files, part_notes, has_heading=True)
+        errors |= part_errors
+        part_notes.move_key(READER_KEY, (*READER_KEY, "parts", part_name))
+        draft_notes.extend(part_notes)
+    part_order = sorted(
+        part_settings, key=lambda word: -len(_motion_channels(part_settings[word]["channels"]))
+    )
+    text = (
+        f"files whose names differ only in {' and '.join(part_order)} are joined as one trip;"
+        " without dates in both, the clock offset is estimated from the motion that the"
+        " commands explain"
+    )
+    draft_notes.add_guess((*READER_KEY, "parts"), text)
+    parts = {part_name: part_settings[part_name] for part_name in part_order}
+    return {"kind": "joined", "parts": parts}, errors
 
 
 def group_by_trip(paths: Sequence[Path]) -> dict[str, list[Path]]:

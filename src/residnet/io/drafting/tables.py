@@ -32,6 +32,7 @@ from residnet.io.header_vocabulary import (
     GERMANIC_PATTERN,
     MOTION_CHANNELS,
     REVOLUTION_PATTERN,
+    ParsedName,
     find_mismatched_unit,
     match_input_channel,
     match_state_channel,
@@ -108,46 +109,15 @@ def draft_tables(
         main_preview,
         *(convert_positions_to_degrees(sheet, DraftNotes())[0] for sheet in previews[1:]),
     ]
-    common_columns = [
-        name
-        for name in main_preview.column_names
-        if all(name in sheet.column_names for sheet in previews)
-    ]
-    missing_columns = sorted(
-        {name for sheet in previews for name in sheet.column_names} - set(common_columns)
-    )
-    if missing_columns:
-        draft_notes.add_note(
-            CHANNELS_KEY, f"not in every file, left out: {', '.join(missing_columns[:12])}"
-        )
     clock = detect_clock(main_preview)
-    if not set(clock.columns) <= set(common_columns):
-        same_table_names = [
-            sheet.path.name for sheet in previews if sheet.column_names == main_preview.column_names
-        ]
-        raise UsageError(
-            f"{main_preview.path}: the column of time '{clock.columns[0]}' is missing elsewhere,"
-            " these are tables of several kinds; give those of one kind, here"
-            f" {', '.join(same_table_names)[:120]} (parts of one trip are files whose names differ"
-            " in one word, each with other quantities)"
-        )
+    common_columns = _find_common_columns(previews, clock, draft_notes)
     if clock.guess:
         draft_notes.add_guess((*READER_KEY, "time"), clock.guess)
     numeric_columns = {name for sheet in previews for name in sheet.numeric_columns}
     common_numeric = [
         name for name in common_columns if name in numeric_columns and name not in clock.columns
     ]
-    minute_columns = [
-        name
-        for name in common_numeric
-        if match_state_channel(parse_name(name)) in _MAX_ANGLE
-        and parse_header_unit(name, "s") == "min"
-    ]
-    if minute_columns:
-        raise DataError(
-            f"{main_preview.path}: '{minute_columns[0]}' has minutes whose degrees are in another"
-            " column; write degrees + minutes / 60 to one column each for latitude and longitude"
-        )
+    _refuse_minute_columns(main_preview.path, common_numeric)
     attitudes = find_quaternions(common_numeric)
     compound_columns = {column for attitude in attitudes for column in attitude.values()}
     sin_cos_pairs = find_sin_cos_pairs(
@@ -166,33 +136,9 @@ def draft_tables(
     )
     column_by_channel = _rename_pulsed_drives(column_by_channel, previews)
     column_by_channel = _add_sin_cos_channels(column_by_channel, sin_cos_pairs)
-    # roll is optional: leave it out rather than the logs without it
-    roll_channels = [name for name in ("phi", "p") if name in column_by_channel]
-    for name in [
-        preview
-        for preview in roll_channels
-        if any(column_by_channel[preview] not in s.numeric_columns for s in previews)
-    ]:
-        draft_notes.add_note(
-            CHANNELS_KEY, f"empty in some files, left out: {column_by_channel.pop(name)}"
-        )
+    _drop_incomplete_roll(column_by_channel, previews, draft_notes)
     column_by_channel |= find_depth_channels(common_numeric, column_by_channel)
-    position_texts = [
-        name
-        for name in main_preview.text_columns
-        if match_state_channel(parse_name(name)) in _MAX_ANGLE
-    ]
-    if (
-        position_texts
-        and "x" not in column_by_channel
-        and not set(_MAX_ANGLE) <= set(column_by_channel)
-    ):
-        example = main_preview.text_columns[position_texts[0]].dropna().iloc[0]
-        raise DataError(
-            f"{main_preview.path}: column '{position_texts[0]}' contains"
-            f" '{truncate(str(example))}', which is no latitude or longitude; accepted are"
-            " 59.90535, 59°54.321'N, 59 54 19.3 N and 5954.321"
-        )
+    _refuse_unparsed_positions(main_preview, column_by_channel)
     if "psi" not in column_by_channel:
         column_by_channel |= choose_quaternion_order(
             attitudes, [preview.numeric_columns for preview in previews]
@@ -225,6 +171,95 @@ def draft_tables(
     reader_config |= draft_manoeuvre_setting(files, draft_notes)
     _note_unused_columns(main_preview, column_by_channel, clock, draft_notes)
     return {**reader_config, "channels": channels}, errors
+
+
+def _find_common_columns(
+    previews: Sequence[TablePreview], clock: TableClock, draft_notes: DraftNotes
+) -> list[str]:
+    """Return the columns that all tables have; others are noted.
+
+    Raises:
+        UsageError: if a column of the clock is missing in a table.
+    """
+    main_preview = previews[0]
+    common_columns = [
+        name
+        for name in main_preview.column_names
+        if all(name in sheet.column_names for sheet in previews)
+    ]
+    missing_columns = sorted(
+        {name for sheet in previews for name in sheet.column_names} - set(common_columns)
+    )
+    if missing_columns:
+        draft_notes.add_note(
+            CHANNELS_KEY, f"not in every file, left out: {', '.join(missing_columns[:12])}"
+        )
+    if not set(clock.columns) <= set(common_columns):
+        same_table_names = [
+            sheet.path.name for sheet in previews if sheet.column_names == main_preview.column_names
+        ]
+        raise UsageError(
+            f"{main_preview.path}: the column of time '{clock.columns[0]}' is missing elsewhere,"
+            " these are tables of several kinds; give those of one kind, here"
+            f" {', '.join(same_table_names)[:120]} (parts of one trip are files whose names differ"
+            " in one word, each with other quantities)"
+        )
+    return common_columns
+
+
+def _refuse_minute_columns(path: Path, columns: Sequence[str]) -> None:
+    """Refuse positions with degrees and minutes in separate columns.
+
+    Raises:
+        DataError: if a column has minutes of latitude or longitude.
+    """
+    minute_columns = [
+        name
+        for name in columns
+        if match_state_channel(parse_name(name)) in _MAX_ANGLE
+        and parse_header_unit(name, "s") == "min"
+    ]
+    if minute_columns:
+        raise DataError(
+            f"{path}: '{minute_columns[0]}' has minutes whose degrees are in another"
+            " column; write degrees + minutes / 60 to one column each for latitude and longitude"
+        )
+
+
+def _drop_incomplete_roll(
+    column_by_channel: dict[str, str], previews: Sequence[TablePreview], draft_notes: DraftNotes
+) -> None:
+    """Remove roll channels that are empty in some tables.
+
+    Roll is optional for a model, so that it is left out rather than the tables without it.
+    """
+    for name in ("phi", "p"):
+        column = column_by_channel.get(name)
+        if column is not None and any(column not in sheet.numeric_columns for sheet in previews):
+            del column_by_channel[name]
+            draft_notes.add_note(CHANNELS_KEY, f"empty in some files, left out: {column}")
+
+
+def _refuse_unparsed_positions(preview: TablePreview, column_by_channel: Mapping[str, str]) -> None:
+    """Refuse positions in a notation that `convert_positions_to_degrees` does not know.
+
+    Raises:
+        DataError: if a column of text is a latitude or longitude, and there is no other position.
+    """
+    position_texts = [
+        name for name in preview.text_columns if match_state_channel(parse_name(name)) in _MAX_ANGLE
+    ]
+    if (
+        position_texts
+        and "x" not in column_by_channel
+        and not set(_MAX_ANGLE) <= set(column_by_channel)
+    ):
+        example = preview.text_columns[position_texts[0]].dropna().iloc[0]
+        raise DataError(
+            f"{preview.path}: column '{position_texts[0]}' contains"
+            f" '{truncate(str(example))}', which is no latitude or longitude; accepted are"
+            " 59.90535, 59°54.321'N, 59 54 19.3 N and 5954.321"
+        )
 
 
 def _suggest_table_fix(
@@ -407,22 +442,47 @@ def match_channels(
             text = f"'{north_east['x']}' and '{north_east['y']}' are assumed north and east"
             draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
             return {**north_east, **other_channels}
+    parsed_names = {column: parse_name(column) for column in columns}
+    names, duplicates, speeds = _assign_columns(columns, parsed_names, draft_notes)
+    _resolve_duplicates(names, duplicates, columns, draft_notes)
+    has_position = bool({"x", "y", "latitude", "longitude"} & names.keys())
+    theta = next(
+        (column for column in columns if "theta" in parsed_names[column].text.split()), None
+    )
+    if has_position and theta is not None and not {"psi", "phi"} & names.keys():
+        names["psi"] = theta
+        draft_notes.add_guess(
+            (*CHANNELS_KEY, "psi"), f"'{theta}' is assumed the heading, because there is no other"
+        )
+    _rename_single_rudder(names, draft_notes)
+    has_heading = (
+        has_heading
+        or "psi" in names
+        or any("course" in parsed.concepts for parsed in parsed_names.values())
+    )
+    if "u" not in names and speeds and ("v" in names or not (has_position and has_heading)):
+        names["u"] = speeds[0]
+        draft_notes.add_guess(
+            (*CHANNELS_KEY, "u"), f"'{speeds[0]}' is assumed the surge velocity, not the speed"
+        )
+    ordered_channels = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
+    return {name: names[name] for name in ordered_channels if name in names}
+
+
+def _assign_columns(
+    columns: Sequence[str], parsed_names: Mapping[str, ParsedName], draft_notes: DraftNotes
+) -> tuple[dict[str, str], dict[str, list[str]], list[str]]:
+    """Assign each column to the channel of its name.
+
+    Returns:
+        Channel -> first column; channel -> all columns, of channels with several; columns of
+        speed.
+    """
     names: dict[str, str] = {}
     duplicates: dict[str, list[str]] = {}
     speeds: list[str] = []
-    parsed_names = {column: parse_name(column) for column in columns}
     copy_suffix = re.compile(r"\.\d+$")
-    # speeds of port and starboard are those of shafts
-    shaft_of_side = {"port": "n_port", "starboard": "n_stbd"}
-    side_velocities = {
-        column: shaft_channel
-        for column, parsed in parsed_names.items()
-        for sided_channel, shaft_channel in shaft_of_side.items()
-        if match_state_channel(parsed) == "v"
-        and parsed.has_all("speed", sided_channel)
-        and parsed.has_none("sway")
-    }
-    side_velocities = side_velocities if len({*side_velocities.values()}) == 2 else {}
+    side_velocities = _match_shaft_speeds(parsed_names)
 
     def sort_key(column: str) -> tuple[bool, bool, int]:
         is_magnetic = (
@@ -437,51 +497,90 @@ def match_channels(
     # precedence: true before magnetic headings, then canonical names (`u` before `vx`), then names
     # with fewer concepts (`heading` before `heading of the second compass`)
     for column in sorted(columns, key=sort_key):
-        channel = (
-            side_velocities.get(column)
-            or match_state_channel(parsed_names[column])
-            or match_input_channel(parsed_names[column])
-        )
-        if (
-            channel is None
-            and parsed_names[column].has_all("pitch")
-            and parse_header_unit(column, "-") == "%"
-        ):
-            # a pitch in per cent is that of a propeller's blades
-            channel = match_input_channel(parse_name(f"propeller {column}"))
-        expected_unit = get_si_unit(channel) if channel else None
-        header_unit_mismatch = (
-            find_mismatched_unit(column, expected_unit) if expected_unit else None
-        )
-        if channel == "n" and header_unit_mismatch == "m":
-            channel = "x"
-        elif channel and "thrust" in channel and parse_header_unit(column, "1/s"):
-            # a thruster in rpm is a shaft speed, not a force
-            channel = channel.replace("thrust", "n")
-        elif (
-            channel
-            and _DRIVE_PATTERN.match(channel)
-            and (header_unit_mismatch in ("-", "us") or parse_header_unit(column, "-") == "%")
-        ):
-            # per cent and pulses are a throttle, neither a shaft speed nor a force
-            channel = _DRIVE_PATTERN.sub("throttle", channel)
-        elif channel in STATE_NAMES and header_unit_mismatch:
-            draft_notes.add_note(
-                CHANNELS_KEY,
-                f"'{column}' has the name of {channel}, but the unit {header_unit_mismatch}",
-            )
+        channel = side_velocities.get(column) or _match_name(column, parsed_names[column])
+        if channel is None:
             continue
-        if channel == "speed":
+        channel = _correct_by_unit(column, channel)
+        unit = _find_other_unit(column, channel)
+        if channel in STATE_NAMES and unit is not None:
+            draft_notes.add_note(
+                CHANNELS_KEY, f"'{column}' has the name of {channel}, but the unit {unit}"
+            )
+        elif channel == "speed":
             speeds.append(column)
-        elif channel is not None and channel not in names:
+        elif channel not in names:
             names[channel] = column
-        elif channel is not None and copy_suffix.sub("", column) == copy_suffix.sub(
-            "", names[channel]
-        ):
+        elif copy_suffix.sub("", column) == copy_suffix.sub("", names[channel]):
             text = f"the header has it more than once; '{names[channel]}' is the first one"
             draft_notes.add_guess((*CHANNELS_KEY, channel), text)
-        elif channel is not None:
+        else:
             duplicates.setdefault(channel, [names[channel]]).append(column)
+    return names, duplicates, speeds
+
+
+def _match_shaft_speeds(parsed_names: Mapping[str, ParsedName]) -> dict[str, str]:
+    """Return the shaft speed channels of columns with speeds of port and starboard.
+
+    Their names match the sway velocity, but a vessel has only one. Both sides must occur.
+    """
+    shaft_of_side = {"port": "n_port", "starboard": "n_stbd"}
+    side_velocities = {
+        column: shaft_channel
+        for column, parsed in parsed_names.items()
+        for side, shaft_channel in shaft_of_side.items()
+        if match_state_channel(parsed) == "v"
+        and parsed.has_all("speed", side)
+        and parsed.has_none("sway")
+    }
+    return side_velocities if len({*side_velocities.values()}) == 2 else {}
+
+
+def _match_name(column: str, parsed: ParsedName) -> str | None:
+    """Return the channel of a column by its name, or None."""
+    channel = match_state_channel(parsed) or match_input_channel(parsed)
+    if channel is None and parsed.has_all("pitch") and parse_header_unit(column, "-") == "%":
+        # a pitch in per cent is that of a propeller's blades
+        channel = match_input_channel(parse_name(f"propeller {column}"))
+    return channel
+
+
+def _find_other_unit(column: str, channel: str) -> str | None:
+    """Return the unit in the name of a column if its dimension is not that of the channel."""
+    expected_unit = get_si_unit(channel)
+    return find_mismatched_unit(column, expected_unit) if expected_unit else None
+
+
+def _correct_by_unit(column: str, channel: str) -> str:
+    """Return the channel of a column whose unit decides between two meanings of its name."""
+    mismatched_unit = _find_other_unit(column, channel)
+    if channel == "n" and mismatched_unit == "m":
+        # north in m, not a shaft speed
+        return "x"
+    if "thrust" in channel and parse_header_unit(column, "1/s"):
+        # a thruster in rpm is a shaft speed, not a force
+        return channel.replace("thrust", "n")
+    if _DRIVE_PATTERN.match(channel) and (
+        mismatched_unit in ("-", "us") or parse_header_unit(column, "-") == "%"
+    ):
+        # per cent and pulses are a throttle, neither a shaft speed nor a force
+        return _DRIVE_PATTERN.sub("throttle", channel)
+    return channel
+
+
+def _resolve_duplicates(
+    names: dict[str, str],
+    duplicates: Mapping[str, Sequence[str]],
+    columns: Sequence[str],
+    draft_notes: DraftNotes,
+) -> None:
+    """Number several thrusters, and note the further columns of other channels.
+
+    Args:
+        names: channel -> column; numbered thrusters replace their common channel.
+        duplicates: channel -> its columns.
+        columns: columns in the order of the table, in which thrusters are numbered.
+        draft_notes: receives guesses and notes.
+    """
     for channel, duplicate_columns in duplicates.items():
         numbered = {
             f"{channel}_{k}": duplicate
@@ -502,37 +601,21 @@ def match_channels(
             (*CHANNELS_KEY, f"{channel}_1"),
             f"{', '.join(duplicate_columns)} are assumed one thruster each",
         )
-    has_position = bool({"x", "y", "latitude", "longitude"} & names.keys())
-    theta = next(
-        (column for column in columns if "theta" in parsed_names[column].text.split()), None
-    )
-    if has_position and theta is not None and not {"psi", "phi"} & names.keys():
-        names["psi"] = theta
-        draft_notes.add_guess(
-            (*CHANNELS_KEY, "psi"), f"'{theta}' is assumed the heading, because there is no other"
-        )
+
+
+def _rename_single_rudder(names: dict[str, str], draft_notes: DraftNotes) -> None:
+    """Rename the rudder of one side to the only rudder, if the other side has none."""
     for port, stbd in (("delta_port", "delta_stbd"), ("cmd_delta_port", "cmd_delta_stbd")):
-        if (port in names) != (stbd in names):
-            # a single rudder: the side is the direction of positive angles
-            sided_channel = port if port in names else stbd
-            rudder = sided_channel.rpartition("_")[0]
-            column = names.pop(sided_channel)
-            if names.setdefault(rudder, column) != column:
-                draft_notes.add_note(
-                    CHANNELS_KEY, f"'{column}' may be {rudder} instead of '{names[rudder]}'"
-                )
-    has_heading = (
-        has_heading
-        or "psi" in names
-        or any("course" in parsed.concepts for parsed in parsed_names.values())
-    )
-    if "u" not in names and speeds and ("v" in names or not (has_position and has_heading)):
-        names["u"] = speeds[0]
-        draft_notes.add_guess(
-            (*CHANNELS_KEY, "u"), f"'{speeds[0]}' is assumed the surge velocity, not the speed"
-        )
-    ordered_channels = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
-    return {name: names[name] for name in ordered_channels if name in names}
+        if (port in names) == (stbd in names):
+            continue
+        # with a single rudder the side is the direction of positive angles
+        sided_channel = port if port in names else stbd
+        rudder = sided_channel.rpartition("_")[0]
+        column = names.pop(sided_channel)
+        if names.setdefault(rudder, column) != column:
+            draft_notes.add_note(
+                CHANNELS_KEY, f"'{column}' may be {rudder} instead of '{names[rudder]}'"
+            )
 
 
 def _add_sin_cos_channels(
@@ -998,16 +1081,10 @@ def convert_positions_to_degrees(
     letter_o, reason = _guess_letter_o(
         preview, hemisphere_columns["longitude"] or columns["longitude"]
     )
-    for form in _ANGLE_FORMS:
-        try:
-            degrees = {name: parse_degrees(cells[name], name, form, letter_o) for name in columns}
-        except DataError:
-            continue
-        max_angles = {name: np.abs(v[np.isfinite(v)]).max(initial=0) for name, v in degrees.items()}
-        if all(max_angles[name] <= _MAX_ANGLE[name] for name in columns):
-            break
-    else:
+    parsed_positions = _parse_positions(cells, letter_o)
+    if parsed_positions is None:
         return preview, {}
+    form, degrees = parsed_positions
     settings: dict[str, dict[str, Any]] = {column: {} for column in columns.values()}
     if form == "ddmm":
         for entry in settings.values():
@@ -1042,6 +1119,31 @@ def convert_positions_to_degrees(
         ),
         settings,
     )
+
+
+def _parse_positions(
+    cells: Mapping[str, pd.Series], letter_o: LetterO | None
+) -> tuple[AngleForm, dict[str, np.ndarray]] | None:
+    """Return the first notation in which all cells are angles in range, and the degrees [T].
+
+    Args:
+        cells: cells of latitude and longitude.
+        letter_o: meaning of the letter O as a hemisphere.
+
+    Returns:
+        None if there is no such notation.
+    """
+    for form in _ANGLE_FORMS:
+        try:
+            degrees = {
+                name: parse_degrees(texts, name, form, letter_o) for name, texts in cells.items()
+            }
+        except DataError:
+            continue
+        max_angles = {name: np.abs(v[np.isfinite(v)]).max(initial=0) for name, v in degrees.items()}
+        if all(max_angles[name] <= _MAX_ANGLE[name] for name in cells):
+            return form, degrees
+    return None
 
 
 def _guess_letter_o(preview: TablePreview, column: str) -> tuple[LetterO | None, str]:
