@@ -30,7 +30,7 @@ WRONG = [
     (
         "wam_v_cal",
         "damping.X.u^-1={value: 1, unit: kg, source: made}",
-        "divides by what may be zero",
+        "divides by a channel that may be zero",
     ),
     ("wam_v_cal", "damping.N.r.unit=kg/s", "kg m\\^2/s"),
     ("wam_v_cal", "damping.N.|u|v|v|={value: 1, unit: kg, source: made}", "kg s/m"),

@@ -35,7 +35,10 @@ class Baseline(nn.Module, ABC):
         """Compute nu_dot [..., n] at channels z [..., nz] (see `residnet.physics.signals`)."""
 
     def parameter_counts(self) -> list[float]:
-        """Return the number of fitted parameters per axis, by default all parameters for each."""
+        """Return the number of fitted parameters per axis.
+
+        By default every parameter counts for every axis.
+        """
         return [float(sum(parameter.numel() for parameter in self.parameters()))] * self.n_dof
 
     def inertia_matrix(self) -> Tensor | None:
@@ -49,11 +52,12 @@ class ParametricBaseline(Baseline, ABC):
     The parameters can be refitted on free runs and sampled from their distribution.
 
     Args:
-        theta: initial values of any shape. The P free parameters are given by `free_indices`.
+        theta: initial values of any shape; `free_indices` selects the P free parameters.
     """
 
     def __init__(self, theta: Tensor) -> None:
         super().__init__()
+        # least squares and refits set theta; gradient descent on a head must not change it
         self.theta = nn.Parameter(theta, requires_grad=False)
 
     @abstractmethod
@@ -79,17 +83,21 @@ class ParametricBaseline(Baseline, ABC):
 
     @final
     def parameter_jacobian(self, z: Tensor) -> Tensor:
-        """Return the derivatives [B, n, P] of nu_dot by the free parameters at channels z [B, nz].
+        """Return the Jacobian [B, n, P] of nu_dot with respect to the free parameters.
 
-        They are exact: each row is differentiated in reverse mode, all rows at once.
+        The derivatives are exact: reverse-mode differentiation of each row, vectorised over rows.
+
+        Args:
+            z: channels [B, nz].
         """
 
         def nu_dot(theta: Tensor, channels: Tensor) -> Tensor:
-            out: Tensor = torch.func.functional_call(self, {"theta": theta}, (channels,))
-            return out
+            acceleration: Tensor = torch.func.functional_call(self, {"theta": theta}, (channels,))
+            return acceleration
 
-        by_theta = torch.func.vmap(torch.func.jacrev(nu_dot), in_dims=(None, 0))
-        jacobian: Tensor = by_theta(self.theta.detach().to(z.dtype), z)
+        # reverse mode: a row has few accelerations and many parameters
+        jacobian_of_row = torch.func.vmap(torch.func.jacrev(nu_dot), in_dims=(None, 0))
+        jacobian: Tensor = jacobian_of_row(self.theta.detach().to(z.dtype), z)
         return jacobian.flatten(2)[..., self.free_indices()]
 
     @abstractmethod
@@ -115,7 +123,7 @@ class ParametricBaseline(Baseline, ABC):
         """
 
     def destabilising_terms(self) -> list[int]:
-        """Return indices of free parameters whose current sign is that of negative damping.
+        """Return the indices of free parameters that cause negative damping by their sign.
 
         The list is empty for a baseline that excludes negative damping or does not check for it.
         """
@@ -137,7 +145,7 @@ class ParametricBaseline(Baseline, ABC):
         Args:
             table: coefficient table of the fit.
             standard_errors: standard errors of the free parameters [P]. The standard errors of
-                ratios are not changed.
+                ratios, such as time constants, are not changed.
         """
 
 
@@ -189,7 +197,7 @@ class IdentifiedConfig(Config, ABC):
 
 
 def require_channels(names: Sequence[str], required: Sequence[str], subject: str) -> None:
-    """Check that channels exist, required velocities are modelled and roll is not.
+    """Check that channels exist, that required velocities are modelled and that roll is not.
 
     Raises:
         ConfigError: with the first missing channel.
@@ -201,8 +209,8 @@ def require_channels(names: Sequence[str], required: Sequence[str], subject: str
         if name in dof.fixed_states:
             raise ConfigError(
                 f"{subject} needs the velocity {name}, but signals.velocities are"
-                f" {', '.join(dof.velocities)}; a baseline of kind 'regressors' or 'nomoto' needs"
-                " no other"
+                f" {', '.join(dof.velocities)}; use a baseline of kind 'regressors' or"
+                " 'nomoto', which needs no further velocities"
             )
         if name not in names:
             raise ConfigError(
@@ -227,7 +235,7 @@ def select_manoeuvres(samples: Samples, kinds: Sequence[str]) -> Samples:
 
 
 _MAX_FIT_SAMPLES = 4000
-"""Maximum number of samples of `fit_parameters`; more samples are thinned evenly."""
+"""Maximum number of samples of `fit_parameters`; more samples are decimated evenly."""
 _MAX_FIT_STEPS = 100
 """Maximum number of Levenberg-Marquardt steps of `fit_parameters`."""
 _MIN_FIT_DECREASE = 1e-10
@@ -262,6 +270,7 @@ def fit_parameters(baseline: Baseline, samples: Samples) -> Solution:
     rows = torch.linspace(0, len(samples) - 1, min(len(samples), _MAX_FIT_SAMPLES)).long()
     z = samples.z[rows]
     target = samples.target[rows]
+    # accelerations in m/s^2 and rad/s^2 become comparable
     target_std = target.std(0).clamp(min=_MIN_TARGET_STD)
 
     def to_state(theta: Tensor) -> dict[str, Tensor]:
@@ -276,6 +285,7 @@ def fit_parameters(baseline: Baseline, samples: Samples) -> Solution:
         return ((acceleration - target) / target_std).flatten()
 
     def compute_jacobian(theta: Tensor) -> Tensor:
+        # forward mode: there are few parameters and thousands of residuals
         jacobian: Tensor = torch.func.jacfwd(compute_residuals)(theta)
         return jacobian
 
@@ -288,9 +298,12 @@ def fit_parameters(baseline: Baseline, samples: Samples) -> Solution:
         _require_effect(gram.diagonal(), labels)
 
         def try_step(damping: float) -> tuple[float, Tensor]:
+            # Marquardt scaling: damping in proportion to the curvature of each parameter,
+            # independent of units
             damped = gram + damping * torch.diag(gram.diagonal())
             factor, info = torch.linalg.cholesky_ex(damped)
             if int(info) != 0:
+                # not positive definite: the optimiser increases the damping after an infinite cost
                 return math.inf, theta
             step = torch.cholesky_solve(gradient[:, None], factor)[:, 0]
             with torch.no_grad():
@@ -317,6 +330,7 @@ def fit_parameters(baseline: Baseline, samples: Samples) -> Solution:
     inverse = torch.cholesky_inverse(factor)
     groups, group_index = torch.unique(samples.group[rows], return_inverse=True)
     scores = jacobian * residuals[:, None]
+    # errors within a manoeuvre are correlated: the scores of its samples are added before squaring
     if len(groups) > 1:
         cluster_index = group_index.repeat_interleave(target.shape[1])
         cluster_scores = scores.new_zeros(len(groups), len(theta))
@@ -332,6 +346,11 @@ def fit_parameters(baseline: Baseline, samples: Samples) -> Solution:
 
 
 def _require_effect(squared_norms: Tensor, labels: Sequence[str]) -> None:
+    """Refuse parameters whose column of the Jacobian is zero.
+
+    Raises:
+        FitError: with the name of the first such parameter.
+    """
     if bool((squared_norms == 0).any()):
         label = labels[int((squared_norms == 0).nonzero()[0, 0])]
         raise FitError(

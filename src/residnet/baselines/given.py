@@ -54,6 +54,7 @@ class FixedBaseline(Baseline):
         self.library = TermLibrary(terms, names)
         self.n_dof = get_dof(names).n_dynamic
         self.is_fitted = is_fitted
+        # roll has no published equation: its acceleration is zero
         empty_axes = [dict[str, float]()] * (self.n_dof - len(coefficients_by_axis))
         theta = [
             [axis_coefficients.get(term, 0.0) for term in terms]
@@ -84,7 +85,9 @@ class FixedBaseline(Baseline):
         columns = [terms.index(name) for name in FORCE_CHANNELS if name in terms]
         if len(columns) < len(FORCE_CHANNELS) or self.n_dof > len(FORCE_CHANNELS):
             return None
+        # nu_dot = M^-1 tau + ...: the coefficients of the forces are the inverse of M
         force_columns = self.theta[:, columns].to(torch.float64)
+        # columns are scaled, because kg and kg m^2 cannot be compared
         is_invertible = float(torch.linalg.cond(force_columns / force_columns.abs().amax(0))) < 1e6
         return torch.linalg.inv(force_columns) if is_invertible else None
 
@@ -157,11 +160,14 @@ class EquationsConfig(AxisCoefficients, FixedBaselineConfig):
         for factor in parse_term(term, names):
             if factor.name not in self.units:
                 continue
+            # a function of a channel in another unit is no multiple of that in SI
             if factor.function:
                 raise ConfigError(
                     f"baseline 'equations', {axis}, term '{term}': {factor.symbol} needs"
                     f" {factor.name} in SI; leave its unit out"
                 )
+            # a coefficient per rpm^2 becomes one per (1/s)^2, and so on for every factor of the
+            # term
             value /= to_si(self.units[factor.name]) ** factor.power
         return value
 
@@ -249,7 +255,8 @@ class BelievedConfig(FixedBaselineConfig):
 
     def build(self, names: Sequence[str]) -> FixedBaseline:
         require_channels(names, (*VELOCITY_NAMES, *FORCE_CHANNELS), "baseline 'believed'")
-        # M, C and D times one factor: only the forces act differently
+        # with M, C and D multiplied by one factor the free motion is unchanged: the factor cancels,
+        # except that forces cause smaller accelerations
         force_scales = dict.fromkeys(FORCE_CHANNELS, self.scale)
         coefficients_by_axis = [
             {term: value / force_scales.get(term, 1.0) for term, value in axis_coefficients.items()}

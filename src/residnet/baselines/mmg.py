@@ -34,8 +34,9 @@ from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.least_squares import minimize_levenberg_marquardt
 
 _WAKE_SLOPE = 2.0
-"""C_1 of the wake at drift, the value of the KVLCC2 in the source."""
-# keeps the drift angle defined for a ship at rest; (m/s)^2
+"""C_1, the slope of the wake fraction over the drift angle; the value of the KVLCC2 in the source.
+"""
+# lower bound of U^2, so that v / U is defined at rest; (m/s)^2
 _MIN_SPEED_SQUARED = 1e-6
 
 
@@ -87,7 +88,8 @@ class MMGRudder(Config):
         area: area of the movable part.
         aspect: aspect ratio, span squared divided by area.
         x: longitudinal position divided by the length, positive forward of midship.
-        race: share of the span in the slipstream, propeller diameter divided by span.
+        race: share of the span in the slipstream (propeller race), propeller diameter divided by
+            span.
     """
 
     area: SquareMetres = Field(gt=0)
@@ -115,8 +117,10 @@ def default_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
     The means of the linear hull derivatives are those of the formulas of Kijima. The means of most
     higher-order derivatives are zero, so that the trials determine them.
     """
+    # aspect ratio k of the hull as a low-aspect-ratio wing, with its mirror image at the surface
     aspect_ratio = 2.0 * hull.draught / hull.length
     beam_fullness = hull.block_coefficient * hull.beam / hull.length
+    # m' = m / (rho/2 L^2 d)
     mass_nondim = 2.0 * hull.mass / (hull.density * hull.length**2 * hull.draught)
     return {
         "m_x": ParameterPrior(0.022, 0.01, "added mass in surge"),
@@ -203,6 +207,7 @@ class MMGForces(nn.Module):
         self.pressure_factor = 0.5 * hull.density * hull.length * hull.draught
         self.mass = float(hull.mass)
         self.x_G = float(hull.x_G)
+        # about midship, by the parallel axis theorem
         self.inertia = hull.mass * ((hull.gyration * hull.length) ** 2 + hull.x_G**2)
         self.density = float(hull.density)
         self.diameter = float(propeller.diameter)
@@ -258,7 +263,8 @@ class MMGForces(nn.Module):
             + N_vrr * v_nondim * r_nondim * r_nondim
             + N_rrr * r_nondim**3
         )
-        # propeller: the wake fraction depends on the drift angle, asymmetrically
+        # propeller: the wake fraction depends on the drift angle, and differently to port and
+        # starboard because of the rotation of the propeller
         propeller_drift = -v_nondim - self.x_P * r_nondim
         wake_ratio = torch.where(propeller_drift > 0, C_2p, C_2n)
         inflow = (
@@ -266,6 +272,7 @@ class MMGForces(nn.Module):
             * (1 - w_P0)
             * (1 + (1 - torch.exp(-self.wake_slope * propeller_drift.abs())) * (wake_ratio - 1))
         )
+        # K_T n^2 D^2 with J = u_P / (n D), written without a division by n, which may be zero
         revolutions_diameter = n * self.diameter
         thrust_loading = (
             self.k0 * revolutions_diameter * revolutions_diameter
@@ -279,6 +286,8 @@ class MMGForces(nn.Module):
                 inflow * inflow + 8.0 / math.pi * thrust_loading, min=self.min_speed_squared
             )
         )
+        # inflow from both parts of the span, weighted by area; kappa is the share of the
+        # acceleration that the slipstream has reached at the rudder
         rudder_inflow_squared = (
             self.race_share * (inflow + kappa * (race_velocity - inflow)) ** 2
             + (1 - self.race_share) * inflow * inflow
@@ -304,6 +313,7 @@ class MMGForces(nn.Module):
         sway = pressure * y_hull + (1 + a_H) * side_force - mass_x * u * r
         rudder_moment = (self.x_R + a_H * x_H) * self.length * side_force
         yaw = pressure * self.length * n_hull + rudder_moment - mass_moment * u * r
+        # sway and yaw are coupled by x_G: Cramer's rule for two equations
         determinant = mass_y * inertia - mass_moment * mass_moment
         return torch.stack(
             (
@@ -321,7 +331,7 @@ _MAX_STEPS = 20
 """Maximum number of Gauss-Newton steps."""
 _MIN_RELATIVE_GAIN = 1e-9
 """Relative decrease of the negative log-posterior below which the iteration ends."""
-# a parameter that affects one acceleration only is listed under its axis
+# axis of parameters that affect one acceleration only, by the first part of their name
 _AXIS_OF_PREFIX = {"X": "u_dot", "R": "u_dot", "t": "u_dot", "Y": "v_dot", "N": "r_dot"}
 
 
@@ -341,9 +351,9 @@ class MMGBaseline(ParametricBaseline):
         return nu_dot
 
     def parameter_counts(self) -> list[float]:
-        """Return the number of free parameters listed under each axis.
+        """Return the number of free parameters of each axis.
 
-        Parameters of propeller and rudder are counted for every axis.
+        Parameters of propeller and rudder affect several axes and are counted for each.
         """
         free_parameters = [PARAMETER_NAMES[i] for i in self.free_indices().tolist()]
         return [
@@ -405,6 +415,7 @@ def axis_of_parameter(name: str) -> str:
 
 
 def _subsample(samples: Samples) -> Samples:
+    """Return at most about `_MAX_SAMPLES` samples at equal distances."""
     mask = torch.zeros(len(samples), dtype=torch.bool)
     mask[:: max(len(samples) // _MAX_SAMPLES, 1)] = True
     return samples.select(mask)
@@ -473,6 +484,7 @@ class MMGConfig(IdentifiedConfig):
         assert isinstance(baseline, MMGBaseline)
         selected = select_manoeuvres(samples, self.manoeuvres)
         subsample = _subsample(selected)
+        # the likelihood of correlated samples must not outweigh the prior
         independent_samples = len(selected) / self.correlation
         free_index = baseline.free_indices()
         mean, precision = baseline.prior()
@@ -483,12 +495,15 @@ class MMGConfig(IdentifiedConfig):
             return subsample.target - predicted
 
         def negative_log_posterior(theta: Tensor) -> float:
-            likelihood = (
+            # Gaussian likelihood, concentrated with respect to the variance of each axis
+            negative_log_likelihood = (
                 0.5
                 * independent_samples
                 * acceleration_residual(theta).square().mean(0).log().sum()
             )
-            return float(likelihood + 0.5 * (precision * (theta - mean).square()).sum())
+            return float(
+                negative_log_likelihood + 0.5 * (precision * (theta - mean).square()).sum()
+            )
 
         def normal_equations(theta: Tensor) -> tuple[Tensor, Tensor]:
             residual = acceleration_residual(theta)
@@ -516,7 +531,12 @@ class MMGConfig(IdentifiedConfig):
                 " hull, propeller and rudder, and units"
             )
         theta_map = minimize_levenberg_marquardt(
-            mean, linearize, _MAX_STEPS, min_relative_decrease=_MIN_RELATIVE_GAIN, damping=0.0
+            # no initial damping: the prior makes the problem well-conditioned
+            mean,
+            linearize,
+            _MAX_STEPS,
+            min_relative_decrease=_MIN_RELATIVE_GAIN,
+            damping=0.0,
         ).minimizer
         standard_errors = torch.linalg.inv(normal_equations(theta_map)[0]).diagonal().sqrt()
         theta = baseline.theta.detach().clone()

@@ -1,8 +1,9 @@
 """Baselines that are linear in their coefficients, nu_dot = Theta phi(z), with named regressors.
 
-Least squares does not ensure a damped model. A term such as u r in yaw may have either sign, and if
-sway and yaw are correlated in the logs, negative damping of this term can be cancelled by terms in
-sway: the fit is good, but the model is unstable. The option `dissipative` removes such terms.
+Least squares does not ensure a damped model. Sway and yaw are often correlated in logs. A term such
+as u r in yaw may then get a coefficient of negative damping that terms in sway cancel in the
+training data: the fit is good, but the model is unstable. The option `dissipative` removes such
+terms.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from residnet.regression.estimator import Coefficient, Solution, evaluate_regres
 from residnet.regression.least_squares import LeastSquares
 
 _RANGE_MARGIN = 0.5
-"""Share of the training range by which a bounded model widens it before clamping."""
+"""Widening of the training range to either side before a bounded model clamps, as a share of it."""
 AxisTermNames = dict[Literal["u", "v", "r", "w", "p", "q"], tuple[str, ...]]
 Penalty = Annotated[float, Field(ge=0)]
 
@@ -94,6 +95,7 @@ class RegressorBaseline(ParametricBaseline):
         )
 
     def forward(self, z: Tensor) -> Tensor:
+        # terms that an axis lacks stay zero, whatever a refit stores in theta
         weights = (self.theta * self.term_mask).to(z.dtype)
         if self.bound is not None:
             clamped: Tensor = self.bound.clamp(z)
@@ -161,11 +163,14 @@ class RegressorBaseline(ParametricBaseline):
         )
         for axis, axis_sign in enumerate(get_axis_parities(samples.names)):
             for term_index, (image, sign) in images.items():
-                # weight 1/4: a term of the wrong parity is its own image with opposite sign
+                # the contrast is zero for symmetric coefficients. A term of the wrong parity is its
+                # own image with the opposite sign: both entries add, so that the factors are 0.5
                 contrast = torch.zeros(self.n_dof * len(terms), dtype=torch.float64)
                 contrast[axis * len(terms) + term_index] += 0.5
                 contrast[axis * len(terms) + image] -= 0.5 * sign * axis_sign
                 precision += energy[term_index] * torch.outer(contrast, contrast)
+        # a penalty of the squared asymmetric acceleration, relative to the residual variance of the
+        # axis
         precision = precision / variance.repeat_interleave(len(terms))[:, None]
         free_index = self.free_indices()
         return precision[free_index][:, free_index]
@@ -192,6 +197,7 @@ class RegressorBaseline(ParametricBaseline):
         if not self.is_dissipative:
             return []
         free_index = self.free_indices().tolist()
+        # d nu_dot_i / d nu_i at samples of the data, term by term
         slopes = _own_velocity_slopes(self.library, samples)
         theta = self.theta.detach()
         undamped = [
@@ -297,6 +303,7 @@ def _find_undamped_term(theta: Tensor, slopes: Tensor) -> int | None:
     Returns:
         The index of the term; None if the axis is damped.
     """
+    # a positive derivative of an acceleration by its own velocity is negative damping
     if not len(slopes) or float((slopes @ theta).median()) <= 0.0:
         return None
     contributions = slopes.mean(0) * theta
@@ -307,7 +314,7 @@ def _find_undamped_term(theta: Tensor, slopes: Tensor) -> int | None:
 def _find_common_undamped_term(
     solutions: Sequence[Solution], terms: Sequence[str], slopes: Tensor
 ) -> set[str]:
-    """Return the set of the undamped term that all solutions share; empty if none."""
+    """Return the undamped term that all solutions have in common, as a set; empty if none."""
     undamped_terms = []
     for solution in solutions:
         coefficient_values = {coefficient.term: coefficient.value for coefficient in solution.table}
@@ -428,7 +435,7 @@ class RegressorsConfig(IdentifiedConfig):
                 outputs=(baseline.output_names[axis],),
             )
 
-        # inactive velocities and angles, whose rates are kinematic, are not fitted
+        # inactive velocities are zero, and rates of angles follow from kinematics: none is fitted
         learned_axes = get_dof(selected.names).regressed_indices
         axis_fits = {}
         velocity_slopes = (
@@ -453,7 +460,8 @@ class RegressorsConfig(IdentifiedConfig):
                         axis_solutions, terms, velocity_slopes[axis]
                     )
                 ):
-                    # the sign of a removed term may change without the undamped term
+                    # terms that were removed by their sign are tried again, because their sign may
+                    # change without the undamped term
                     destabilising = set()
                     undamped = undamped | new_undamped
                 else:

@@ -14,7 +14,8 @@ from residnet.physics.terms import Factor, make_polynomial_terms
 
 SetName = Literal["linear", "fossen", "abkowitz", "astern", "wind", "polynomial_1", "polynomial_2"]
 
-# thrusters act through forces where the model makes them; two fixed thrusters make no sway force
+# default channels by role. If the model computes forces, thrusters act through these; tau_y is
+# missing, because two fixed thrusters produce no sway force
 _DRIVE_NAMES = ("n", "tau_x")
 _STEER_NAMES = ("delta", "delta_s", "tau_n")
 
@@ -94,12 +95,14 @@ def is_force_channel(name: str) -> bool:
 
 
 def _linear_terms(roles: ChannelRoles) -> list[str]:
+    # no force on a submerged hull depends on the depth
     states = [name for name in roles.dynamic_states if name != "z"]
     return ["1", *states, *roles.drives, *roles.steers, *roles.unassigned]
 
 
 def _thrust_terms(drive: str) -> list[str]:
     """Return the term of a force, or the terms of a propeller, whose thrust depends on speed."""
+    # a linear K_T(J) gives n|n| and |n| u; the linear term approximates other actuators
     return [drive] if is_force_channel(drive) else [drive, f"{drive}|{drive}|", f"|{drive}| u"]
 
 
@@ -168,6 +171,7 @@ def submerged_terms(roles: ChannelRoles) -> list[str]:
     thrust_terms = [
         term
         for thruster in thrusters
+        # revolutions of a propeller have no linear term: its thrust is quadratic
         for term in _thrust_terms(thruster)[
             0 if is_force_channel(thruster) or not _is_revolutions(thruster) else 1 :
         ]
@@ -178,7 +182,7 @@ def submerged_terms(roles: ChannelRoles) -> list[str]:
         f"{speed_factor}{fin}{exponent}" for fin in roles.steers for exponent in ("", "^2")
     ]
     damping_terms = [f"{name}|{name}|" for name in velocities]
-    # without roll, weight and buoyancy along heave are nearly independent of pitch
+    # without roll the restoring force is the pitch term; along heave cos(theta) is nearly constant
     vertical_terms = () if "phi" in roles.dynamic_states else ("sin(theta)", "1")
     return [
         *velocities,

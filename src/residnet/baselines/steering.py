@@ -48,11 +48,13 @@ class SteeringBaselineConfig(IdentifiedConfig, ABC):
     @final
     def build(self, names: Sequence[str]) -> RegressorBaseline:
         velocities = get_dof(names).velocities
+        # a model of surge only needs no steering channel, and one without surge no drive
         driving = (
             [self.drive] if velocities == ("u",) else [self.steer] if "u" not in velocities else []
         )
         driving = driving or [self.drive, self.steer]
         require_channels(names, (*self.required_velocities, *driving), f"baseline '{self.kind}'")
+        # the decay of sway is a copy of the yaw coefficient, which a refit must not change
         terms_by_axis = active_terms(self.axis_terms(), names)
         return RegressorBaseline(
             terms_by_axis, names, ((1, "v"),) if terms_by_axis[1] == ("v",) else ()
@@ -143,7 +145,7 @@ class _NomotoBaselineConfig(SteeringBaselineConfig, ABC):
             raise FitError(
                 f"a Nomoto model needs a stable {name}, but the coefficient of {name} in"
                 f" {name}_dot is {slope:.2g} +- {standard_error:.1g} 1/s: the vessel is unstable or"
-                " hardly excited; use a baseline of kind 'regressors' or fit on other `manoeuvres`"
+                " barely excited; use a baseline of kind 'regressors' or fit on other `manoeuvres`"
             )
         return fit
 
@@ -168,6 +170,7 @@ def _ratio_parameters(
         denominator_index = terms.index(ratio.denominator)
         gradient = torch.zeros_like(theta)
         value = ratio.evaluate(dict(zip(terms, theta.tolist(), strict=True)))
+        # delta method: the gradient of a quotient by its numerator and denominator
         gradient[denominator_index] = -value / theta[denominator_index]
         if ratio.numerator is not None:
             gradient[terms.index(ratio.numerator)] += ratio.sign / theta[denominator_index]
@@ -347,6 +350,7 @@ class LinearSteadyConfig(SteeringBaselineConfig):
         )
         a = fit.coefficients
         a_standard_error = fit.standard_errors
+        # x_dot = A (x - Phi tau - Phi_bias), with A transposed: rows are regressors
         coefficients = torch.cat((a, -phi @ a))
         variance = (
             phi_standard_error.square() @ a.square() + phi.square() @ a_standard_error.square()

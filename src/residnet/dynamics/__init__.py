@@ -1,1 +1,1 @@
-"""Models in discrete time, and the one time loop that runs them all."""
+"""Models in discrete time: interface, hybrid models, ensembles, plants and their storage."""

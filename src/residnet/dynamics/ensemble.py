@@ -43,7 +43,7 @@ class MeanBaseline(Baseline):
 
 @final
 class MeanHead(ResidualHead):
-    """A head that is the mean residual of several; its memory joins their memories."""
+    """A head that is the mean residual of several heads; its memory concatenates their memories."""
 
     def __init__(self, members: Sequence[ResidualHead]) -> None:
         super().__init__()
@@ -92,9 +92,10 @@ def mean_of(members: Sequence[HybridDynamics]) -> HybridDynamics:
 
 
 _MEASUREMENT_SHARE = 1e-3
-"""Share of a velocity's training range by which a measurement differs from a prediction.
+"""Scale of the innovation that distinguishes a measured state from a predicted one.
 
-Accelerations change velocities by more in a step, and rounding in float32 by less.
+As a share of the training range of a velocity. Measurement noise exceeds it, rounding in float32
+does not.
 """
 
 
@@ -110,7 +111,7 @@ class MeanOfTrajectories(HybridDynamics):
     integrated with the mean velocities.
 
     Args:
-        members: with the same signals and step; all have the same weight.
+        members: models with the same signals and time step, equally weighted.
         low: smallest dynamic states in the training data [n].
         high: largest dynamic states in the training data [n].
     """
@@ -132,7 +133,8 @@ class MeanOfTrajectories(HybridDynamics):
             member.has_position = False
         self.copies = [member.head.batch_ensemble_size for member in members]
         self.memory_sizes = [self.dof + member.n_state for member in members]
-        # the mean's own memory comes first: whether there is a prediction, and the prediction
+        # memory of the mean: a flag whether there is a prediction, and the predicted velocities;
+        # then the memories of the members
         *self.offsets, self.n_state = accumulate(
             (copies * size for copies, size in zip(self.copies, self.memory_sizes, strict=True)),
             initial=1 + self.dof,
@@ -159,9 +161,9 @@ class MeanOfTrajectories(HybridDynamics):
         return self._average(x, next_states, memories)
 
     def _continuation(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the share [B, 1] of their deviations that members keep.
+        """Return the factor [B, 1] of the members' deviations from the mean velocities.
 
-        It is 1 where the state is the prediction, and close to 0 where it is measured.
+        It is 1 if the state is the prediction, and close to 0 if it is measured.
         """
         innovation = dynamic_states(x, self.dof) - s[:, 1 : 1 + self.dof]
         scaled = innovation / self.innovation_scale.to(x.dtype)
@@ -171,6 +173,7 @@ class MeanOfTrajectories(HybridDynamics):
         self, x: Tensor, s: Tensor, continuation: Tensor, i: int
     ) -> tuple[Tensor, Tensor]:
         """Return the states and memories [K B, ...] from which member i steps."""
+        # a head with a batch of networks steps K copies of each row
         copies = self.copies[i]
         size = self.memory_sizes[i]
         n_rows = x.shape[0]
@@ -210,7 +213,7 @@ class MeanOfTrajectories(HybridDynamics):
             member_memory = torch.cat((velocities - mean, memory), dim=-1)
             parts.append(member_memory.transpose(0, 1).reshape(n_rows, self.copies[i] * size))
 
-        # midpoint rule: the pose moves with the mean of old and new velocities at half the turn
+        # midpoint rule: mean of old and new velocities, at the heading in the middle of the step
         mid_velocities = 0.5 * (nu + mean)
         end_pose = pose(x) + self.dt * self.kinematics(torch.cat((pose(x), mid_velocities), dim=-1))
         mid_heading = 0.5 * (pose(x) + end_pose)[:, 2:]
@@ -220,7 +223,7 @@ class MeanOfTrajectories(HybridDynamics):
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
         s = y_history.new_zeros((y_history.shape[0], self.n_state))
-        # nothing is trained through the mean, and a graph of a long past would fill the memory
+        # no training uses this model, and the autograd graph of a long past would need much memory
         with torch.no_grad():
             for k in range(y_history.shape[1]):
                 s = self.step(y_history[:, k], w_history[:, k], s)[1]
@@ -262,7 +265,7 @@ class MeanOfTrajectories(HybridDynamics):
 
 @final
 class SampledDynamics(Dynamics):
-    """A model that runs with many samples of one parameter side by side.
+    """A model that runs with many samples of one parameter in parallel.
 
     Rows [M * D] of a batch are M manoeuvres with D samples each (samples vary fastest); sample d
     runs with theta[d] in place of the parameter.

@@ -23,7 +23,7 @@ from residnet.physics.signals import Signals
 from residnet.physics.symmetry import get_dof
 
 _SEGMENT_DURATION = 20.0
-"""Length in s of the segments into which a measurement is cut, and of the past of each segment."""
+"""Duration in s of the segments of a measurement, and of the warm-up that precedes each segment."""
 MAX_MEMORY = 100.0
 """Largest velocity or acceleration that a memory may hold, SI."""
 
@@ -51,6 +51,8 @@ class InnovationFilter(nn.Module):
         self.size = 1 + 2 * dof.n_dynamic
         self.is_fully_regressed = len(dof.regressed_indices) == dof.n_dynamic
         self.mask = nn.Buffer(dof.equation_mask(), persistent=False)
+        # exact discretisation of a first-order lag; the division by dt turns a velocity error per
+        # step into an acceleration
         self.decay = math.exp(-dt / time_constant)
         self.gain = (1.0 - self.decay) / dt
 
@@ -90,8 +92,9 @@ class InnovationFilter(nn.Module):
 class HybridDynamics(Dynamics):
     """A hybrid model with the state x [B, 3 + n]: x, y, psi, then the dynamic states u, v, r etc.
 
-    The head is evaluated once per step and its residual held over the stages of the integrator. A
-    head with an innovation time constant receives the filtered innovation as further channels.
+    The head is evaluated once per time step, and its residual is constant over the stages of the
+    integrator. A head with an innovation time constant receives the filtered innovation as further
+    channels.
     """
 
     def __init__(
@@ -240,8 +243,8 @@ class HybridDynamics(Dynamics):
     ) -> Tensor:
         """Return nu_dot [B, T, n] of a head that receives the innovation.
 
-        Long measurements are cut into segments that run side by side. Each starts with the previous
-        segment, so that its memory has settled.
+        Long measurements are split into segments that run in parallel. Each begins one segment
+        earlier as a warm-up, so that its memory has converged.
 
         Args:
             z: channels [B, T, nz].
@@ -264,7 +267,7 @@ class HybridDynamics(Dynamics):
             part[:, index].repeat(n_copies, 1, 1, 1).flatten(0, 1) for part in (z, baseline)
         )
 
-        # Euler predictions of the velocities stand in for the step; positions do not matter
+        # one Euler step predicts the velocities, instead of the integrator; positions do not matter
         zero_pose = z.new_zeros((*z.shape[:-1], 3))
         x = torch.cat((zero_pose, z[..., :n]), dim=-1)
         s = z.new_zeros((len(z), self.n_state))
@@ -276,6 +279,7 @@ class HybridDynamics(Dynamics):
             nu_dot = self.total_acceleration(baseline[:, k], rho, z[:, k, :n])
             next_state = torch.cat((x[:, k, :3], x[:, k, 3:] + self.dt * nu_dot), dim=-1)
             filter_memory = innovation_filter.next_memory(next_state, innovation)
+            # before the first and after the last sample the memory is reset to zero
             s = torch.cat((head_memory, filter_memory), dim=-1) * is_inside[:, k, None]
             accelerations.append(nu_dot)
         recorded = torch.stack(accelerations[length:], dim=1).reshape(n_copies, n_rows, -1, n)

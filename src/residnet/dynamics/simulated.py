@@ -36,10 +36,10 @@ def check_steps(duration: float, step: float, what: str = "duration") -> None:
 
 @final
 class PlantDynamics(Dynamics):
-    """A plant integrated with RK4 under held actuators, which move after the step.
+    """A plant integrated by RK4 with constant actuator positions, which are updated after the step.
 
-    The reference data of the tests use the same order. Inputs are constant over all sub-steps of a
-    step.
+    The reference data of the tests have the same order of updates. Inputs are constant over all
+    sub-steps of a step.
     """
 
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
@@ -62,8 +62,8 @@ class PlantDynamics(Dynamics):
 class InAmbientCurrent(Dynamics):
     """A model in a steady uniform current, which may differ from row to row.
 
-    u and v are velocities through the water, x and y the position over ground. The
-    current does not change the motion relative to the water; it only adds a drift to the position.
+    u and v are velocities through the water, x and y the position over ground. The current does not
+    change the motion relative to the water; it only adds a drift to the position.
     The memory s [B, 2 + k] is the current to the north and to the east in m/s, followed by the
     memory of the model.
 

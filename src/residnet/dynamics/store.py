@@ -182,14 +182,15 @@ class ModelSpec(Stored):
         if head.n_dof != dof.n_dynamic:
             raise ConfigError(
                 f"model {self.name}: its head has {head.n_dof} accelerations, expected one for"
-                f" each of"
-                f" {', '.join(dof.dynamic_states)}; pass these names to ResidualHead as channels"
+                f" each of {', '.join(dof.dynamic_states)}; pass these names to ResidualHead as"
+                " channels"
             )
         baseline = self.baseline.build(signals.names)
+        # a residual in force space needs the masses of the baseline
         head.set_inertia(baseline.inertia_matrix())
         model = HybridDynamics(signals, baseline, head, self.dt, self.integrator)
         if self.role == "constant_velocity":
-            # constant velocity: the angles are constant too
+            # roll and pitch are constant too, although their rates are states
             model.angle_rate_matrix.zero_()
             if dof.is_six_dof:
                 # the vessel moves horizontally, at constant depth
@@ -323,6 +324,7 @@ def read_weights(folder: Path, module: nn.Module) -> None:
     file = folder / _WEIGHTS
     remedy = "restore the folder or run the fit again"
     try:
+        # a device or pipe from a stranger is not opened, and the size is limited
         weights = read_regular_file(file, SIZE_LIMITS[".safetensors"])
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -330,8 +332,7 @@ def read_weights(folder: Path, module: nn.Module) -> None:
     if hashlib.sha256(weights).hexdigest() != _read_description(folder).get("sha256"):
         raise UsageError(
             f"{file}: its SHA-256 is not the one in {_DESCRIPTION}, so the file is truncated,"
-            f" edited"
-            f" or from another folder; {remedy}"
+            f" edited or from another folder; {remedy}"
         )
     try:
         tensors = load(weights)

@@ -1,4 +1,4 @@
-"""CasADi functions as C statements, and the compiler that makes libraries of them."""
+"""Translation of CasADi functions to C statements, and compilation to shared libraries."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FUNCTIONS: Final = {
         "hypot", "pow", "fmod", "copysign",
     )
 } | {ca.OP_CONSTPOW: "pow"}  # fmt: skip
-"""Operations that C's own library has."""
+"""Operations that are functions of the C library."""
 _OPERATORS: Final = {
     ca.OP_ADD: "{0} + {1}", ca.OP_SUB: "{0} - {1}", ca.OP_MUL: "{0} * {1}",
     ca.OP_DIV: "{0} / {1}", ca.OP_NEG: "-{0}", ca.OP_SQ: "{0} * {0}", ca.OP_TWICE: "{0} + {0}",
@@ -43,9 +43,9 @@ _COMPARISONS: Final = {
 }  # fmt: skip
 _LOGICAL: Final = {ca.OP_NOT: "!{0}", ca.OP_AND: "{0} && {1}", ca.OP_OR: "{0} || {1}"}
 _MAX_UNROLLED_LENGTH: Final = 24
-"""Longest operation that is written out, where it could be a loop."""
+"""Largest number of elements of an operation that is unrolled instead of written as a loop."""
 _MAX_UNROLLED_PRODUCTS: Final = 256
-"""Most products of a small matrix that are written out."""
+"""Largest number of scalar products of a matrix product that is unrolled."""
 
 
 def write_literal(value: float) -> str:
@@ -76,13 +76,13 @@ class Tables:
 
 @dataclass(frozen=True)
 class _CColumn:
-    """Numbers in C.
+    """A column of numbers as C expressions.
 
     Attributes:
-        cells: each of them.
-        array: where they lie side by side, or are taken from by `places`; None of single numbers.
-        places: in that array; None for all from its beginning on.
-        flag: whether they are truth values.
+        cells: expression of each number.
+        array: name of the C array that contains the numbers; None for separate variables.
+        indices: positions of the numbers in that array; None for all from its beginning.
+        is_boolean: whether the numbers are truth values.
     """
 
     cells: Sequence[str]
@@ -91,6 +91,7 @@ class _CColumn:
     is_boolean: bool = False
 
     def select(self, indices: Sequence[int]) -> _CColumn:
+        """Return the numbers at some positions of the column."""
         cells = [self.cells[i] for i in indices]
         if self.array is None:
             return _CColumn(cells, is_boolean=self.is_boolean)
@@ -99,7 +100,7 @@ class _CColumn:
 
 
 class FunctionWriter:
-    """Writes a function as C statements: single numbers where few act, loops where many do.
+    """Writes a function as C statements: scalars for short columns, loops for long ones.
 
     Args:
         function: CasADi function of dense columns.
@@ -107,8 +108,11 @@ class FunctionWriter:
         what: name of the function, for messages.
 
     Attributes:
-        lines: name and text of each statement.
+        lines: name of the variable and text of each statement.
         results: C expressions of each result, complete after all statements are written.
+        conditional_halves: condition, its type and value of each variable that is `c ? value : 0`.
+        negated: condition of which a variable is the negation.
+        constants: literals, which are propagated instead of stored.
     """
 
     REAL: str = "REAL"
@@ -157,10 +161,11 @@ class FunctionWriter:
                 columns.update(zip(outputs, results, strict=True))
 
     def store_result(self, result: int, column: _CColumn) -> None:
-        """Take numbers as those that come next in a result."""
+        """Append numbers to a result, which CasADi may write in several parts."""
         self.results[result] += [self.to_real(cell, column.is_boolean) for cell in column.cells]
 
     def write_constant(self, k: int) -> _CColumn:
+        """Return the constant of an instruction, in a table if it is long."""
         if self.is_scalar_function:
             values = [self.function.instruction_constant(k)]
         else:
@@ -177,7 +182,7 @@ class FunctionWriter:
         return f"{name}[{place}]"
 
     def copy_argument(self, argument: int, place: int | None = None) -> _CColumn:
-        """Return an argument, copied because results may go where arguments came from."""
+        """Return a copy of an argument, because results may be written to the same memory."""
         name = self.names[argument]
         if place is not None:
             return _CColumn([self.write_scalar(self.argument_expression(name, place))])
@@ -189,6 +194,7 @@ class FunctionWriter:
         return self.write_loop(size, f"{name}[i]", False)
 
     def new_name(self) -> str:
+        """Return the name of a new variable, unique because each statement defines one."""
         return f"t{len(self.lines)}"
 
     def write_scalar(self, text: str, is_boolean: bool = False) -> str:
@@ -200,7 +206,7 @@ class FunctionWriter:
         return name
 
     def write_loop(self, size: int, text: str, is_boolean: bool) -> _CColumn:
-        """Write an array whose entry i is what a text says."""
+        """Write a loop that fills an array; `text` is the expression of entry i."""
         name = self.new_name()
         c_type = self.FLAG if is_boolean else self.REAL
         self.lines.append(
@@ -285,7 +291,7 @@ class FunctionWriter:
         return _CColumn([self.write_scalar(self.to_real(cell, True)) for cell in column.cells])
 
     def write_elementwise(self, op: int, operands: Sequence[_CColumn]) -> _CColumn:
-        """Write an operation on each element; single numbers go with each."""
+        """Write an operation on each element; a single number is broadcast."""
         size = max(len(column.cells) for column in operands)
         is_boolean = op in _COMPARISONS or op in _LOGICAL
         if size <= self.max_unrolled_length:
@@ -314,7 +320,7 @@ class FunctionWriter:
     def write_scalar_operation(
         self, op: int, expressions: Sequence[str], flags: Sequence[bool], is_boolean: bool
     ) -> str:
-        """Write an operation on single numbers; what does nothing is left out."""
+        """Write an operation on single numbers; additions of 0 and products with 1 are omitted."""
         is_constant = [cell in self.constants for cell in expressions]
         if op == ca.OP_ADD and self.zero_literal in expressions and not any(flags):
             return expressions[expressions[0] == self.zero_literal]
@@ -332,7 +338,9 @@ class FunctionWriter:
     def note_conditional(
         self, op: int, name: str, expressions: Sequence[str], flags: Sequence[bool]
     ) -> None:
-        """Remember halves of a choice, which CasADi has as the sum of two."""
+        """Record parts of a conditional: CasADi writes if_else(c, a, b) as (c ? a : 0) + (!c ? b :
+        0).
+        """
         if op == ca.OP_IF_ELSE_ZERO:
             self.conditional_halves[name] = (
                 expressions[0],
@@ -343,7 +351,7 @@ class FunctionWriter:
             self.negated[name] = expressions[0]
 
     def find_conditional(self, expressions: Sequence[str]) -> tuple[str, str, str] | None:
-        """Return condition, value and alternative where two halves of a choice are added."""
+        """Return condition, value and alternative if a sum adds both parts of a conditional."""
         for first, second in (expressions, expressions[::-1]):
             if first in self.conditional_halves and second in self.conditional_halves:
                 condition, is_boolean, value = self.conditional_halves[first]
@@ -355,7 +363,7 @@ class FunctionWriter:
     def operation_expression(
         self, op: int, expressions: Sequence[str], flags: Sequence[bool]
     ) -> str:
-        """Return an operation on numbers in C."""
+        """Return the C expression of an operation on numbers."""
         if op == ca.OP_ADD and (conditional := self.find_conditional(expressions)) is not None:
             return self.conditional_expression(*conditional)
         if op == ca.OP_IF_ELSE_ZERO:
@@ -421,7 +429,7 @@ class FunctionWriter:
             return _CColumn(cells)
         a, b = self.as_array(left), self.as_array(right)
         if rows == columns == 1:
-            # eight sums side by side, which compilers vectorise
+            # eight partial sums, which compilers vectorise
             name = self.new_name()
             n_unrolled = inner - inner % 8
             text = (
@@ -447,7 +455,7 @@ class FunctionWriter:
         return result
 
     def used_statements(self, results: Sequence[str]) -> list[str]:
-        """Return the statements that the last ones need, and those."""
+        """Return the statements that some last statements depend on, followed by these."""
         used_names = set(re.findall(r"\w+", " ".join(results)))
         statements = []
         for name, text in reversed(self.lines):
@@ -458,7 +466,7 @@ class FunctionWriter:
 
 
 def _write_sum(terms: Sequence[str]) -> str:
-    """Return a sum in pairs, whose parts a processor adds side by side."""
+    """Return a pairwise sum, whose parts a processor can add in parallel."""
     if len(terms) < 3:
         return " + ".join(terms)
     half = len(terms) // 2
@@ -506,9 +514,9 @@ _MAX_CACHED_LIBRARIES = 64
 def load_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
     """Return a library compiled for this machine from a C source, or from the cache.
 
-    The cache is `residnet/compiled` in `XDG_CACHE_HOME`, or in `~/.cache`; `RESIDNET_CACHE` names
-    a folder in which the cache is the folder `residnet-cache`. If the
-    folder is not writable or a file in it was changed, the library is compiled at every call.
+    The cache is `residnet/compiled` in `XDG_CACHE_HOME`, or in `~/.cache`. If `RESIDNET_CACHE` is
+    set, it is the folder `residnet-cache` there. If the folder is not writable or a file in it was
+    changed, the library is compiled at every call.
 
     Args:
         source: C source.
@@ -521,6 +529,7 @@ def load_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
     flags = ("-O0", *_FLAGS[1:]) if quick else _FLAGS
     path = _cache_path(compiler_path, source, flags)
     try:
+        # the manifest has checksums of the files that residnet wrote: no other library is loaded
         manifest = Manifest(path.parent)
         if not manifest.is_owned(path):
             with tempfile.TemporaryDirectory() as folder:
@@ -584,7 +593,7 @@ def _run_compiler(
         process = subprocess.run(command, capture_output=True, text=True)
     if process.returncode:
         messages = process.stderr.strip().splitlines() or ["no message"]
-        raise CompilerError(f"compiled code does not compile ({messages[0]})")
+        raise CompilerError(f"the generated C code does not compile ({messages[0]})")
 
 
 def _evict_old_libraries(manifest: Manifest) -> None:

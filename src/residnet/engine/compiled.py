@@ -35,10 +35,11 @@ from residnet.engine.rollout import Rollout
 from residnet.engine.trace import RowProduct, StepParts, split_step, to_scalar_function
 
 _MAX_INSTRUCTIONS = 20_000
-"""Most scalar operations of a step: a compiler takes minutes for more."""
+"""Largest number of scalar operations of a step: for more, compilation takes minutes."""
 _CARRIED = ("x", "s", "q")
-"""Arguments that a step returns updated: state, memory of the model and memory of the source."""
+"""Arguments that a step updates: state x, memory s of the model and memory q of the source."""
 _LABEL = "rollout"
+"""Name of the model in messages."""
 _BINARY_FUNCTIONS = ("atan2", "hypot", "pow", "fmod", "copysign")
 
 
@@ -57,7 +58,7 @@ _SCALAR_FUNCTIONS = {
 
 
 def _write_horner(x: str, *coefficients: float) -> str:
-    """Return Horner's scheme for a polynomial in C; coefficients in ascending order."""
+    """Return Horner's scheme of a polynomial in x in C; coefficients in ascending order."""
     constant, *higher = coefficients
     return (
         f"(ALL({constant!r}) + {x} * {_write_horner(x, *higher)})"
@@ -205,6 +206,13 @@ def _write_prelude(dtype: torch.dtype) -> str:
 
 
 Calls = Mapping[str, Sequence[tuple[str, str]]]
+"""For each result of a step, the quantities computed from it by loops, and their statements."""
+_STEP_ARGUMENTS = ("x", "w", "s", "q", "own", "theta")
+"""Arguments of a step before the products.
+
+They are state, inputs, memories of model and source, tensors that differ from row to row, and the
+entries of shared tensors.
+"""
 
 
 class _LaneWriter(FunctionWriter):
@@ -502,18 +510,19 @@ def _write_product_calls(
     return statements
 
 
-_STEP_ARGUMENTS = ("x", "w", "s", "q", "own", "theta")
-
-
 def _make_symbols(step: ca.Function) -> list[ca.SX]:
+    """Return a scalar symbol for each entry of the arguments of a step."""
     return [ca.SX.sym(name, step.numel_in(name)) for name in step.name_in()]
 
 
 def _substitute_detached(
     expression: ca.SX, symbols: Sequence[ca.SX], values: Sequence[ca.SX]
 ) -> ca.SX:
-    """Return an expression with the values that a step detaches."""
-    # a detached value may depend on earlier ones
+    """Replace the symbols of detached values by these values.
+
+    The symbols had no derivative, as `Tensor.detach` requires.
+    """
+    # a detached value may depend on earlier ones, so that the last is replaced first
     for symbol, value in zip(reversed(symbols), reversed(values), strict=True):
         expression = ca.substitute(expression, symbol, value)
     return ca.densify(expression)
@@ -560,12 +569,14 @@ def _vector_jacobian_function(
     symbols = _make_symbols(step)
     n_arguments = len(_STEP_ARGUMENTS) + n_products
     x, _, s, q, _, theta, *product_values = symbols[:n_arguments]
+    # suffix `_slope`: cotangent, the derivative of the loss with respect to the quantity
     outputs = step.call(symbols)
     factors = outputs[:n_products]
     results = outputs[n_products : n_products + len(_CARRIED) + 1]
     slopes = [ca.SX.sym(f"{name}_slope", sizes[name]) for name in (*_CARRIED, "a")]
     factor_slopes = [ca.SX.sym(f"factor_{k}_slope", part.numel()) for k, part in enumerate(factors)]
     variables = [*product_values, x, s, q, theta[list(trained_indices)]]
+    # transposed Jacobian times the cotangents of results and factors
     pullback = ca.jtimes(
         ca.vertcat(*results, *factors),
         ca.vertcat(*variables),
@@ -577,6 +588,7 @@ def _vector_jacobian_function(
     )
     offsets = np.cumsum([0, *(part.numel() for part in variables)]).tolist()
     parts = [pullback[a:b] for a, b in pairwise(offsets)]
+    # later products first: their cotangents are needed for those of earlier products
     order = [*range(n_products)[::-1], *range(n_products, len(parts))]
     names = [f"product_{k}_slope" for k in range(n_products)]
     names += [*(f"{name}_before" for name in _CARRIED), "total"]
@@ -586,6 +598,7 @@ def _vector_jacobian_function(
     representative = dict[str, str]()
     name_of_hash = dict[tuple[int, ...], str]()
     for name in (names[k] for k in order if k in single_products):
+        # products whose results are added have the same expression as cotangent
         hashes = tuple(cell.element_hash() for cell in slope_of_name[name].elements())
         representative[name] = name_of_hash.setdefault(hashes, name)
     result_names = [name for name in slope_of_name if representative.get(name, name) == name]
@@ -613,19 +626,19 @@ class _RolloutStep(nn.Module):
     def forward(self, x: Tensor, w: Tensor, s: Tensor, q: Tensor) -> tuple[Tensor, ...]:
         """Return state, memory of the model, memory of the source, and applied inputs.
 
-        Applied inputs are left out where they are the given ones.
+        Applied inputs are omitted if the source returns the inputs of the rollout.
         """
-        acting, q = self.rollout.source(x, w, 0, q)
-        x, s = self.rollout.model.step(x, acting, s)
-        return x, s, q, acting[:, :0] if self.rollout.source.is_playback else acting
+        applied, q = self.rollout.source(x, w, 0, q)
+        x, s = self.rollout.model.step(x, applied, s)
+        return x, s, q, applied[:, :0] if self.rollout.source.is_playback else applied
 
 
 @final
 class CompiledRollout:
     """A rollout as compiled C, with gradients by parameters, initial states and memory.
 
-    It has no gradient if torch's gradients are disabled when it is made, or no parameter requires
-    one.
+    It has no gradient if gradients were disabled in torch when it was compiled, or if no parameter
+    requires one.
 
     Args:
         rollout: its source must not depend on the number of the step. Parameters and buffers may
@@ -640,7 +653,7 @@ class CompiledRollout:
             can have gradients 10^6 times larger than the other rows.
 
     Raises:
-        ExportError: where a step cannot be traced or written in C, or compilation fails.
+        ExportError: if the step cannot be traced or written in C, or compilation fails.
     """
 
     def __init__(
@@ -656,6 +669,7 @@ class CompiledRollout:
         self.rollout = rollout
         self.row_tensor_names = tuple(row_tensors)
         self.max_gradient_ratio = max_gradient_ratio
+        # traced in float64; the C code has the precision of the runs
         reference = copy.deepcopy(rollout).double()
         tensors = _named_tensors(reference)
         self.shared_names = [
@@ -683,15 +697,15 @@ class CompiledRollout:
 
         rows = [("x", x[:1].double()), ("w", w[:1, 0].double()), ("s", s[:1].double())]
         with torch.no_grad():
-            # a source with tensors per row accepts only as many rows
+            # a source with tensors for each row accepts this number of rows only
             q = reference.source.initial(x.double())
-            acting = reference.source(x.double(), w[:, 0].double(), 0, q)[0]
+            applied = reference.source(x.double(), w[:, 0].double(), 0, q)[0]
         rows += [("q", q[:1]), ("own", self._row_tensors(tensors, 1).double())]
         shared = [tensors[name].detach() for name in self.shared_names]
         names = [f"{name}_after" for name in _CARRIED]
         self.parts = split_step(step, rows, shared, [*names, "a"], _LABEL)
         self.sizes = {name: example.shape[1] for name, example in rows}
-        self.sizes["a"] = 0 if rollout.source.is_playback else acting.shape[1]
+        self.sizes["a"] = 0 if rollout.source.is_playback else applied.shape[1]
         self.trained_indices: list[int] | None = None
         if is_trained:
             # entries of theta that depend on no trained parameter have no gradient
@@ -774,7 +788,17 @@ class CompiledRollout:
         *,
         keep_history: bool,
     ) -> tuple[tuple[Tensor, Tensor, Tensor], list[Tensor]]:
-        """Run forward.
+        """Run all rows in C.
+
+        Args:
+            theta: entries of shared tensors that the scalar function reads.
+            tables: matrices of products, one after the other.
+            x: initial states [B, nx].
+            s: initial memory of the model [B, n_state].
+            row_values: tensors that differ from row to row, flattened [B, n].
+            w: inputs [B, T, m].
+            q: initial memory of the source [B, k].
+            keep_history: whether to store what the gradient needs.
 
         Returns:
             States, inputs and final memory; and the arguments of the gradient: `theta`, tables,
@@ -808,6 +832,7 @@ class CompiledRollout:
         self.call_library(
             "fly", n_blocks, *tensors, applied, stored, int(keep_history), n_steps, n_padded
         )
+        # without history two buffers alternate
         final_memory = memories[0][n_steps if keep_history else n_steps & 1]
         result = (
             states.permute(2, 0, 1)[:n_rows],
@@ -823,7 +848,7 @@ class CompiledRollout:
         )
 
     def call_library(self, name: str, n_blocks: int, *arguments: Tensor | int) -> None:
-        """Call a function of the library for all blocks, in parallel on idle cores."""
+        """Call a function of the library for all blocks of rows, in parallel on idle cores."""
         function = getattr(self.library, name)
         values = [
             ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_long(a)
@@ -852,8 +877,8 @@ class _CompiledRun(torch.autograd.Function):
         *tensors, compiled = arguments
         result: tuple[Tensor, Tensor, Tensor]
         result, history = compiled.run_forward(*tensors, keep_history=True)
-        ctx.loop = compiled
-        ctx.n_repeats = len(result[0])
+        ctx.compiled = compiled
+        ctx.n_rows = len(result[0])
         ctx.save_for_backward(*history)
         return result
 
@@ -861,15 +886,16 @@ class _CompiledRun(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradient of theta, tables, x and s."""
         history = ctx.saved_tensors
-        compiled = ctx.loop
-        n_rows = ctx.n_repeats
+        compiled = ctx.compiled
+        n_rows = ctx.n_rows
         n_steps, _, n_padded = history[4].shape
         cotangents = []
         for grad in (grads[0], grads[1], grads[2][:, None]):
             padded = torch.zeros(*grad.shape[1:], n_padded, dtype=compiled.dtype)
             padded[:, :, :n_rows] = grad.permute(1, 2, 0)
             cotangents.append(padded)
-        # each row is summed by itself, so that the sum does not depend on the number of threads
+        # each row has its own total; the sum over rows then does not depend on the number of
+        # threads
         n_blocks = n_padded // compiled.n_lanes
         n_theta = len(compiled.trained_indices)
         backward_storage = compiled.allocate(n_blocks, n_steps, compiled.backward_storage)
@@ -897,6 +923,8 @@ class _CompiledRun(torch.autograd.Function):
         if not compiled.has_row_gradients:
             gradient_of_product: dict[int, Tensor] = {}
             layout = compiled.backward_storage
+            # products with one cotangent have adjacent factors: their matrices get their gradients
+            # in one batched product of stored factors and cotangents
             ordered_products = sorted(
                 products, key=lambda p: compiled.forward_storage[f"factor_{p[0]}"].start
             )
@@ -928,6 +956,7 @@ class _CompiledRun(torch.autograd.Function):
 
 
 def _storage_size(layout: Mapping[str, slice]) -> int:
+    """Return the number of entries of a layout."""
     return max((entries.stop for entries in layout.values()), default=0)
 
 
@@ -953,7 +982,7 @@ def _clip_row_gradients(gradients: Tensor, cotangent_norm: Tensor, max_ratio: fl
 
 def _named_tensors(rollout: Rollout) -> dict[str, Tensor]:
     """Return the parameters and buffers of a rollout by name."""
-    # `named_parameters` and `named_buffers` take half the time of a short run
+    # `named_parameters` and `named_buffers` would take half the time of a short run
     return {
         f"{module_name}.{name}" if module_name else name: tensor
         for module_name, module in rollout.named_modules()
@@ -966,11 +995,12 @@ def _named_tensors(rollout: Rollout) -> dict[str, Tensor]:
 def _call_with_tensors(
     step: nn.Module, tensors: Mapping[str, Tensor], arguments: tuple[Tensor, ...]
 ) -> Any:
-    """Call a step with these parameters and buffers."""
+    """Call the step of a rollout with other parameters and buffers."""
     tensors = {f"rollout.{name}": tensor for name, tensor in tensors.items()}
     # a tensor shared by two modules would be replaced twice and restored once
     return torch.func.functional_call(step, tensors, arguments, tie_weights=False)
 
 
 def _concatenate(parts: Sequence[Tensor]) -> Tensor:
+    """Return all entries of tensors in one vector, empty for no tensors."""
     return torch.cat([torch.zeros(0), *(part.flatten() for part in parts)])

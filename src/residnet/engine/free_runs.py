@@ -1,4 +1,4 @@
-"""Fast rollouts: as compiled C, or with a traced step."""
+"""Choice of the fastest rollout: compiled C, a traced step, or the step in Python."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class _StructurePickler(pickle.Pickler):
         self.tensor_ids = {id(tensor) for tensor in (*rollout.parameters(), *rollout.buffers())}
 
     def persistent_id(self, obj: Any) -> Any:
-        """Return what identifies a tensor: its type and shape, or its values if it is constant."""
+        """Return the identity of a tensor: type and shape, or type and values of a constant."""
         if not isinstance(obj, Tensor):
             return None
         if obj.is_floating_point() and id(obj) in self.tensor_ids:
@@ -45,9 +45,9 @@ _COMPILED: dict[bytes, CompiledRollout | Literal[False]] = {}
 
 
 def compile_rollout(rollout: Rollout, steps: int) -> FreeRun:
-    """Compile a rollout to C, or trace its step where C is impossible or does not pay.
+    """Compile a rollout to C, or trace its step if C is impossible or compilation takes longer.
 
-    Rollouts that differ in parameters and buffers alone are compiled once.
+    Rollouts that differ only in parameters and buffers are compiled once.
 
     Args:
         rollout: the rollout on its device, in its type and mode (training or evaluation).
@@ -102,5 +102,5 @@ def _select_run(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) 
 
 @cache
 def _report_missing_compiler(reason: str) -> None:
-    """Say once per process why free runs are slow."""
+    """Log once per process why free runs are slow."""
     log_message(f"  free runs are not compiled and take longer: {reason}")

@@ -57,9 +57,10 @@ class _BaselineStep(nn.Module):
 
 @final
 class StepJacobian:
-    """Derivatives of heading and dynamic states after a step by themselves and the parameters.
+    """Jacobian of a step: heading and dynamic states by their previous values and the parameters.
 
-    The position is left out: nothing in body axes depends on it. All numbers are float64.
+    The position is omitted, because the dynamics in body axes do not depend on it. All numbers are
+    float64.
 
     Attributes:
         free_indices: indices of the free parameters in the flattened theta.

@@ -64,6 +64,7 @@ class RecordedPlantDynamics(Dynamics):
         arguments: list[Any] = [part.detach().double().contiguous().numpy() for part in (x, w)]
         result: Any = next_state.numpy()
         for i, argument in enumerate(arguments):
+            # CasADi reads and writes the memory of the tensors directly, without copies
             buffer.set_arg(i, memoryview(argument))
         buffer.set_res(0, memoryview(result))
         evaluate()

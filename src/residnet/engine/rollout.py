@@ -1,7 +1,7 @@
 """The time loop of all simulations: batched and differentiable.
 
-Its inputs come from a `Source`: playback of given inputs, or a manoeuvre that steers by the state.
-A source can stop rows: their state is held from that sample on.
+Its inputs come from a `Source`: playback of recorded inputs, or a manoeuvre with feedback of the
+state. A source can stop rows of the batch, whose state is then constant.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Source(nn.Module, ABC):
     """The source of the inputs of a rollout.
 
     Args:
-        is_playback: whether the inputs are those given to the rollout, independent of the state.
+        is_playback: whether the source returns the inputs of the rollout, independent of the state.
 
     Attributes:
         depends_on_step: whether the inputs depend on the number of the step.
@@ -45,7 +45,7 @@ class Source(nn.Module, ABC):
 
         Args:
             x: states [B, nx].
-            w: inputs given for the step [B, m].
+            w: inputs of the rollout in this step [B, m].
             k: number of the step.
             memory: memory of the source [B, k].
         """
@@ -57,7 +57,7 @@ class Source(nn.Module, ABC):
 
 @final
 class Playback(Source):
-    """A source that returns the given inputs."""
+    """A source that returns the inputs of the rollout."""
 
     def __init__(self) -> None:
         super().__init__(is_playback=True)
@@ -79,7 +79,7 @@ class Rollout(nn.Module):
 
         Args:
             x0: initial states [B, nx].
-            w: given inputs [B, T, m], each row held over its step.
+            w: inputs [B, T, m], constant over each step; the source may replace them.
             s: initial memory [B, n_state].
 
         Returns:
@@ -124,19 +124,19 @@ Step = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 FreeRun = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 """A function with the arguments and results of `Rollout.forward`."""
 MIN_STEPS_TO_COMPILE = 200
-"""Number of steps of a rollout that takes about as long as compiling it or tracing its step.
+"""Number of steps from which compiling a rollout or tracing its step saves time.
 
-It depends on the rollout's own steps alone, so that numbers do not depend on previous runs. C takes
-.2 s once for all models of a structure, a step in torch .15 to 1.3 ms.
+The choice depends on the number of steps only, so that results do not depend on previous runs.
+Compilation takes .2 s once for all models of a structure, a step in torch .15 to 1.3 ms.
 """
 TRAINING_STEPS = 1_000_000
-"""Number of steps of a training, large enough for compiling to pay."""
+"""Nominal number of steps of a training, large enough that it is always compiled."""
 
 
 def has_untraceable_part(rollout: Rollout) -> bool:
-    """Return whether a part of the model runs in Python alone, such as one of scikit-learn.
+    """Return whether a part of the model runs in Python only, such as an estimator of scikit-learn.
 
-    A trace would hold its answers to the examples as constants.
+    A trace would contain its results at the examples as constants.
     """
     return any(bool(getattr(part, "refusal", "")) for part in rollout.modules())
 
@@ -145,14 +145,13 @@ def trace_rollout(rollout: Rollout, steps: int) -> FreeRun:
     """Return the rollout with its model's step traced by TorchScript.
 
     A traced step takes half the time of the step in Python. It shares parameters and buffers with
-    the current state of the model: trace again after the model is moved to another device or type,
-        or
-    changes between training and evaluation.
+    the model. Trace again after the model was moved to another device or dtype, or switched between
+    training and evaluation.
 
     Args:
         rollout: the rollout on its device, in its type and mode.
-        steps: total number of steps that it will run. Where these are too few to pay for the trace
-            the rollout itself is returned.
+        steps: total number of steps that it will run. If tracing takes longer than these, the
+            rollout itself is returned.
     """
     if steps < MIN_STEPS_TO_COMPILE or has_untraceable_part(rollout):
         return rollout

@@ -45,8 +45,10 @@ _SHAPE_ONLY: Final = frozenset(
 )  # fmt: skip
 """Operations whose result depends on the shape of their argument only."""
 _MAX_TABLE_ROWS: Final = 64
-"""Largest table whose look-up becomes a chain of conditionals, which has derivatives and can be
-expanded to scalars. A delay line of one second at 50 Hz has 50 rows.
+"""Largest table whose look-up at run time becomes a chain of conditionals.
+
+A chain has derivatives and can be expanded to scalars. A delay line of one second at 50 Hz has 50
+rows.
 """
 
 
@@ -105,7 +107,7 @@ def lower(
         what: name of the model, for messages.
 
     Raises:
-        ExportError: where an operation is not supported, or Python decides by values.
+        ExportError: if an operation is not supported, or Python branches on values.
     """
     examples = [torch.zeros(1, size, dtype=torch.float64) for _, size in arguments]
     symbols = [ca.MX.sym(name, size) for name, size in arguments]
@@ -545,13 +547,14 @@ def to_scalar_function(function: ca.Function) -> ca.Function:
 def record_graph(step: Callable[..., Any], examples: Sequence[Tensor], what: str) -> Graph:
     """Record the operations of a step on examples as a graph.
 
-    The module that owns the graph holds its constants.
+    The constants of the graph are buffers of the module that owns it.
 
     Raises:
-        ExportError: where Python decides by values.
+        ExportError: if Python branches on values.
     """
     from torch.func import functionalize
 
+    # in-place operations become out-of-place ones, so that each node has one value
     wrapped = functionalize(lambda *arguments: step(*arguments), remove="mutations")
     try:
         with warnings.catch_warnings(), torch.no_grad():
@@ -585,7 +588,7 @@ class _Recorder(TorchDispatchMode):
         self._rules: Any = _core_aten_decompositions_post_autograd()
         self._owner = GraphModule({}, Graph())
         self._graph = Graph(self._owner)
-        # tensors are referenced, so that no other tensor gets the same id
+        # the tensors are stored too: Python may reuse the id of a deleted one
         self._nodes: dict[int, tuple[Node, Tensor]] = {}
         self._varying: set[Node] = set()
 
@@ -606,6 +609,7 @@ class _Recorder(TorchDispatchMode):
         rules = (self._rules.get(func), func.decompose)
         for rule in filter(None, () if _operation_name(func) in _DATA_MOVEMENT else rules):
             with self:
+                # with the mode active the rule's own operations are recorded
                 result = rule(*args, **keyword_arguments)
             if result is not NotImplemented:
                 return result
@@ -616,7 +620,7 @@ class _Recorder(TorchDispatchMode):
             self._varying.add(node)
             if torch.Tag.data_dependent_output in func.tags:
                 raise RuntimeError(
-                    f"{_operation_name(func)} makes a Python number of a tensor that varies"
+                    f"{_operation_name(func)} converts a tensor that varies to a Python number"
                 )
         result = func(*args, **keyword_arguments)
         self._register(node, result)
@@ -628,6 +632,8 @@ class _Recorder(TorchDispatchMode):
             self._nodes[id(result)] = node, result
         elif isinstance(result, list | tuple):
             for k, element in enumerate(result):
+                # operations such as split return several tensors: each is an item of the node's
+                # result
                 element_node = self._graph.call_function(operator.getitem, (node, k))
                 self._varying |= {element_node} if node in self._varying else set()
                 self._register(element_node, element)
@@ -647,7 +653,9 @@ class _Recorder(TorchDispatchMode):
 class _TracedValue:
     """A tensor of the graph: its value at the examples, and its CasADi column in row order.
 
-    Constants have no expression.
+    Attributes:
+        example: value at the examples, which defines shape and dtype.
+        expression: CasADi column; None for a constant, whose column is made when it is needed.
     """
 
     example: Tensor
@@ -655,17 +663,19 @@ class _TracedValue:
 
     @property
     def is_constant(self) -> bool:
+        """Whether the value does not depend on the arguments of the step."""
         return self.expression is None or self.example.numel() == 0
 
     @property
     def column(self) -> Any:
+        """CasADi column of the entries in row order."""
         if self.expression is None:
             self.expression = ca.MX(ca.DM(self.example.double().reshape(-1).tolist()))
-            return self.expression
         return self.expression
 
     @property
     def indices(self) -> Tensor:
+        """Position of each entry in the column, in the shape of the tensor."""
         return torch.arange(self.example.numel()).reshape(self.example.shape)
 
 
@@ -679,6 +689,7 @@ def _select(column: Any, indices: Tensor) -> Any:
 
 
 def _to_traced_value(value: Any) -> _TracedValue:
+    """Return a value of the graph; Python numbers become constants."""
     if isinstance(value, _TracedValue):
         return value
     dtype = torch.bool if isinstance(value, bool) else torch.float64
@@ -700,6 +711,11 @@ def _lower_elementwise(operation: str, example: Tensor, *values: Any) -> _Traced
 
 
 def _lower_operation(target: Any, args: Any, keyword_arguments: Any, what: str) -> Any:
+    """Return the result of an operation of torch.
+
+    Raises:
+        ExportError: if the operation is not supported.
+    """
     if target is operator.getitem:
         return args[0][args[1]]
     name = _operation_name(target)
@@ -714,6 +730,7 @@ def _lower_operation(target: Any, args: Any, keyword_arguments: Any, what: str) 
             part, lambda leaf: leaf.example if isinstance(leaf, _TracedValue) else leaf
         )
 
+    # torch itself computes the shape of the result
     example = target(*to_examples(args), **to_examples(keyword_arguments))
     if name in _SHAPE_ONLY or all(leaf.is_constant for leaf in leaves):
         return (
@@ -726,6 +743,7 @@ def _lower_operation(target: Any, args: Any, keyword_arguments: Any, what: str) 
         if i not in moved_arguments
         for leaf in tree.tree_leaves(arg)
     ]
+    # the same movement of the indices gives the entries of the result, unless it depends on values
     if moved_arguments and all(
         leaf.is_constant for leaf in other_leaves if isinstance(leaf, _TracedValue)
     ):
@@ -752,7 +770,7 @@ def _lower_data_movement(
     keyword_arguments: Any,
     example: Any,
 ) -> Any:
-    """Return the result of a data movement, found by moving the indices of the entries."""
+    """Return the result of a data movement, which torch applies to the indices of the entries."""
     columns: list[Any] = []
     count = 0
 
@@ -801,6 +819,7 @@ def _lower_reduction(
 ) -> _TracedValue:
     rows, size = _reduction_rows(value, dim)
     if name in ("sum", "mean"):
+        # one matrix operation instead of a chain of additions
         total = ca.sum2(ca.reshape(_select(value.column, rows.T), len(rows), size))
         return _TracedValue(example, total / size if name == "mean" else total)
     total = _select(value.column, rows[:, 0])
@@ -825,6 +844,7 @@ def _lower_extremum(
 
 
 def _scale(operand: Any, factor: float) -> Any:
+    """Return an operand times the factor `alpha` or `beta` of an operation of torch."""
     value = _to_traced_value(operand)
     return (
         operand
@@ -834,6 +854,7 @@ def _scale(operand: Any, factor: float) -> Any:
 
 
 def _lower_power(example: Tensor, a: Any, b: Any) -> _TracedValue:
+    """Return a power; small exponents become products, which are faster and exact at a < 0."""
     power = _to_traced_value(b)
     exponent = float(power.example) if power.is_constant and power.example.numel() == 1 else None
     if exponent in (0.5, -1.0, 2.0):
@@ -849,6 +870,7 @@ def _lower_power(example: Tensor, a: Any, b: Any) -> _TracedValue:
 def _lower_division(
     example: Tensor, a: Any, b: Any, rounding_mode: str | None = None
 ) -> _TracedValue:
+    """Return a quotient; the rounding mode is the name of an elementwise operation."""
     ratio = _lower_elementwise("div", example, a, b)
     return ratio if rounding_mode is None else _lower_elementwise(rounding_mode, example, ratio)
 
@@ -856,6 +878,7 @@ def _lower_division(
 def _lower_clamp(
     example: Tensor, value: _TracedValue, min: Any = None, max: Any = None
 ) -> _TracedValue:
+    """Return a clamped value; maximum and minimum propagate NaN as torch does."""
     clamped = value if min is None else _lower_elementwise("maximum", example, value, min)
     return clamped if max is None else _lower_elementwise("minimum", example, clamped, max)
 
@@ -874,6 +897,7 @@ def _lower_cast(example: Tensor, value: _TracedValue, *_: Any, **_settings: Any)
 def _lower_copy(
     example: Tensor, value: _TracedValue, source: _TracedValue, *_: Any
 ) -> _TracedValue:
+    """Return a source broadcast and cast to the shape and type of a value."""
     return _lower_cast(
         example, _lower_elementwise("add", source.example.expand(example.shape), source, 0.0)
     )
@@ -903,6 +927,8 @@ def _lower_product(
 
 
 def _lower_batched_products(example: Tensor, a: _TracedValue, b: _TracedValue) -> _TracedValue:
+    """Return the products of two batches of matrices, one after the other."""
+
     def matrix(value: _TracedValue, i: int) -> _TracedValue:
         column = None if value.expression is None else _select(value.column, value.indices[i])
         return _TracedValue(value.example[i], column)
@@ -914,7 +940,7 @@ def _lower_batched_products(example: Tensor, a: _TracedValue, b: _TracedValue) -
 
 
 def _select_row(table: Any, indices: Tensor, position: Any) -> Any:
-    """Return the row of a table at a position that is known at run time.
+    """Return the row of a table at a position that is only known at run time.
 
     Args:
         table: column of the entries.
@@ -923,6 +949,7 @@ def _select_row(table: Any, indices: Tensor, position: Any) -> Any:
     """
     rows, size = indices.shape
     if rows > _MAX_TABLE_ROWS:
+        # an index at run time: fast, but without derivatives and not expandable to scalars
         row = ca.fmin(ca.fmax(position, 0.0), rows - 1.0)
         return ca.vec(_select(table, indices).get_nz(False, row * size + ca.DM(list(range(size)))))
     selected = _select(table, indices[0])
@@ -948,6 +975,7 @@ def _lower_index_select(
 def _lower_index(
     example: Tensor, table: _TracedValue, indices: Sequence[_TracedValue | None]
 ) -> _TracedValue:
+    """Return `table[index]` for one index tensor along the first dimension."""
     index = indices[0]
     if index is None or len(indices) > 1:
         raise ExportError(
@@ -960,6 +988,7 @@ def _lower_index(
 def _lower_gather(
     example: Tensor, value: _TracedValue, dim: int, index: _TracedValue, **_: Any
 ) -> _TracedValue:
+    """Return entries along a dimension at positions of each row, as `torch.gather`."""
     table_indices = value.indices.movedim(dim, -1)
     index_positions = index.indices.movedim(dim, -1)
     table_indices = table_indices[
@@ -992,4 +1021,4 @@ _SPECIAL_OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
     "argmin": lambda e, x, dim=None, keepdim=False: _lower_extremum("min", (e, e), x, dim)[1],
     "index_select": _lower_index_select, "index": _lower_index, "gather": _lower_gather,
 }  # fmt: skip
-"""Operations with arguments that need a rule each."""
+"""Operations with an individual rule, because of their arguments."""

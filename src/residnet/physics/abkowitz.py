@@ -116,6 +116,7 @@ class AbkowitzConfig(VesselFile):
     @model_validator(mode="after")
     def _validate_series(self) -> AbkowitzConfig:
         parsed_terms = parse_axis_terms(self.coefficients, SERIES_VARIABLES)
+        # dn has a value only with a shaft, and a shaft without terms in dn would have no effect
         if any(factor.name == "dn" for *_, factors in parsed_terms for factor in factors) != (
             self.shaft is not None
         ):
@@ -145,9 +146,11 @@ class AbkowitzConfig(VesselFile):
         mass_terms = self.mass
         length = self.length.value
         is_prime_system = self.units == "prime"
+        # prime system: mass in 0.5 rho L^3, length in L
         mass_unit, length_unit = (
             (0.5 * self.density * length**3, length) if is_prime_system else (1.0, 1.0)
         )
+        # static moment m x_G
         moment = mass_terms.m * mass_terms.x_G
         mass_si = mass_terms.m * mass_unit
         moment_si = moment * mass_unit * length_unit
@@ -167,6 +170,7 @@ class AbkowitzConfig(VesselFile):
         coriolis_rows: tuple[Mapping[str, float], ...] = ({}, {}, {})
         if self.coriolis == "rigid_body":
             coriolis_rows = (
+                # rows of -C_RB(nu) nu (Fossen 2011)
                 {"v r": mass_si, "r^2": moment_si},
                 {"u r": -mass_si},
                 {"u r": -moment_si},
@@ -195,6 +199,7 @@ class AbkowitzForces(ActuatorSystem):
         self.length = config.length.value
         self.speed = config.speed
         self.delta_sign = float(config.delta_sign)
+        # 0.5 rho L^2, the factor of U^2 in the unit of force
         self.pressure_area = 0.5 * config.density * self.length**2
         coefficient_rows = list(config.coefficients.values())
         self.terms = TermLibrary(
@@ -222,12 +227,14 @@ class AbkowitzForces(ActuatorSystem):
         v = nu[..., 1]
         r = nu[..., 2]
         delta = self.delta_sign * position[..., 0]
+        # without a shaft no term contains dn, so that its value does not matter
         dn = position[..., 1] - self.n_0 if self.has_shaft else torch.zeros_like(u)
         coefficients = self.coefficients.to(nu.dtype)
         if not self.is_prime_system:
             series_variables = torch.stack((u - self.speed, v, r, delta, dn), dim=-1)
             force: Tensor = self.terms(series_variables) @ coefficients
             return force
+        # the lower bound keeps v / U finite at rest
         speed = torch.sqrt((u * u + v * v).clamp(min=(0.1 * self.speed) ** 2))
         series_variables = torch.stack(
             ((u - self.speed) / speed, v / speed, r * self.length / speed, delta, dn / self.n_0),

@@ -69,11 +69,13 @@ class SymmetricWindConfig(WindLoadConfig):
     c_n: float = Field(ge=0, le=1)
 
     def wind_forces(self, relative_x: Tensor, relative_y: Tensor) -> Tensor:
-        """Compute the loads [..., 4] without an angle, so that they are smooth at zero wind."""
+        """Compute the loads [..., 4] without an arctangent, which is not smooth at zero wind."""
         frontal_factor = 0.5 * self.density * self.frontal_area
         lateral_factor = 0.5 * self.density * self.lateral_area
         speed = torch.sqrt(relative_x * relative_x + relative_y * relative_y + 1e-12)
         y = lateral_factor * self.c_y * relative_y * speed
+        # C_N sin 2 gamma times the squared speed: sin gamma cos gamma is the product of both
+        # components
         n = -2.0 * lateral_factor * self.length * self.c_n * relative_x * relative_y
         x = frontal_factor * self.c_x * relative_x * speed
         return torch.stack((x, y, self.centre_height * y, n), dim=-1)
@@ -124,7 +126,7 @@ class TabulatedWindConfig(WindLoadConfig):
 
     @cached_property
     def forces_by_angle(self) -> tuple[Tensor, Tensor]:
-        """Return angles [A] and loads X, Y, N per squared speed [A, 3], float64."""
+        """Angles [A] and loads X, Y, N per squared speed [A, 3], float64."""
         reference_areas = [self.frontal_area, self.lateral_area, self.lateral_area * self.length]
         coefficients = torch.tensor([self.C_X, self.C_Y, self.C_N], dtype=torch.float64).T
         areas = torch.tensor(reference_areas, dtype=torch.float64)
@@ -137,11 +139,14 @@ class TabulatedWindConfig(WindLoadConfig):
             values.to(relative_x.dtype) for values in self.forces_by_angle
         )
         speed_squared = relative_x * relative_x + relative_y * relative_y
-        # the angle of a calm is any; a fixed one keeps the gradient finite
+        # in a calm the angle is undefined; a fixed one keeps the gradient of atan2 finite
         head_wind = torch.where(speed_squared < 1e-12, torch.ones_like(relative_x), -relative_x)
         angle = torch.atan2(-relative_y, head_wind)
         upper_index = torch.searchsorted(
-            table_angles, angle.abs().detach().contiguous(), right=True
+            # the index has no gradient; the interpolation within the interval has
+            table_angles,
+            angle.abs().detach().contiguous(),
+            right=True,
         ).clamp(1, table_angles.shape[0] - 1)
         fraction = (
             (angle.abs() - table_angles[upper_index - 1])
@@ -150,6 +155,7 @@ class TabulatedWindConfig(WindLoadConfig):
         force = (
             table_forces[upper_index - 1] * (1.0 - fraction) + table_forces[upper_index] * fraction
         ) * speed_squared.unsqueeze(-1)
+        # the table is for wind from starboard; wind from port mirrors Y, K and N
         side_sign = torch.where(angle < 0, -torch.ones_like(angle), torch.ones_like(angle))
         y = side_sign * force[..., 1]
         return torch.stack(
@@ -197,7 +203,7 @@ class JonswapSpectrumConfig(Config):
             * frequency_ratio**-5.0
             * np.exp(-1.25 * frequency_ratio**-4.0)
         )
-        # narrower below the peak than above
+        # sigma of the JONSWAP peak: narrower below the peak than above it
         peak_width = np.where(frequency_ratio <= 1, 0.07, 0.09)
         peak_enhancement = self.gamma ** np.exp(-((frequency_ratio - 1) ** 2) / (2 * peak_width**2))
         return np.asarray(pierson_moskowitz * peak_enhancement)
@@ -270,6 +276,7 @@ class IrregularWaves(nn.Module):
         omega = frequency_edges[:-1, None] + np.diff(frequency_edges)[:, None] * random.random(
             (n_rows, n_frequencies, n_directions)
         )
+        # spreading is cos^2 about the mean direction, zero beyond +-90 deg
         direction_edges = np.linspace(-np.pi / 2, np.pi / 2, n_directions + 1)
         direction_offset = (
             direction_edges[:-1]
@@ -281,6 +288,8 @@ class IrregularWaves(nn.Module):
             config.spectrum.spectral_density(omega, config.significant_height, config.peak_period)
             * np.cos(direction_offset) ** 2
         )
+        # m0 = H_s^2 / 16; the sum over finitely many components would otherwise miss it by the
+        # tails
         energy *= config.significant_height**2 / 16 / energy.sum(axis=(1, 2), keepdims=True)
         phase = 2 * np.pi * random.random((n_rows, n_frequencies, n_directions))
         components = [
@@ -288,6 +297,7 @@ class IrregularWaves(nn.Module):
             for values in (omega, config.direction + direction_offset, np.sqrt(2 * energy), phase)
         ]
         self.omega, self.direction, self.amplitude, self.phase = components
+        # dispersion relation in deep water
         self.wave_number = self.omega**2 / GRAVITY
         self.specific_weight = config.water_density * GRAVITY
         self.length = config.hull.length
@@ -321,12 +331,16 @@ class IrregularWaves(nn.Module):
         length = self.length
         breadth = self.breadth
         bottom_decay = torch.exp(-wave_number * self.draught)
+        # torch.sinc is sin(pi x) / (pi x)
         sinc_length = torch.sinc(0.5 * wave_number * cos_chi * length / torch.pi)
         sinc_breadth = torch.sinc(0.5 * wave_number * sin_chi * breadth / torch.pi)
+        # the wave pressure decays with exp(-k z); integrated over the draught it gives 1 - exp(-k
+        # T)
         pressure = self.specific_weight * (1.0 - bottom_decay)
         area_factor = length * breadth * sinc_length * sinc_breadth
         moment_x = _sine_first_moment(wave_number * cos_chi, length)
         moment_y = _sine_first_moment(wave_number * sin_chi, breadth)
+        # first moment of the pressure about the waterline, for the roll moment of the side walls
         pressure_arm = (1.0 - bottom_decay * (1.0 + wave_number * self.draught)) / wave_number
         roll_response = self.specific_weight * (
             sin_chi * pressure_arm * area_factor - bottom_decay * length * sinc_length * moment_y
@@ -361,6 +375,7 @@ def _sine_first_moment(kappa: Tensor, width: float) -> Tensor:
     Near zero a series replaces the closed form, which suffers from cancellation.
     """
     half_width = 0.5 * width
+    # the replaced argument also keeps the gradient of the branch that is not used finite
     is_small = kappa.abs() * half_width < 1e-2
     safe_kappa = torch.where(is_small, torch.ones_like(kappa), kappa)
     closed_form = (

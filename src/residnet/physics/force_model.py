@@ -48,7 +48,7 @@ FERRY_TERMS: tuple[str, ...] = (
 _MAX_CONDITION = 100.0
 """Maximum condition number of a mass matrix relative to that of the prior model.
 
-Above this value the mass of some axis is less than a hundredth of another and not physical.
+Above this value one axis has less than a hundredth of the mass of another, which is not physical.
 """
 
 
@@ -69,6 +69,7 @@ def weighted_column_std(terms: Sequence[str], x: Tensor) -> Tensor:
         FitError: if a column is constant.
     """
     std = x.std(0)
+    # a constant column is collinear with the intercept
     is_constant = std <= 1e-9 * x.abs().amax(0).clamp(min=1e-300)
     if bool(is_constant.any()):
         raise FitError(
@@ -157,6 +158,8 @@ class ForceModel(nn.Module):
         It is the force of the motion minus the constant external force.
         """
         earth_force = self.earth_force.to(nu.dtype)
+        # mean wind and current forces are constant in earth axes and turn with the heading in body
+        # axes
         body_x, body_y = to_body(earth_force[0], earth_force[1], psi)
         required_force: Tensor = self(nu_dot, nu) - torch.stack(
             (body_x, body_y, torch.zeros_like(body_x)), dim=-1
@@ -219,8 +222,10 @@ def augment_mass(
     augmented_mass = mass.clone()
     other_terms = [j for j in range(len(terms)) if j not in axis_of_term]
     for j, axis in axis_of_term.items():
+        # the coefficient of u_dot in eps is an added mass: it moves to the left-hand side
         augmented_mass[:, axis] += coefficients[j]
-    # in units of the believed masses, so that an axis that has lost its mass shows
+    # divided by the prior masses, so that the condition number does not depend on the units kg and
+    # kg m^2, and shows an axis whose fitted added mass cancels its mass
     scale = mass.diagonal().abs().sqrt()
     eigenvalues = torch.linalg.eigvals(augmented_mass).real
     condition = float(torch.linalg.cond(augmented_mass / torch.outer(scale, scale)))

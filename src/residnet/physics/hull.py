@@ -95,8 +95,12 @@ def _axis_terms_validator(
     def validate_units(axis_terms: dict[str, AxisTerms]) -> dict[str, AxisTerms]:
         for axis, term, factors in parse_axis_terms(axis_terms, channels, functions=False):
             metre_power = _METRE_POWER[axis] - sum(
-                factor.power for factor in factors if factor.name in ("u", "v", "w")
+                # each linear velocity in a term takes a metre from the unit of its coefficient
+                factor.power
+                for factor in factors
+                if factor.name in ("u", "v", "w")
             )
+            # each velocity or rate adds a second; the roll angle is dimensionless
             second_power = -2 + sum(factor.power for factor in factors if factor.name != "phi")
             unit = axis_terms[axis][term].unit
             if parse_dimension(unit, mass_power) != (metre_power, second_power):
@@ -207,10 +211,13 @@ class HullConfig(HullVessel, ABC):
         surge = mass[0][0]
         sway = mass[1][1]
         coupling = self.scale * self.sway_yaw_coupling()
+        # D(nu) nu is on the left-hand side: as a force it has the opposite sign
         coefficients = coefficient_rows(self.damping, -self.scale)
         for axis_coefficients, coriolis in zip(
             coefficients,
             (
+                # rows of -C(nu) nu for a mass matrix with the entries m11, m22 and m23 (Fossen
+                # 2011)
                 {"v r": sway, "r^2": coupling},
                 {"u r": -surge},
                 {"u v": surge - sway, "u r": -coupling},
@@ -337,6 +344,7 @@ class AccelerationHullConfig(HullVessel):
 
     def build_hull(self) -> Hull:
         """Build the hull, whose masses are the reciprocals of the gains."""
+        # the terms are accelerations: multiplied by the mass they are forces, and the mass cancels
         mass = [1.0 / gain.value for gain in (self.gains.x, self.gains.y, self.gains.n)]
         force_rows = [
             {term: m * value for term, value in acceleration_row.items()}
@@ -434,6 +442,7 @@ class RollingHullConfig(HullVessel):
         m = rigid_body.m.value
         moment_x = m * rigid_body.x_G.value
         moment_z = m * rigid_body.z_G.value
+        # off-diagonal entries couple sway, roll and yaw through the centre of gravity
         roll_row = [
             -(moment_z + added_mass.K_vdot.value),
             rigid_body.I_x.value - added_mass.K_pdot.value,
@@ -454,8 +463,8 @@ class RollingHullConfig(HullVessel):
                 rigid_body.I_z.value - added_mass.N_rdot.value,
             ],
         ]
-        # centripetal terms of the rigid body, (5.12), and the restoring moment, which (5.17) leaves
-        # out
+        # centripetal terms of the rigid body (5.12), and the restoring moment, which is missing in
+        # (5.17)
         inertial_terms: tuple[dict[str, float], ...] = (
             {"v r": m, "r r": moment_x, "p r": -moment_z},
             {"u r": -m},
@@ -560,15 +569,20 @@ class SubmergedHullConfig(HullVessel):
                 [parameter.value for parameter in dict(added_mass).values()], dtype=torch.float64
             )
         )
+        # the centre of gravity (x, 0, z) couples forces and moments: blocks -m S(r_G) and m S(r_G)
         for force, moment, lever in ((0, 4, z), (1, 3, -z), (1, 5, x), (2, 4, -x)):
             mass[force, moment] = mass[moment, force] = m * lever
         coefficients = coefficient_rows(self.forces)
 
         def add_term(axis: int, term: str, value: float) -> None:
+            # terms without a coefficient would only cost time
             if value:
                 coefficients[axis][term] = coefficients[axis].get(term, 0.0) + value
 
+        # (a x b)_axis = a_i b_j - a_j b_i for the cyclic permutations (axis, i, j)
         axis_cycles = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+        # momenta are linear in the velocities: column k of M multiplies velocity k, so that each
+        # cross product becomes a sum of products of two velocities
         for k, name in enumerate(SUBMERGED_LAYOUT.velocities):
             momentum = mass[:3, k].tolist()
             angular_momentum = mass[3:, k].tolist()
@@ -581,9 +595,11 @@ class SubmergedHullConfig(HullVessel):
                     add_term(
                         3 + axis, _format_velocity_product(w[i], name), sign * angular_momentum[j]
                     )
+        # gravity and buoyancy (Fossen 2021, eq. (4.6)): the force is (W - B) along the vertical,
+        # and the moment is (W r_G - B r_B) x vertical
         weight = m * GRAVITY
         buoyancy_force = buoyancy.density.value * GRAVITY * buoyancy.volume.value
-        # the vertical along the body axes
+        # components of the downward vertical in body axes, without their signs
         vertical_direction = ("sin(theta)", "cos(theta) sin(phi)", "cos(theta) cos(phi)")
         signs = (-1.0, 1.0, 1.0)
         net_weight = weight - buoyancy_force
@@ -626,14 +642,14 @@ def compute_froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
         ValueError: if the length is not positive.
     """
     if not length > 0:
-        raise ValueError(f"the Froude number needs the length of a hull, given {length:g} m")
+        raise ValueError(f"the Froude number needs a positive length of the hull, got {length:g} m")
     return torch.hypot(u, v) / math.sqrt(GRAVITY * length)
 
 
 def classify_speed_regime(froude: Tensor) -> Tensor:
     """Return the index in `SPEED_REGIMES` at each Froude number, integers of the same shape.
 
-    A boundary belongs to the upper regime.
+    A Froude number on a boundary belongs to the regime above it.
     """
     edges = torch.tensor(REGIME_BOUNDARIES, dtype=froude.dtype, device=froude.device)
     return torch.bucketize(froude, edges, right=True)

@@ -61,6 +61,7 @@ class NomotoVesselConfig(VesselFile, ABC):
 
     @model_validator(mode="after")
     def _validate_turning_sense(self) -> NomotoVesselConfig:
+        # r_ddot (or r_dot) right after a rudder step is K / (T1 T2) delta (or K / T delta)
         gain_ratio = self.K.value
         for name in self.pole_names:
             time_constant = getattr(self, name).value
@@ -94,6 +95,7 @@ class NomotoConfig(NomotoVesselConfig):
         """Return the state-space model of r with constant v."""
         k = self.K.value
         T = self.T.value
+        # the derivative of v is zero: it keeps its initial value
         return SteeringStateSpace(np.diag([0.0, -1.0 / T]), np.array([0.0, k / T]))
 
 
@@ -135,6 +137,8 @@ class SecondOrderNomotoConfig(SecondOrderSteeringConfig):
         """Return the state-space model of v, r and q."""
         k = self.K.value
         companion = self.companion_matrix()
+        # -companion[1, 0] is 1 / (T1 T2); with r_dot = q + direct_gain delta the rudder rate
+        # cancels
         direct_gain = -k * self.T3.value * companion[1, 0]
         a = np.zeros((3, 3))
         b = np.array([0.0, direct_gain, -k * companion[1, 0] + companion[1, 1] * direct_gain])
@@ -172,6 +176,8 @@ class SideslipNomotoConfig(SecondOrderSteeringConfig):
         k = self.K.value
         k_v = self.K_v.value
         companion = self.companion_matrix()
+        # controllable canonical form: (v, r) = output_matrix (y, y_dot) with the common denominator
+        # of both transfer functions; the change of variables to (v, r) is a similarity transform
         output_matrix = np.array([[k_v, k_v * self.T_v.value], [k, k * self.T3.value]])
         return SteeringStateSpace(
             output_matrix @ companion @ np.linalg.inv(output_matrix),

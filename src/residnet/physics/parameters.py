@@ -63,11 +63,12 @@ MassDensity = Annotated[Parameter, AfterValidator(convert_to_unit("kg/m^3"))]
 def require_positive(parameter: Parameter) -> Parameter:
     """Validate that a parameter is positive."""
     if not parameter.value > 0:
-        raise ValueError(f"must be positive, given {parameter.value:g}")
+        raise ValueError(f"must be positive, got {parameter.value:g}")
     return parameter
 
 
 Positive = AfterValidator(require_positive)
+# exponents of metre and second; the exponent of kilogram is counted separately
 _BASE_DIMENSIONS = {
     "kg": (0, 0),
     "m": (1, 0),
@@ -85,6 +86,7 @@ def parse_dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
     For example (2, -1) for `kg m^2/s` or `N m s/rad`; None for any other unit.
     """
     metre_power = second_power = mass_power = 0
+    # factors are separated by a space (multiplied) or a slash (divided), such as `kg m^2/s`
     for sign, name, power in re.findall(r"([/ ]?)([^/ ^]*)(?:\^([1-9]))?", unit.strip()):
         if not name:
             continue
@@ -93,6 +95,7 @@ def parse_dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
         exponent = int(power or 1) * (-1 if sign == "/" else 1)
         metre_power = metre_power + exponent * _BASE_DIMENSIONS[name][0]
         second_power = second_power + exponent * _BASE_DIMENSIONS[name][1]
+        # a newton contains one kilogram
         mass_power += exponent * (name in ("kg", "N"))
     return (metre_power, second_power) if mass_power == mass else None
 

@@ -23,7 +23,9 @@ SUBMERGED_LAYOUT = StateLayout(
     ("x", "y", "z", "phi", "theta", "psi"), ("u", "v", "w", "p", "q", "r")
 )
 """Six degrees of freedom, z is the depth."""
-_LAYOUT_OF_DOF = {one.n_dof: one for one in (PLANAR_LAYOUT, ROLLING_LAYOUT, SUBMERGED_LAYOUT)}
+_LAYOUT_OF_DOF = {
+    layout.n_dof: layout for layout in (PLANAR_LAYOUT, ROLLING_LAYOUT, SUBMERGED_LAYOUT)
+}
 _FORCE_AXES_OF_DOF = {
     PLANAR_LAYOUT.n_dof: ("x", "y", "n"),
     ROLLING_LAYOUT.n_dof: ("x", "y", "k", "n"),
@@ -92,11 +94,13 @@ def invert_mass(mass: Tensor, vessel: str) -> Tensor:
     Raises:
         ConfigError: if an eigenvalue has no positive real part, or the matrix is nearly singular.
     """
+    # identified mass matrices may be asymmetric, so that the eigenvalues can be complex
     if bool((torch.linalg.eigvals(mass).real <= 0).any()):
         raise ConfigError(
             f"vessel {vessel}: the mass matrix is not positive definite; added mass (X_udot,"
             " Y_vdot, N_rdot) is negative for a hull"
         )
+    # scaled to unit diagonal, because kg and kg m^2 cannot be compared
     scale = mass.diagonal().sqrt()
     condition = float(torch.linalg.cond(mass / torch.outer(scale, scale)))
     if condition > 1e8:
@@ -174,6 +178,7 @@ class Hull(nn.Module):
 
         The last n columns are the coefficients of tau.
         """
+        # nu_dot = M^-1 C^T terms + M^-1 tau
         response = torch.cat((self.inverse_mass @ self.coefficients.T, self.inverse_mass), dim=1)
         return self.terms.terms, response.tolist()
 
@@ -239,7 +244,8 @@ class HullPlant(Plant):
         return self.actuators.commands_for_demand(drive, steer)
 
     def without_environment(self) -> Self:
-        """Return a faster copy of this plant without exogenous inputs and air resistance."""
+        """Remove exogenous inputs and air resistance, which makes the step faster; returns self."""
+        # traced and compiled plants skip the inputs that are always zero
         self.has_environment = False
         self.input_names = self.actuators.command_names
         return self
@@ -256,6 +262,7 @@ class HullPlant(Plant):
         If the actuator forces are not constant over a time step, the result is w. This reduces the
         time of a traced step of wam_v_cal from 221 to 162 us.
         """
+        # forces that depend on lags or on the speed change between the stages of the integrator
         if not self.actuators.is_force_constant_in_step:
             return w
         n = self.n_dof
@@ -316,6 +323,8 @@ class HullPlant(Plant):
         tau = tau + self._to_body_axes(w[:, c + n + 2], w[:, c + n + 3], pose)
         if self.wind is not None:
             tau = tau + self._wind_force(w[:, c + n + 4], w[:, c + n + 5], pose, nu)
+        # the hull gives the derivative of the velocity through the water; adding that of the
+        # current gives the velocity over ground
         nu_dot = self.hull(self._hull_channels(pose, relative_velocity), tau) + current_derivative
         return torch.cat((pose_derivative, nu_dot, actuator_derivative), dim=-1)
 
@@ -363,6 +372,8 @@ class HullPlant(Plant):
         """Return the current in body axes and its derivative due to rotation, each [B, n]."""
         if self.is_submerged:
             current = self._to_body_axes(north, east, pose)
+            # a current that is constant in earth axes rotates in body axes: d/dt nu_c = nu_c x
+            # omega
             rotation = cross_product(current[..., :3], nu[..., 3:])
             return current, torch.cat((rotation, torch.zeros_like(rotation)), dim=-1)
         body_x, body_y = to_body(north, east, pose[..., -1])
@@ -382,6 +393,7 @@ class HullPlant(Plant):
     def _wind_force(self, speed: Tensor, direction: Tensor, pose: Tensor, nu: Tensor) -> Tensor:
         """Return the wind forces [B, n] at a true wind and velocities over ground nu."""
         assert self.wind is not None
+        # the direction is where the wind comes from
         air_velocity = self._to_body_axes(
             -speed * torch.cos(direction), -speed * torch.sin(direction), pose
         )

@@ -204,6 +204,7 @@ class Signals(nn.Module):
         thrusters = config.forces if isinstance(config.forces, DifferentialThrustConfig) else None
         self.has_forces = thrusters is not None
         input_columns = config.input_columns
+        # unused indices are 0, because TorchScript takes no optional attributes
         self.speed_column = input_columns.index("wind_speed") if self.has_wind else 0
         self.direction_column = input_columns.index("wind_dir") if self.has_wind else 0
         self.thrusters: nn.Module = (
@@ -226,6 +227,8 @@ class Signals(nn.Module):
 
         They are inputs, forces and the wind velocity over ground (north, east).
         """
+        # commands are constant over a step, so that the thrust and the true wind are evaluated once
+        # per step and not at each stage of the integrator
         columns = [w[..., : self.n_inputs]]
         if self.has_forces:
             columns.append(self.thrusters(w[..., : self.n_inputs]))
@@ -233,6 +236,7 @@ class Signals(nn.Module):
             speed = w[..., self.speed_column]
             direction = w[..., self.direction_column]
             columns.append(
+                # the direction is where the wind comes from: its velocity points the other way
                 torch.stack((-speed * torch.cos(direction), -speed * torch.sin(direction)), dim=-1)
             )
         # joining a single part would copy it
@@ -246,14 +250,16 @@ class Signals(nn.Module):
             p: result of `prepare` for the inputs of the time step.
         """
         if self.is_six_dof:
-            # nothing depends on the depth
+            # depth and attitude are no channels; velocities that the model lacks are set to zero
             return torch.cat(
                 (dynamic_states(x, self.n_dof) * self.used_velocities.to(x.dtype), p), dim=-1
             )
         if not self.has_wind:
             return torch.cat((dynamic_states(x, self.n_dof), p), dim=-1)
-        n_known = p.shape[-1] - 2
-        relative_x, relative_y = to_body(p[..., n_known], p[..., n_known + 1], x[..., 2])
+        n_inputs_and_forces = p.shape[-1] - 2
+        wind_north = p[..., n_inputs_and_forces]
+        wind_east = p[..., n_inputs_and_forces + 1]
+        relative_x, relative_y = to_body(wind_north, wind_east, x[..., 2])
         relative_x = relative_x - x[..., 3]
         relative_y = relative_y - x[..., 4]
         # the offset keeps the gradient finite in a calm
@@ -261,7 +267,7 @@ class Signals(nn.Module):
         return torch.cat(
             (
                 dynamic_states(x, self.n_dof),
-                p[..., :n_known],
+                p[..., :n_inputs_and_forces],
                 torch.stack((relative_x, relative_y, magnitude), dim=-1),
             ),
             dim=-1,
@@ -269,7 +275,10 @@ class Signals(nn.Module):
 
 
 _MAX_ACCELERATION_STD = 10.0
-"""Acceleration in standard deviations that is balanced half a range outside the range."""
+"""Restoring acceleration half a training range outside the training range.
+
+In standard deviations of the accelerations in the training data.
+"""
 _MIN_RATE = 0.05
 """Lower limit of the restoring rate of the velocity guard, 1/s."""
 _MAX_RATE = 2.0
@@ -286,7 +295,7 @@ class RestoringAcceleration(RenamedStateModule):
     acceleration would be integrated without limit.
 
     Args:
-        margin: share of the training range by which it is widened on either side.
+        margin: widening of the training range on either side, as a share of its width.
         n_channels: number of channels, the velocities first, that are clamped to their ranges.
         n_dof: number of velocities n.
     """
@@ -317,6 +326,8 @@ class RestoringAcceleration(RenamedStateModule):
         self.high.copy_(upper + self.margin * width)
         acceleration_std = target_moments.std()
         self.restoring_rate.copy_(
+            # rate * (half a range) = 10 standard deviations of the acceleration; the limits keep
+            # the restoring term slower than a time step and faster than a drift
             (_MAX_ACCELERATION_STD * acceleration_std / (0.5 * width[: self.n_dof])).clamp(
                 min=_MIN_RATE, max=_MAX_RATE
             )

@@ -9,6 +9,8 @@ from residnet.core.layout import SURGE_SWAY_YAW, DegreesOfFreedom
 from residnet.core.names import port_starboard_pairs
 from residnet.physics.terms import EVEN_FUNCTIONS, Factor, parse_term
 
+# mirroring at the centre plane changes the sign of motions and forces to the side, and of roll and
+# yaw
 _CHANNEL_PARITY = dict.fromkeys(
     ("v", "r", "p", "phi", "delta", "tau_y", "tau_n", "wind_v"), -1
 ) | dict.fromkeys(("u", "w", "q", "z", "theta", "n", "delta_s", "tau_x", "wind_u", "wind_mag"), 1)
@@ -68,15 +70,15 @@ def is_active_term(term: str, names: Sequence[str]) -> bool:
 
 
 def get_channel_parity(name: str) -> int | None:
-    """Return +1 if the mirror image of a channel keeps its sign, -1 if it changes, else None.
+    """Return the parity of a channel: its sign in the mirror image, +1 or -1.
 
-    None means that the parity of the channel is unknown.
+    The result is None if the parity is unknown, for example of a user-defined channel.
     """
     return _CHANNEL_PARITY.get(name)
 
 
 def get_pair_parity(name: str) -> int:
-    """Return the sign with which paired channels are exchanged: -1 for angles, otherwise +1."""
+    """Return the sign of a paired channel after the exchange: -1 for angles, otherwise +1."""
     return -1 if name.removeprefix("cmd_").startswith(_ANGLE_PREFIXES) else 1
 
 
@@ -95,6 +97,7 @@ def _product_parity(factors: Iterable[Factor], parities: Mapping[str, float]) ->
     """Return the sign of the mirror image of a product, from the parities of its channels."""
     sign = 1
     for factor in factors:
+        # even factors have the same value in the mirror image
         is_even = factor.magnitude or factor.function in EVEN_FUNCTIONS or factor.power % 2 == 0
         if parities[factor.name] < 0 and not is_even:
             sign = -sign
@@ -119,6 +122,7 @@ def violates_symmetry(term: str, axis: int, names: Sequence[str]) -> bool:
     """
     if get_dof(names).dynamic_states[axis] == "p":
         heeling_propellers = find_heeling_propellers(names)
+        # the propeller torque heels the vessel: symmetry does not exclude these terms in roll
         if any(factor.name in heeling_propellers for factor in parse_term(term, names)):
             return False
     parity = compute_term_parity(term, names)
@@ -159,6 +163,7 @@ def mirror_terms(terms: Sequence[str], names: Sequence[str]) -> dict[int, tuple[
     index, signs = mirror
     renamed = {name: names[i] for name, i in zip(names, index, strict=True)}
     parities = dict(zip(names, signs, strict=True))
+    # `u v` and `v u` are one term: compare canonical forms
     index_of_factors = {
         canonical_factors(term, names, {}): term_index for term_index, term in enumerate(terms)
     }
@@ -179,7 +184,12 @@ def canonical_factors(
     """Return a canonical form of a term, which is equal for `v u` and `u v`.
 
     The form is a set of (factor without power and magnitude, total power, whether the product is
-    odd in the factor), with channels renamed by `partners`.
+    odd in the factor).
+
+    Args:
+        term: the term.
+        names: channels of the model.
+        renamed: channels that are replaced by others, such as their port/starboard partners.
     """
     total_power: dict[Factor, int] = {}
     is_odd: dict[Factor, bool] = {}
@@ -187,6 +197,8 @@ def canonical_factors(
         name = renamed.get(factor.name, factor.name)
         base_factor = factor._replace(name=name, power=1, magnitude=False)
         total_power[base_factor] = total_power.get(base_factor, 0) + factor.power
+        # |x| x is odd although its total power is even, so that parity and power are counted
+        # separately
         is_odd[base_factor] = is_odd.get(base_factor, False) ^ (
             not factor.magnitude and factor.power % 2 != 0
         )

@@ -79,6 +79,7 @@ def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tu
                 f"term '{term}': invalid from '{term[position:]}'; write a product such as"
                 " 'u|u|', 'v r' or 'n^2 delta'"
             )
+        # each match consumes one factor and an optional `*`
         position = match.end()
         if match["one"]:
             continue
@@ -89,7 +90,7 @@ def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tu
             hint = (
                 suggest_name(function, TERM_FUNCTIONS)
                 if functions
-                else "; only products of channels have a place here"
+                else "; functions are not allowed here, only products of channels"
             )
             raise ConfigError(f"term '{term}': no function '{function}'{hint}")
         if name not in names:
@@ -118,7 +119,7 @@ def parse_axis_terms(
             except ConfigError as error:
                 raise ValueError(f"{axis}: {error}") from None
             if any(factor.power < 0 for factor in factors):
-                raise ValueError(f"{axis}: term '{term}' divides by what may be zero")
+                raise ValueError(f"{axis}: term '{term}' divides by a channel that may be zero")
             parsed_terms.append((axis, term, factors))
     return parsed_terms
 
@@ -159,8 +160,10 @@ class TermLibrary(nn.Module):
             for parsed_factor in factors
             if parsed_factor.function or parsed_factor.power < 0
         }
+        # columns are 1, z, |z|, then functions and reciprocals; the key is (channel, magnitude,
+        # function)
         column_of_key = {key: i + 1 for i, key in enumerate(channel_keys)}
-        # the first one stands for nothing: TorchScript takes no empty list
+        # the first entry is a placeholder: TorchScript takes no empty list
         self.function_columns = [("", 0)]
         for name, function in sorted(function_keys):
             column_of_key[name, False, function] = len(column_of_key) + 1
@@ -171,6 +174,7 @@ class TermLibrary(nn.Module):
         ]
         self.n_terms = len(columns)
         self.max_factors = max([len(factor_columns) for factor_columns in columns], default=0)
+        # column 0 is the constant 1: it fills terms with fewer factors
         padded_columns = [
             factor_columns + [0] * (self.max_factors - len(factor_columns))
             for factor_columns in columns
@@ -179,7 +183,7 @@ class TermLibrary(nn.Module):
             torch.tensor(padded_columns, dtype=torch.long).reshape(self.n_terms, self.max_factors).T
         )
         self.factor_index = nn.Buffer(factor_index.contiguous(), persistent=False)
-        # a linear model has the channels alone for terms
+        # if every term is one channel, an index select replaces the products
         self.is_linear = self.n_terms > 0 and all(
             len(factor_columns) == 1 and 0 < factor_columns[0] <= len(names)
             for factor_columns in columns
@@ -212,13 +216,13 @@ def _evaluate_function(name: str, x: Tensor) -> Tensor:
         return torch.sin(x)
     if name == "cos":
         return torch.cos(x)
-    # where |x| is below the clamp, the slope of the root stays finite
+    # the clamp keeps the derivative of the root finite at zero, where it would be infinite
     if name == "sqrt":
         return torch.sqrt(x.abs().clamp(min=1e-24))
     if name == "ssqrt":
         return x.sign() * torch.sqrt(x.abs().clamp(min=1e-24))
     if name == "inv":
-        # zero stays zero, and its gradient finite
+        # the inner where avoids 1/0, whose infinite gradient the outer where could not remove
         return torch.where(x == 0, x, torch.where(x == 0, torch.ones_like(x), x).reciprocal())
     return x.reciprocal()
 
@@ -326,11 +330,12 @@ class CandidatesConfig(Config):
     def find_nonsingular_terms(
         self, terms: Sequence[str], names: Sequence[str], z: Tensor
     ) -> Tensor:
-        """Return which terms [J] have no divisor near zero in the data, or are in `extra`.
+        """Return whether each term [J] has no divisor near zero in the data, or is in `extra`.
 
         Args:
             z: channels of the data [N, nz].
         """
+        # a divisor must have one sign and stay away from zero relative to its size
         is_nonzero = z.amin(0) * z.amax(0) > 0
         is_nonzero &= z.abs().amin(0) >= _MIN_DIVISOR_SHARE * z.abs().amax(0)
         near_zero_channels = {
@@ -363,11 +368,13 @@ def _ship_input_products(
     speed_products, speed_squares = (
         _products_up_to(surge, degree, magnitudes=magnitudes) for degree in (1, 2)
     )
+    # propeller thrust and rudder lift: an input up to its square, times the inflow speed
     single_input_products = [
         product_text
         for name in inputs
         for product_text in _products_up_to([name], 2, magnitudes=magnitudes)[1:]
     ]
+    # interaction of two actuators, such as propeller and rudder in its slipstream
     input_pairs = [
         product_text
         for first_input, second_input in combinations(inputs, 2)
@@ -376,6 +383,7 @@ def _ship_input_products(
             _products_up_to([second_input], 1, magnitudes=magnitudes)[1:],
         )
     ]
+    # rudder lift in the slipstream: squared revolutions times an angle
     squares = [
         f"{squared_input} {other_input}"
         for name in inputs
@@ -383,6 +391,7 @@ def _ship_input_products(
         for other_input in inputs
         if other_input != name
     ]
+    # advance ratio and similar quotients, with the protected division `inv`
     ratios = [
         f"{numerator} inv({name})".strip()
         for name in inputs
@@ -415,6 +424,8 @@ def rank_candidates(terms: Iterable[str], names: Sequence[str]) -> tuple[Candida
     for term in terms:
         factors = parse_term(term, names)
         degree = sum(abs(factor.power) for factor in factors)
+        # among terms of one degree, few different channels come first, then those without
+        # magnitudes (0.5), functions (0.75) and divisions (1)
         complexity = len({factor.name for factor in factors}) + sum(
             0.5 * parsed_factor.magnitude
             + 0.75 * bool(parsed_factor.function)

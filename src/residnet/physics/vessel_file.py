@@ -56,6 +56,7 @@ def merge_with_base(data: Any, folder: Path | None) -> Any:
         ValueError: if the base does not exist, cannot be read, or bases form a cycle.
     """
     visited: list[Path] = []
+    # from the file down to the last base, which has no base itself
     layers = [_lists_to_tuples(data)]
     while isinstance(layers[-1], dict) and "base" in layers[-1]:
         path = _resolve_base_path(layers[-1]["base"], folder)
@@ -70,6 +71,7 @@ def merge_with_base(data: Any, folder: Path | None) -> Any:
         except ConfigError as error:
             raise ValueError(f"base: {error}") from None
     merged = layers[-1]
+    # files override their bases, so that they are applied last
     for layer in reversed(layers[:-1]):
         merged = _merge_sections(
             {key: value for key, value in layer.items() if key != "base"}, merged
@@ -80,7 +82,7 @@ def merge_with_base(data: Any, folder: Path | None) -> Any:
 def _resolve_base_path(name: object, folder: Path | None) -> Path:
     files = find_vessel_files()
     if not isinstance(name, str):
-        raise ValueError(f"base: expected the name of a vessel or of its yaml file, given {name!r}")
+        raise ValueError(f"base: expected the name of a vessel or of its YAML file, got {name!r}")
     if name in files:
         return files[name].resolve()
     path = Path(name)
@@ -107,12 +109,13 @@ def _lists_to_tuples(data: Any) -> Any:
 def _merge_sections(override: dict[str, Any], base: dict[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in override.items():
-        lower_value = base.get(key)
+        # sections of different kinds have different keys and cannot be merged
+        base_value = base.get(key)
         if (
             isinstance(value, dict)
-            and isinstance(lower_value, dict)
-            and value.get("kind", lower_value.get("kind")) == lower_value.get("kind")
+            and isinstance(base_value, dict)
+            and value.get("kind", base_value.get("kind")) == base_value.get("kind")
         ):
-            value = _merge_sections(value, lower_value)
+            value = _merge_sections(value, base_value)
         merged[key] = value
     return merged

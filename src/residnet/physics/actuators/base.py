@@ -89,6 +89,8 @@ class SecondOrderConfig(ResponseConfig):
             self.frequency**2 * (target - position)
             - 2.0 * self.damping * self.frequency * limited_velocity
         )
+        # a rate at its limit must not grow further, or it would take time to leave the limit
+        # (windup)
         is_rate_limited = (velocity.abs() >= rate_limit) & (acceleration * velocity > 0)
         return torch.cat(
             (
@@ -124,6 +126,7 @@ class ServoConfig(Config):
                 " the plant (data.step divided by data.substeps)"
             )
         if self.delay_step is not None:
+            # the delay line stores one command per step
             taps = self.dead_time / self.delay_step
             if abs(taps - round(taps)) > 1e-6 * taps or not 1 <= round(taps) <= 1000:
                 raise ValueError(
@@ -186,6 +189,7 @@ class Servo(nn.Module):
         self.n_actuators = len(names)
         self.has_lag = len(config.response.state_suffixes) > 0
         self.rate_limit = float("inf") if rate_limit is None else rate_limit
+        # a rate limit without lag also needs the position as a state
         suffixes = config.response.state_suffixes or (() if rate_limit is None else ("",))
         self.n_lag_states = len(suffixes) * self.n_actuators
         self.delay_step = config.delay_step or 0.0
@@ -224,7 +228,8 @@ class Servo(nn.Module):
         Raises:
             ConfigError: if dt is not the step of the delay line.
         """
-        # without lag the position moves to its target at the limited rate
+        # without lag the position moves to its target at the limited rate, once per step: an
+        # integrator with stages would overshoot the target
         lag_states = states[..., : self.n_lag_states]
         if self.n_lag_states > 0 and not self.has_lag:
             max_change = self.rate_limit * dt
@@ -362,7 +367,8 @@ class CommandSpec(NamedTuple):
         name: name of the command.
         demand_axis: normalised demand of a manoeuvre that sets it, drive or steer.
         max_value: value at a demand of 1.
-        min_share: minimum demand; 0 for actuators that act in one direction.
+        min_share: minimum demand as a share of the maximum; 0 for actuators that act in one
+            direction only, otherwise -1.
     """
 
     name: str

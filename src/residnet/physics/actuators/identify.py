@@ -14,7 +14,7 @@ from residnet.core.errors import FitError
 
 
 class IntervalEstimate(NamedTuple):
-    """Estimate with the half width of its 95 % confidence interval, in `unit`."""
+    """Estimate with the lower and upper limit of its 95 % confidence interval, in `unit`."""
 
     value: float
     low: float
@@ -95,19 +95,23 @@ def fit_throttle_map(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
         )
     max_throttle = float(np.abs(throttle).max())
     max_n = float(np.abs(n).max())
+    # initial estimate: a line through the origin and the largest revolutions
     slope = max_n / max_throttle
-    at_bound = np.abs(n) > 0.97 * max_n
+    # saturated points have nearly the maximum revolutions at clearly different throttles
+    is_at_bound = np.abs(n) > 0.97 * max_n
     is_saturated = (
-        at_bound.sum() >= _SATURATION_POINTS
-        and np.ptp(np.abs(throttle[at_bound])) > 0.05 * max_throttle
+        is_at_bound.sum() >= _SATURATION_POINTS
+        and np.ptp(np.abs(throttle[is_at_bound])) > 0.05 * max_throttle
     )
     initial = [slope, 0.0]
     scale = [slope, 0.1 * max_n]
     if is_saturated:
-        below_bound = ~at_bound
-        if np.unique(throttle[below_bound]).size >= 2:
-            initial[0] = scale[0] = float(np.polyfit(throttle[below_bound], n[below_bound], 1)[0])
-        initial = [*initial, float(np.median(np.abs(n[at_bound])))]
+        is_below_bound = ~is_at_bound
+        if np.unique(throttle[is_below_bound]).size >= 2:
+            initial[0] = scale[0] = float(
+                np.polyfit(throttle[is_below_bound], n[is_below_bound], 1)[0]
+            )
+        initial = [*initial, float(np.median(np.abs(n[is_at_bound])))]
         scale = [*scale, max_n]
 
     def residual(parameters: np.ndarray) -> np.ndarray:
@@ -143,7 +147,8 @@ def simulate_shaft(
     n[0] = initial_n
     max_change = rate_limit * np.diff(t)
     for k in range(1, t.size):
-        # the command that acted over the interval, with its share where it changed inside
+        # a delayed command may change within an interval: the shaft follows the previous command
+        # until then, and the next one for the remaining share of the interval
         previous_command = command[max(command_index[k - 1], 0)]
         next_command = command[max(command_index[k], 0)]
         new_command_share = (
@@ -186,7 +191,9 @@ def fit_step_response(
                 "step test: the revolutions hardly follow the command; check columns and units, and"
                 " log until they settle"
             )
+    # initial estimates from the largest step: slope, and delay of the first 10 % of the response
     t, command, n = max(responses, key=lambda run: np.ptp(run[1]))
+    # a percentile instead of the maximum, which would be noise
     max_slope = float(np.percentile(np.abs(np.gradient(n, t)), 95))
     step_time = t[np.flatnonzero(np.abs(command - command[0]) > 0.5 * np.ptp(command))[0]]
     response_index = np.flatnonzero((np.abs(n - n[0]) > 0.1 * np.ptp(n)) & (t >= step_time))
@@ -239,6 +246,7 @@ def fit_thrust_curves(
     Args:
         n: revolutions [N] in 1/s.
         pull: total pull [N] of all thrusters, in N.
+        n_thrusters: number of thrusters that share the pull equally.
 
     Raises:
         FitError: if a direction has fewer than five points or four different revolutions, or its
@@ -250,7 +258,7 @@ def fit_thrust_curves(
 
 
 def _fit_thrust_curve(n: np.ndarray, thrust: np.ndarray, direction: str) -> ThrustFit:
-
+    """Fit a quadratic to the thrust [N] of one thruster in one direction, with t intervals."""
     from scipy import stats
 
     n_levels = np.unique(np.round(n / max(float(np.abs(n).max(initial=0.0)), 1e-9), 2)).size
@@ -266,6 +274,7 @@ def _fit_thrust_curve(n: np.ndarray, thrust: np.ndarray, direction: str) -> Thru
             " negative astern"
         )
     scale = float(np.abs(n).max())
+    # scaled revolutions make the normal equations well-conditioned
     design_matrix = np.stack((np.ones_like(n), n / scale, (n / scale) ** 2), axis=1)
     solution, *_ = np.linalg.lstsq(design_matrix, thrust, rcond=None)
     residual = thrust - design_matrix @ solution
@@ -298,7 +307,12 @@ def _fit_with_intervals(
     from scipy.optimize import least_squares
 
     solution = least_squares(
-        residual, initial, x_scale=np.abs(scale), diff_step=[1e-3] * len(initial)
+        # large steps of the finite differences, because saturation and sampled delays make the
+        # residual piecewise smooth
+        residual,
+        initial,
+        x_scale=np.abs(scale),
+        diff_step=[1e-3] * len(initial),
     )
     variance = 2 * float(solution.cost) / (n_samples - len(initial))
     if is_serial:
@@ -311,6 +325,8 @@ def _fit_with_intervals(
                 0.99,
             )
         )
+        # variance inflation of an AR(1) process: n samples contain n (1 - a) / (1 + a) independent
+        # ones
         variance *= (1 + autocorrelation) / (1 - autocorrelation)
     jacobian = np.asarray(solution.jac)
     covariance = np.linalg.pinv(jacobian.T @ jacobian) * variance

@@ -74,6 +74,7 @@ class PropellerShaftConfig(ShaftConfig, ThrustConfig):
         reverse = self.reverse
         forward_thrust = (forward[0] + n * (forward[1] + n * forward[2])).clamp(min=0.0)
         reverse_thrust = (reverse[0] + n * (reverse[1] + n * reverse[2])).clamp(max=0.0)
+        # each polynomial is valid for one direction of rotation only
         static_thrust = torch.where(
             n > 0, forward_thrust, torch.where(n < 0, reverse_thrust, torch.zeros_like(n))
         )
@@ -118,14 +119,20 @@ class RudderPropellerConfig(SteeredConfig):
         delta = position[..., 0]
         u = nu[..., 0]
         lift_factor = 0.5 * self.density * rudder.area
+        # gradient of the normal force (Fujii)
         lift_factor *= 6.13 * rudder.aspect_ratio / (rudder.aspect_ratio + 2.25)
         disc_area = 0.25 * math.pi * propeller.diameter**2
         thrust = propeller.thrust_at(position[..., 1], u)
+        # momentum theory: the far slipstream of a disc has the added dynamic pressure T / A_p;
+        # astern thrust has no slipstream at the rudder
         race_factor = rudder.race_share * 2.0 / (self.density * disc_area)
         signed_inflow_squared = u * u.abs() + race_factor * thrust.clamp(min=0.0)
+        # lateral velocity at the rudder, from sway and yaw
         cross_flow = rudder.straightening * (nu[..., 1] + rudder.x * nu[..., 2])
-        # the offset keeps the gradient finite at rest
+        # the offset keeps the gradient of the root finite at rest
         inflow = torch.sqrt(signed_inflow_squared.abs() + 1e-8)
+        # U_R^2 sin(delta - beta_R) with the inflow angle beta_R, expanded so that no arctangent is
+        # needed
         normal_force = lift_factor * (
             signed_inflow_squared * torch.sin(delta) + inflow * cross_flow * torch.cos(delta)
         )
@@ -222,8 +229,9 @@ class FoilRuddersConfig(SternRuddersConfig):
         self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor
     ) -> tuple[Tensor, Tensor]:
         disc_area = 0.25 * math.pi * self.diameter**2
-        # C_Th V^2 per newton of total thrust: each propeller has its share
+        # C_Th V^2 per newton of total thrust, which the propellers share equally
         thrust_loading = 2.0 / (self.propellers * self.density * disc_area)
+        # beyond the stall angle lift and drag are constant
         angle_of_attack = delta.clamp(-self.stall, self.stall)
         speed_squared = u * u + v * v
         # 1/sqrt(1 + C_Th); the offset keeps it and its gradient finite at rest
@@ -325,6 +333,7 @@ class WaterJetsConfig(SteeredConfig):
 
     def command_specs(self) -> tuple[CommandSpec, ...]:
         """Return the commands: nonnegative revolutions from drive and nozzle angle from steer."""
+        # jets aft of the origin turn the bow to starboard by a force to port
         max_nozzle_angle = self.nozzle.limit if self.x > 0 else -self.nozzle.limit
         return (
             CommandSpec("cmd_n", "drive", self.motor.n_max, 0.0),
@@ -419,7 +428,10 @@ class TorpedoFinsConfig(ServoConfig, SteeredConfig):
         dynamic_pressure = 0.5 * self.density * nu[..., 0].square()
         side_force = -dynamic_pressure * self.rudder * delta
         lift = -dynamic_pressure * self.planes * delta_s
+        # the component of the normal forces along the hull, for small angles
         drag = -side_force * delta - lift * delta_s
+        # J n |n| D = u_a n: the thrust coefficient is linear in the advance ratio J; astern
+        # revolutions have no such term
         advance_product = self.wake * nu[..., 0] / self.diameter * n.clamp(min=0.0)
         thrust, torque = (
             self.density

@@ -75,8 +75,8 @@ class ThrusterConfig(ThrusterPositionConfig, ShaftConfig, ThrustConfig):
 class ThrustersConfig(ActuatorConfig):
     """Fixed thrusters at any positions of the hull.
 
-    The share of drive of a thruster is its surge component, and the share of steer is its lever
-    about the origin.
+    Drive acts on each thruster in proportion to the surge component of its direction. Steer acts on
+    it with the sign of its lever about the origin.
 
     Attributes:
         thrusters: the thrusters, in the order of the commands.
@@ -145,6 +145,7 @@ class ThrusterForces(nn.Module):
         x, y, angle = torch.tensor(geometry, dtype=torch.float64).unbind(-1)
         surge_share = torch.cos(angle)
         sway_share = torch.sin(angle)
+        # moment arm about the vertical, r x f
         lever = x * sway_share - y * surge_share
         self.thrust_configuration = nn.Buffer(
             torch.stack((surge_share, sway_share, lever), dim=-1), persistent=False
@@ -175,7 +176,8 @@ class Thrusters(ActuatorSystem):
         self.command_names = tuple(f"cmd_{thruster.name}" for thruster in thrusters)
         self.thruster_forces = ThrusterForces(thrusters)
         surge_share, _, lever = self.thruster_forces.thrust_configuration.unbind(-1)
-        # what a thruster adds to surge and yaw as far as it does so at all
+        # contribution of each thruster to surge and sign of its contribution to yaw; components at
+        # the level of rounding, such as cos(90 deg), are zero
         demand_map = torch.stack((surge_share, torch.sign(lever)))
         is_negligible = torch.stack((surge_share, lever)).abs() < 1e-9
         n_max = torch.tensor([thruster.n_max for thruster in thrusters], dtype=torch.float64)
@@ -233,6 +235,7 @@ class AzimuthThrustersConfig(ActuatorConfig):
     def _validate_thrusters(self) -> AzimuthThrustersConfig:
         _require_unique_names([thruster_position.name for thruster_position in self.places])
         require_curve_covers_range(self.curve_range, self.shaft.n_max)
+        # allocation inverts the thrust curve, which must therefore be monotonic
         n = np.linspace(-self.shaft.n_max, self.shaft.n_max, _TABLE_POINTS)
         decreasing = n[np.polynomial.Polynomial(self.thrust).deriv()(n) <= 0]
         if len(decreasing):
@@ -317,6 +320,7 @@ class AzimuthThrusters(ForceActuators):
         )
         n = lower + fraction.clamp(0.0, 1.0) * (upper - lower)
         for _ in range(_NEWTON_STEPS):
+            # the bounds keep a step from leaving the interval of the table where the slope is small
             n = n - (self.thrust_at(n) - force) / _evaluate_polynomial(self.slope_coefficients, n)
             n = torch.minimum(torch.maximum(n, lower), upper)
         return n
@@ -492,7 +496,7 @@ class VectoredThrusters(ActuatorSystem):
             (thrust_direction, torch.linalg.cross(position, thrust_direction)), dim=-1
         )
         self.thrust_configuration = nn.Buffer(configuration, persistent=False)
-        # ahead, about the vertical and down, as far as a thruster does any of it
+        # signs of the contributions to surge, yaw and heave; zero at the level of rounding
         demand_rows = torch.stack((configuration[:, 0], configuration[:, 5], configuration[:, 2]))
         demand_rows = (
             torch.where(demand_rows.abs() < 1e-9, 0.0, torch.sign(demand_rows)) * config.limit
