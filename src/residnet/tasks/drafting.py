@@ -138,6 +138,49 @@ def write_new_config(
     ]
 
 
+def _note_missing_inputs(
+    inputs: Sequence[str], draft_logs: _DraftLogs, draft_notes: DraftNotes
+) -> None:
+    """Note that the logs have no inputs, or none for thrust or steering."""
+    if not inputs:
+        channel_names = ", ".join(next(iter(draft_logs.complete_logs.values())).channels)
+        draft_notes.add_guess(
+            INPUTS_KEY,
+            "no channel of the logs is a rudder, a propeller or another command (channels:"
+            f" {channel_names}): a model without inputs can only predict how the vessel coasts;"
+            " name the columns of the commands",
+        )
+    elif missing := missing_control(inputs, draft_logs.dof):
+        draft_notes.add_guess(
+            INPUTS_KEY,
+            f"no input {missing} the vessel; if an unused column does, name it under"
+            " data.reader.channels",
+        )
+
+
+def _note_unused_channels(
+    draft_logs: _DraftLogs, draft_notes: DraftNotes, *, has_wind: bool
+) -> None:
+    """Note channels of depth and wind that the model does not use, and what it would need."""
+    dof = draft_logs.dof
+    measured_channels = {name for log in draft_logs.logs.values() for name in log.channels}
+    depth_channels = [
+        name
+        for name in SIX_DOF_LAYOUT.dynamic_states
+        if name in measured_channels and name not in ROLL_LAYOUT.dynamic_states
+    ]
+    if depth_channels and not dof.is_six_dof:
+        draft_notes.add_note(
+            CHANNELS_KEY,
+            f"{', '.join(depth_channels)}: not used: six degrees of freedom need depth, pitch and"
+            " roll angles, and u and v or a position, that move in all logs",
+        )
+    if not has_wind and all({*WIND_INPUTS} <= {*log.channels} for log in draft_logs.logs.values()):
+        draft_notes.add_note(
+            CHANNELS_KEY, "the wind is not used: its loads need u, v, r and a measured heading"
+        )
+
+
 def draft_fit_config(
     paths: Sequence[Path], folder: Path, name: str, answer_question: AnswerCallback | None = None
 ) -> ConfigDraft:
@@ -156,21 +199,7 @@ def draft_fit_config(
     draft_notes = DraftNotes(answer_question)
     draft_logs = _DraftLogs(find_log_files(paths), draft_notes)
     inputs = choose_inputs(list(draft_logs.complete_logs.values()), draft_notes)
-    if not inputs:
-        channel_names = ", ".join(next(iter(draft_logs.complete_logs.values())).channels)
-        draft_notes.add_guess(
-            INPUTS_KEY,
-            "no channel of the logs is a rudder, a propeller or another command (channels:"
-            f" {channel_names}): a model without inputs can only predict how the vessel coasts;"
-            f" name"
-            " the columns of the commands",
-        )
-    elif missing := missing_control(inputs, draft_logs.dof):
-        draft_notes.add_guess(
-            INPUTS_KEY,
-            f"no input {missing} the vessel; if an unused column does, name it under"
-            " data.reader.channels",
-        )
+    _note_missing_inputs(inputs, draft_logs, draft_notes)
     inputs = draft_logs.keep_inputs(inputs, draft_notes)
     dof = draft_logs.dof
     finding_codes, quality_warnings = _data_quality_warnings(list(draft_logs.logs.values()), inputs)
@@ -200,26 +229,7 @@ def draft_fit_config(
         if preparation_recipe.wind_channels
         else {}
     )
-    measured_channels = {name for log in draft_logs.logs.values() for name in log.channels}
-    depth_channels = [
-        name
-        for name in SIX_DOF_LAYOUT.dynamic_states
-        if name in measured_channels and name not in ROLL_LAYOUT.dynamic_states
-    ]
-    if depth_channels and not dof.is_six_dof:
-        text = (
-            f"{', '.join(depth_channels)}: not used: six degrees of freedom need depth, pitch"
-            f" and roll"
-        )
-        draft_notes.add_note(
-            CHANNELS_KEY, f"{text} angles, and u and v or a position, that move in all logs"
-        )
-    if not preparation_recipe.wind_channels and all(
-        {*WIND_INPUTS} <= {*log.channels} for log in draft_logs.logs.values()
-    ):
-        draft_notes.add_note(
-            CHANNELS_KEY, "the wind is not used: its loads need u, v, r and a measured heading"
-        )
+    _note_unused_channels(draft_logs, draft_notes, has_wind=bool(preparation_recipe.wind_channels))
     preparation = preparation_recipe.to_config()
     for text in quality_warnings:
         draft_notes.add_note(("data",), f"data doctor: {text}")
@@ -242,9 +252,8 @@ def draft_fit_config(
     draft_notes.add_note(("prepare", "grid"), preparation_recipe.reason)
     draft_notes.add_note(
         ("evaluation", "protocols"),
-        f"free runs of a length that most logs contain; {evaluation_settings['selection']} is"
-        f" used for"
-        " model selection on validation logs",
+        f"free runs of a length that most logs contain; {evaluation_settings['selection']} is used"
+        " for model selection on validation logs",
     )
     draft_notes.add_note(
         ("evaluation", "scales"), "winsorized standard deviations over the training logs"
