@@ -25,7 +25,7 @@ from residnet.regression.estimator import Solution
 from residnet.regression.shrinkage import CONSTANT_TOLERANCE
 
 _MIN_STD = 1e-9
-"""Lower bound of the standard deviation by which the output of a network is scaled, SI."""
+"""Lower bound of the standard deviation of the residual that scales the output of a network, SI."""
 
 
 class ResidualHead(nn.Module, ABC):
@@ -101,6 +101,7 @@ class ResidualHead(nn.Module, ABC):
             samples: samples whose target is the measured acceleration [N, n].
             baseline_acceleration: acceleration of the baseline [N, n].
         """
+        # long training data are stored on disk: computed in chunks of rows
         residuals = paged.allocate_rows(len(samples), samples.target.shape[1])
         for rows in paged.iterate_row_chunks(len(samples)):
             torch.sub(samples.target[rows], baseline_acceleration[rows], out=residuals[rows])
@@ -158,7 +159,10 @@ class ResidualHead(nn.Module, ABC):
         return torch.ones(self.n_dof, dtype=torch.float64)
 
     def parameter_counts(self) -> list[float]:
-        """Return the number of fitted parameters per axis, by default all parameters for each."""
+        """Return the number of fitted parameters per axis.
+
+        By default every parameter counts for every axis.
+        """
         return [float(sum(parameter.numel() for parameter in self.parameters()))] * self.n_dof
 
 
@@ -229,8 +233,8 @@ class FeatureConfig(Config):
 
     Attributes:
         features: names of channels; empty for all.
-        margin: share by which the training range is widened. Features are clamped to the wider
-            range, so that the residual is constant outside of it and does not diverge.
+        margin: widening of the training range to either side, as a share of its width. Features are
+            clamped to the wider range, so that the residual is constant outside and cannot diverge.
     """
 
     features: tuple[str, ...] = ()
@@ -302,6 +306,7 @@ class Features(nn.Module):
             moments[self.index]
             for moments in (channel_moments.minimum, channel_moments.maximum, channel_moments.std())
         )
+        # outside the margin the residual is constant instead of extrapolated
         range_margin = self.margin * (upper - lower)
         self.mean.copy_(channel_moments.mean[self.index])
         self.std.copy_(
@@ -326,6 +331,7 @@ class Features(nn.Module):
 
 
 def _index_buffer(indices: Sequence[int]) -> nn.Buffer:
+    """Return column indices as a buffer, which moves with the module but is not stored."""
     return nn.Buffer(torch.tensor(indices, dtype=torch.long), persistent=False)
 
 

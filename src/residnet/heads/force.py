@@ -91,6 +91,7 @@ class ForceHead(RenamedStateModule, ClosedFormHead):
         self.upper_velocities.copy_(velocities.amax(0))
         for feature_index, name in enumerate(self.feature_names):
             if name in ACCELERATION_NAMES:
+                # a clamped acceleration would no longer be affine in nu_dot
                 self.inner.features.low[feature_index] = -torch.inf
                 self.inner.features.high[feature_index] = torch.inf
 
@@ -110,6 +111,8 @@ class ForceHead(RenamedStateModule, ClosedFormHead):
                 runnable.append(self._add_augmented_mass(solution))
             except FitError as error:
                 errors.append(error)
+        # an empty equation always has a positive definite mass; it must not hide the error of the
+        # others
         if errors and not any(
             bool(solution.state["inner.coefficients"].any()) for solution in runnable
         ):
@@ -120,6 +123,7 @@ class ForceHead(RenamedStateModule, ClosedFormHead):
         """Return a solution with its mass M + A, with the names of the state of this head."""
         coefficients = solution.state["coefficients"].clone()
         for j, axis in self.acceleration_terms.items():
+            # the coefficients belong to accelerations scaled by their standard deviation
             coefficients[j] /= self.inner.features.std[
                 self.feature_names.index(ACCELERATION_NAMES[axis])
             ]
@@ -137,13 +141,14 @@ class ForceHead(RenamedStateModule, ClosedFormHead):
         }
         notes = solution.notes | {"space": "force", "augmented_mass": augmented_mass.tolist()}
         if self.constant_forces:
-            # the equation of motion is then identifiable up to a factor only; the penalty and free
-            # runs keep the factor near one
+            # without varying forces the equation of motion is identifiable only up to a factor; the
+            # penalty and the selection by free runs keep the factor near one
             notes["forces_that_never_vary"] = self.constant_forces
         return Solution(solution.hyperparameters, state, notes=notes)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the acceleration -(M + A)^-1 b [..., 3] at channels z [..., nz]."""
+        # b(z) is the residual at zero acceleration; A is part of the augmented mass
         residual_load, s = self.inner(torch.cat((zero_acceleration(z), z), dim=-1), s)
         return -(residual_load @ self.inverse.to(z.dtype).T), s
 

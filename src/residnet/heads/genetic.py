@@ -112,7 +112,7 @@ class GeneticHead(EquationHead):
                 term_values, samples.target, names=library.terms, outputs=self.output_names
             )[0].table
         except FitError:
-            # too few samples for all candidates say nothing against a bred equation
+            # too few samples for all candidates at once; genetic programming needs fewer
             return []
         return [
             [

@@ -143,6 +143,7 @@ class KernelHead(ClosedFormHead):
         if self.config.choose == "recursion":
             group = samples.group.numpy()
             t = samples.t.numpy()
+            # recursion runs one velocity freely, which needs segments without gaps
             time_step = median_time_step(group, t)
             segment = torch.from_numpy(number_regular_segments(group, t, time_step))
             columns = [samples.names.index(name) for name in get_dof(samples.names).dynamic_states]
@@ -163,6 +164,7 @@ class KernelHead(ClosedFormHead):
         return [self._to_state(solution) for solution in solutions]
 
     def _to_state(self, solution: Solution) -> Solution:
+        """Return a solution of the kernel with the names of the state of this head."""
         state_names = {"effective": "effective"}
         state = {
             state_names.get(name, f"kernel.{name}"): value for name, value in solution.state.items()

@@ -18,6 +18,8 @@ from residnet.regression.shrinkage import PLSR, Ridge
 
 
 class LinearBasisConfig(BasisConfig, ABC):
+    """Base of the configurations of heads that are linear in basis functions."""
+
     @final
     def build(self, names: Sequence[str]) -> ClosedFormHead:
         """Build the head for channels `names`, in acceleration or force space.
@@ -27,6 +29,7 @@ class LinearBasisConfig(BasisConfig, ABC):
         """
         if self.space == "acceleration":
             return BasisHead(self, names)
+        # defaults of document 002: accelerations and velocities as features, and its thirty terms
         force_defaults = {
             "features": self.features or MOTION_CHANNELS,
             "terms": self.terms or FERRY_TERMS,

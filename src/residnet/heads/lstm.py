@@ -18,7 +18,7 @@ from residnet.physics.signals import RestoringAcceleration
 from residnet.physics.symmetry import get_dof
 
 _MAX_CELL_STATE = 1e3
-"""Upper bound of the magnitude of a plausible cell state; activations saturate far below."""
+"""Upper bound of the magnitude of a plausible cell state; the activation saturates far below it."""
 
 
 class LstmConfig(FeatureConfig):
@@ -111,8 +111,10 @@ class LSTMCell(RenamedStateModule):
         )
         self.bias = nn.Parameter(torch.zeros(4 * hidden_size))
         with torch.no_grad():
-            # a forget gate that starts open lets the memory reach back from the first epoch
+            # an initially open forget gate (bias 1) passes gradients over many steps from the first
+            # epoch (Jozefowicz et al. 2015)
             self.bias[hidden_size : 2 * hidden_size] = 1.0
+        # the fused kernel of torch expects a second bias
         self.zero_bias = nn.Buffer(torch.zeros(4 * hidden_size), persistent=False)
 
     def forward(self, features: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -123,7 +125,8 @@ class LSTMCell(RenamedStateModule):
         """Return output and memory as `forward`, given the input part of the gates [B, 4H]."""
         hidden, previous_cell = s.split([self.hidden_size, self.hidden_size], dim=-1)
         gates = gates + hidden @ self.hidden_weight.T
-        # one operation over all numbers is quicker than three over parts that lie apart
+        # one sigmoid over the contiguous gates is faster than three over separate slices; that of
+        # the cell gate is not used
         input_gate, forget_gate, _, output_gate = torch.sigmoid(gates).chunk(4, dim=-1)
         cell_gate = gates[:, 2 * self.hidden_size : 3 * self.hidden_size]
         cell_input = (
@@ -200,6 +203,7 @@ class LstmNetwork(RenamedStateModule):
         self.has_readout_layer = config.readout > 0
         output_layer = nn.Linear(config.readout or config.hidden_size, n_outputs)
         with torch.no_grad():
+            # small initial outputs: training starts near the baseline
             output_layer.weight.mul_(0.1)
             output_layer.bias.zero_()
         hidden_layers = (

@@ -103,6 +103,7 @@ class MirroredHead(RenamedStateModule, ResidualHead):
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         rho, next_memory = self.inner_head(
             self.stack_mirrored(z),
+            # columns of the memory become rows of the doubled batch
             torch.cat((s[:, : self.inner_state_size], s[:, self.inner_state_size :]), dim=0),
         )
         batch_size = z.shape[0]

@@ -16,7 +16,7 @@ from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualS
 from residnet.physics.signals import RestoringAcceleration
 
 _INNOVATION_CLIP_STD = 4.0
-"""Number of standard deviations of the residual at which innovations are clipped."""
+"""Bound of the innovations after smooth clipping, in standard deviations of the residual."""
 _MIN_GATE = 1e-13
 """Lower bound of the update gate, so that its logarithm is finite in float32."""
 
@@ -98,6 +98,7 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
         self.skip_weight = uniform_parameter(n_inputs, self.n_dof)
         self.bias_out = nn.Parameter(torch.zeros(config.members, 1, self.n_dof))
         with torch.no_grad():
+            # small initial outputs: training starts near the baseline
             for weight in (self.output_weight, self.skip_weight):
                 weight.mul_(0.1)
 
@@ -149,7 +150,9 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
             update_gate = torch.exp(
                 self.step_ratio * torch.log(update_gate.clamp(min=self.min_gate))
             )
+        # reset after the product, as in cuDNN and torch.nn.GRU
         candidate = torch.tanh(candidate + reset_gate * (hidden_candidate + self.bias_hidden))
+        # convex combination of candidate and memory, written with one product
         return candidate + update_gate * (hidden - candidate)
 
     def teacher_forced_residuals(self, z: Tensor) -> Tensor:

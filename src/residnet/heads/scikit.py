@@ -27,7 +27,10 @@ from residnet.heads.scikit_state import FITTED, KERNELS, StateError, decode, enc
 from residnet.regression.estimator import Solution
 
 _DIFFERENCE_STEP = 0.1
-"""Step of central differences in standard deviations of a feature; trees are flat locally."""
+"""Step of central differences in standard deviations of a feature.
+
+It is large, because trees are piecewise constant.
+"""
 _STATE = "_extra_state"
 _STORED_STATE = 1
 """First byte of a stored state that holds the arrays of fitted estimators."""
@@ -46,7 +49,7 @@ class SklearnConfig(FeatureConfig):
         pipeline: steps of the pipeline. A step is a dotted name below `sklearn`, or a mapping from
             the name to the parameters, whose values may again be names or mappings. Classes outside
             of `residnet.heads.scikit_state.FITTED` need `--trust`.
-        samples: maximum number of training samples, thinned evenly.
+        samples: maximum number of training samples; more samples are decimated evenly.
     """
 
     kind: Literal["sklearn"] = "sklearn"
@@ -205,6 +208,7 @@ class SklearnHead(ClosedFormHead):
             features = self.features(samples.z[rows]).double().numpy()
             y = (samples.target[rows] / self.scale.std).double().numpy()
         axes = self._fit(features, y)
+        # layout of the stored bytes: kind, number of samples (four bytes), content
         count = np.array([len(rows)], dtype="<u4").view(np.uint8)
         if self.config.is_storable:
             names = [_parse_step(step)[0] for step in self.config.pipeline]  # type: ignore[index]
@@ -252,6 +256,7 @@ class SklearnHead(ClosedFormHead):
                 "a head of kind sklearn: its state was stored by an earlier version of residnet,"
                 " which fitted it again at each load; run the fit again"
             )
+        # loading the state that is already set needs no new fit
         if np.array_equal(stored, self.stored):
             return
         if len(stored) < 5:

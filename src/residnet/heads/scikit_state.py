@@ -101,7 +101,7 @@ KERNELS: Final = frozenset(
 _FORESTS = ("RandomForestRegressor", "ExtraTreesRegressor")
 _SINGLE_TREES = ("DecisionTreeRegressor", "ExtraTreeRegressor")
 _MAX_FEATURES = 100_000
-"""Maximum number of columns between two steps, above that of any useful polynomial."""
+"""Maximum number of columns between two steps; useful polynomials have fewer."""
 
 
 class StateError(ValueError):
@@ -251,6 +251,7 @@ def _fill(estimator: Any, name: str, state: dict[str, Any], columns: int) -> Non
         raise StateError("has other degrees than its description")
     vars(estimator).update(attributes)
     estimator.n_features_in_ = columns
+    # predictions run in this thread: a stored config must not start processes
     if "n_jobs" in vars(estimator):
         estimator.n_jobs = None
     _restore_special(estimator, state, columns)

@@ -74,7 +74,7 @@ class DelayLine(nn.Module):
             torch.tensor([list(names).index(name) for name in delayed_names], dtype=torch.long),
             persistent=False,
         )
-        # a float, as all stored numbers are
+        # stored as a float like all buffers, because models are cast to a dtype as a whole
         self.steps = nn.Buffer(torch.zeros(1, dtype=torch.float64))
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -82,8 +82,10 @@ class DelayLine(nn.Module):
         if self.n_delayed == 0:
             return z, s
         current = z.index_select(-1, self.delayed_index)
+        # an empty memory (flag 0) is filled with the first sample
         buffered = torch.where(s[..., -1:] > 0, s[..., :-1], self._repeat_to_line(current))
         delay_line = torch.cat((buffered, current), dim=-1)
+        # the line is ordered from old to new: a delay of d steps begins d blocks before the end
         first_column = (self.max_delay - self.steps.round().to(torch.long)) * self.n_delayed
         delayed = delay_line.index_select(
             -1, first_column + torch.arange(self.n_delayed, device=z.device)
@@ -130,7 +132,7 @@ class DelayLine(nn.Module):
         lower_memory, upper_memory = (
             limit[self.delayed_index].repeat(self.max_delay) for limit in (lower, upper)
         )
-        # the memory without a past is zeros
+        # the memory without a past is zero, which need not be in the range of a channel
         return torch.cat((lower_memory.clamp(max=0.0), lower_memory.new_zeros(1))), (
             torch.cat((upper_memory.clamp(min=0.0), upper_memory.new_ones(1)))
         )
@@ -202,8 +204,7 @@ def find_best_delay(
         if len(z) <= max_terms:
             raise FitError(
                 f"delay: {len(z)} samples have {max_delay} preceding samples, which is too few for"
-                f" {max_terms} terms;"
-                " give longer logs or a shorter delay"
+                f" {max_terms} terms; give longer logs or a shorter delay"
             )
         for library, target in zip(libraries, delayed.target.T, strict=True):
             columns = library(z).numpy()
@@ -214,6 +215,7 @@ def find_best_delay(
             )
             target_energy = float(target @ target)
             projection = columns.T @ target
+            # RSS of the projection: y'y - (X'y)' (X'X)^+ X'y
             rss = max(target_energy - float(projection @ gram_inverse @ projection), 0.0)
             # differences at the level of rounding errors must not decide between delays
             profile[delay_steps] += np.log(rss + _ROUNDING_SHARE * target_energy + _MIN_NORM) / len(
@@ -349,6 +351,7 @@ class SymbolicHead(EquationHead):
     def _fit_equations(
         self, samples: SegmentedSamples, gammas: Sequence[float] = ()
     ) -> list[Solution]:
+        """Fit sparse equations to delayed samples; first that of the search, then one per gamma."""
         with torch.no_grad():
             term_values = self.candidate_values(torch.from_numpy(samples.features)).numpy()
         regression_rows = self.config.estimator.build_rows(
@@ -397,14 +400,14 @@ class SymbolicHead(EquationHead):
         is_possible = self._allowed_terms(samples).any(1).tolist()
         delayed_index = self.line.delayed_index.numpy()
         linear_terms = [
-            coefficient.term
-            for coefficient, is_term_possible in zip(self.candidates, is_possible, strict=True)
-            if is_term_possible and coefficient.degree <= 1
+            candidate.term
+            for candidate, is_term_possible in zip(self.candidates, is_possible, strict=True)
+            if is_term_possible and candidate.degree <= 1
         ]
         terms: list[list[str]] = [linear_terms] * self.n_dof
         tried_delays: list[int] = []
         profile = np.zeros(0)
-        # alternate between the delay and the terms until the delay does not change
+        # delay and terms depend on each other: a fixed-point iteration with a limit of rounds
         while len(tried_delays) < 2 or (
             tried_delays[-1] != tried_delays[-2] and len(tried_delays) < _MAX_DELAY_ROUNDS
         ):
@@ -432,6 +435,7 @@ class SymbolicHead(EquationHead):
     def _add_delay_and_text(
         self, solution: Solution, delay_steps: int, delay_notes: dict[str, Any]
     ) -> Solution:
+        """Add the delay to the state of a solution, and the written equations to its notes."""
         equations = {
             name: self._format_solution(
                 name,
@@ -451,6 +455,7 @@ class SymbolicHead(EquationHead):
     def _format_solution(
         self, name: str, terms: Sequence[Coefficient], delay_steps: int
     ) -> dict[str, str]:
+        """Return the equation of one acceleration in several notations."""
         channels = self.features.names
         weights = [coefficient.value for coefficient in terms]
         factors = [

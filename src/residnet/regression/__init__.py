@@ -1,1 +1,1 @@
-"""Estimators from arrays to coefficients; nothing here knows of vessels."""
+"""Estimators from arrays to coefficients, independent of vessels."""

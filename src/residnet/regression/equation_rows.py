@@ -120,10 +120,12 @@ def integrate_windows(
             f"weak form: a window of {window:g} s has {window_samples} samples at an interval of"
             f" {time_step:g} s; set it to {3 * time_step:g} s or longer"
         )
+    # the samples lie inside the window: at its ends the test function is zero
     window_coordinate = np.linspace(-1.0, 1.0, window_samples + 2)[1:-1]
     test_function = np.square(1.0 - np.square(window_coordinate))
     test_function /= test_function.sum()
     segment_starts, segment_ends = find_run_bounds(samples.segment)
+    # a window must end within the segment of its first sample
     window_starts = np.flatnonzero(
         np.arange(window_samples, len(segment_ends) + window_samples) <= segment_ends
     )
@@ -195,6 +197,7 @@ def effective_correlation_length(residual: np.ndarray) -> np.ndarray:
     """
     n = len(residual)
     centred = residual - residual.mean(axis=0)
+    # autocovariance by the Wiener-Khinchin theorem; padding to 2 n avoids circular correlation
     spectrum = np.abs(np.fft.rfft(centred, 2 * n, axis=0)) ** 2
     covariance = np.fft.irfft(spectrum, axis=0)[:n]
     rho = covariance / np.maximum(covariance[0], _MIN_VARIANCE)

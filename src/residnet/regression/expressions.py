@@ -109,9 +109,11 @@ class Algebra:
         Raises:
             TooLargeError: if the result exceeds the limits.
         """
+        # without expansion a sum is one factor, such as (u + v) in (u + v) r
         if not self.limits.expand:
             a = self.bracket_sum(a)
             b = self.bracket_sum(b)
+        # terms may cancel or merge, so that the limit before multiplication is looser
         if len(a) * len(b) > 4 * self.limits.terms:
             raise TooLargeError
         result: Sum = {}
@@ -159,6 +161,7 @@ class Algebra:
         """Return a sum of several terms as one bracketed factor times its leading weight."""
         if len(a) <= 1:
             return a
+        # brackets that differ by a factor share one atom
         leading_weight = a[min(a)]
         return {
             self._normalise_function(
@@ -255,6 +258,11 @@ class Algebra:
         return tuple(sorted(atoms))
 
     def _require_within_limits(self, a: Sum) -> Sum:
+        """Return a sum unchanged.
+
+        Raises:
+            TooLargeError: if it has too many terms.
+        """
         if len(a) > self.limits.terms:
             raise TooLargeError
         return a
@@ -275,6 +283,7 @@ class ProductEvaluator:
 
     def __init__(self, algebra: Algebra, data: Mapping[str, np.ndarray]) -> None:
         self.algebra = algebra
+        # row 0 is the constant 1, which pads products of fewer factors
         rows = [np.asarray(data[name], dtype=np.float64) for name in algebra.channels]
         self._atom_values = np.concatenate((np.ones((1, len(rows[0]))), np.stack(rows)))
         self._row_of_atom = {i: i + 1 for i in range(len(rows))}
@@ -297,6 +306,7 @@ class ProductEvaluator:
         return values
 
     def _evaluate_atoms(self, required: set[int]) -> None:
+        """Evaluate the functions among some atoms that were not evaluated before."""
         missing = sorted(i for i in required if i not in self._row_of_atom)
         if not missing:
             return
@@ -374,7 +384,13 @@ class ProductLayer(ResizableModule):
 
 
 class FunctionLayer(ResizableModule):
-    """Appends K functions of sums, f_k(sum_m weight_km product_km), to the columns."""
+    """Appends K functions of sums, f_k(sum_m weight_km product_km), to the columns.
+
+    Attributes:
+        products: products of all sums, M for each function.
+        weight: weights of the products [K, M]; zero for padding.
+        pick: one-hot selection of each function among `FUNCTIONS` [K, 6].
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -410,7 +426,10 @@ class FunctionLayer(ResizableModule):
             dim=-1,
         )
         return torch.cat(
-            (columns, torch.where(self.pick > 0, values, torch.zeros_like(values)).sum(-1)), dim=-1
+            # all functions are evaluated and one is selected, because a traced graph has no
+            # branches
+            (columns, torch.where(self.pick > 0, values, torch.zeros_like(values)).sum(-1)),
+            dim=-1,
         )
 
 
@@ -520,6 +539,7 @@ def build_library_state(
 
 
 def _product_index(products: Sequence[Product], column_of_atom: dict[int, int]) -> Tensor:
+    """Return the buffer `index` [D, P] of a `ProductLayer` for products of atoms."""
     max_factors = max([1, *(len(product) for product in products)])
     rows = [
         [column_of_atom[i] for i in product] + [0] * (max_factors - len(product))
@@ -563,6 +583,7 @@ def format_sum(terms: Sequence[str], weights: Sequence[float]) -> str:
 
 
 def _format_atom(algebra: Algebra, i: int) -> str:
+    """Format a channel, or a function of a sum sorted by degree, as plain text."""
     atom = algebra.atoms[i]
     if not atom.inner:
         return atom.channel
@@ -607,6 +628,7 @@ def products_to_sympy(algebra: Algebra, products: Sequence[tuple[Product, float]
 
 
 def _apply_sympy_function(function: str, x: Any) -> Any:
+    """Return a function of the term language of a SymPy expression."""
     import sympy
 
     if function == "inv":
@@ -643,6 +665,7 @@ def format_equation(
     rounded_expression = expression.xreplace(
         {x: sympy.Float(x, 6) for x in expression.atoms(sympy.Float)}
     )
+    # SymPy renders the suffix `dot` as a dot above the letter
     lhs_symbol = sympy.Symbol(name.replace("_dot", "dot"))
     used_channels = {symbol.name for symbol in expression.free_symbols}
     unused_arguments = "".join(

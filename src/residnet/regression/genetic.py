@@ -50,8 +50,9 @@ from residnet.regression.sparse import (
 Operator = Literal["+", "-", "*", "/", "abs", "sin", "cos", "sqrt"]
 BINARY = {"+": "add", "-": "subtract", "*": "multiply", "/": "divide"}
 VALIDATION_BLOCKS = 8
-"""Number of blocks of the record used instead of groups if there are too few groups."""
+"""Number of blocks that replace the groups if there are too few groups."""
 Terms = tuple[Product, ...]
+"""Sorted products of an individual, which identify its fit."""
 _SINGULARITY_TOLERANCE = 1e-13
 """Squared pivot of the Cholesky factor below which a Gram matrix counts as singular.
 
@@ -97,8 +98,8 @@ class EvolutionConfig(Config):
         elite: number of best individuals copied unchanged to the next generation.
         goal: relative mean squared error, in training and validation, at which the search ends.
         patience: number of generations without a lower validation error after which it ends.
-        rows: maximum number of training samples of the search, thinned evenly; the coefficients of
-            the result are fitted to all samples.
+        rows: maximum number of training samples of the search, decimated evenly; the coefficients
+            of the result are fitted to all samples.
     """
 
     population: int = Field(default=500, ge=2, le=100_000)
@@ -197,6 +198,7 @@ class FitnessEvaluator:
             target: target [N].
             is_training: which samples [N] are used for training; the others validate.
         """
+        # training samples first: both subsets are slices of one array of columns
         order = np.argsort(~is_training, kind="stable")
         self._evaluator = ProductEvaluator(
             algebra,
@@ -226,6 +228,7 @@ class FitnessEvaluator:
         ]
         if new_term_sets:
             self._cache_columns({product for terms in new_term_sets for product in terms})
+            # sets of equal size are fitted in one batched Cholesky factorisation
             by_width: dict[int, list[Terms]] = {}
             for terms in new_term_sets:
                 if not terms or not bool(
@@ -243,6 +246,7 @@ class FitnessEvaluator:
         return [failed_result if terms is None else self._results[terms] for terms in individuals]
 
     def _clear_cache(self) -> None:
+        """Forget all columns of products; results of term sets are retained."""
         self._cache_rows: dict[Product, int] = {}
         self._cached_columns = torch.zeros(
             0, len(self.y) + len(self.y_validation), dtype=torch.float64
@@ -271,6 +275,7 @@ class FitnessEvaluator:
         self._is_usable = torch.cat((self._is_usable, torch.from_numpy(is_usable)))
 
     def _fit_batch(self, term_sets: Sequence[Terms]) -> None:
+        """Fit term sets of equal size by least squares and store their errors."""
         columns = self._cached_columns[
             torch.tensor([[self._cache_rows[p] for p in terms] for terms in term_sets])
         ]
@@ -321,7 +326,7 @@ class EvolutionResult:
     Attributes:
         terms: terms of the individual of minimum validation error among the best individuals of
             all generations.
-        train: its relative mean squared error on the thinned training samples.
+        train: its relative mean squared error on the decimated training samples.
         validation: its relative mean squared error on all validation samples.
         generation: generation in which it appeared; 0 is the initial population.
         is_goal_reached: whether both errors are below the goal.
@@ -390,15 +395,15 @@ def evolve(
             f" {int(is_training.sum())} of {len(is_training)} samples are for training; give more"
             " manoeuvres"
         )
-    # thin the training samples evenly; all validation samples are used
+    # decimate the training samples evenly; all validation samples are used
     training_rows = np.flatnonzero(is_training)
-    thinned_index = (
+    decimated_index = (
         np.linspace(0, len(training_rows) - 1, min(config.rows, len(training_rows)))
         .round()
         .astype(int)
     )
     selected_rows = np.sort(
-        np.concatenate((training_rows[np.unique(thinned_index)], np.flatnonzero(~is_training)))
+        np.concatenate((training_rows[np.unique(decimated_index)], np.flatnonzero(~is_training)))
     )
     fitness = FitnessEvaluator(
         algebra,
@@ -449,6 +454,7 @@ class _Evolution:
         self.operator_functions = binary_functions | {
             function: partial(algebra.apply_function, function) for function in functions
         }
+        # an operator that exceeds the depth returns a copy of a parent (Koza's limit)
         limit_height = self.gp.staticLimit(key=lambda tree: tree.height, max_value=config.depth)
         self.mate = limit_height(self.gp.cxOnePoint)
         self.mutate = limit_height(
@@ -583,6 +589,7 @@ class _Evolution:
     def _tree_to_sum(self, tree: Sequence[Any]) -> Sum:
         """Evaluate a tree in prefix order to a sum of products."""
         stack: list[Sum] = []
+        # prefix order read backwards: the operands are on the stack before their operator
         for node in reversed(tree):
             if node.arity == 2:
                 stack.append(self.operator_functions[node.name](stack.pop(), stack.pop()))
@@ -638,6 +645,7 @@ class GeneticEquations(Estimator):
                 target[:, k],
                 is_training,
                 config,
+                # distinct seeds for all outputs of all runs
                 n_outputs * config.seed + k,
                 extra_products[k],
             )

@@ -75,6 +75,7 @@ def fit_dual_path(
     errors_by_penalty = []
     effective_parameters = []
     for penalty in penalties:
+        # one eigendecomposition serves all penalties
         alpha = eigenvectors @ (projected / (eigenvalues + penalty)[:, None])
         squared_error = torch.zeros(y.shape[1], dtype=y.dtype)
         for rows in fold_members:
@@ -131,6 +132,7 @@ def fit_primal_path(
             y.shape[1],
             penalties,
         )
+        # residuals of the fold: Phi W w - Y = R [w; -I], up to a rotation that preserves the norm
         weights_and_targets = torch.cat(
             (weights, -torch.eye(y.shape[1], dtype=y.dtype).expand(len(penalties), -1, -1)), dim=1
         )
@@ -155,6 +157,7 @@ def _accumulate_r_factor(
 
 
 def _qr_factor(matrix: Tensor) -> Tensor:
+    """Return the R factor of a QR factorisation."""
     factor: Tensor = torch.linalg.qr(matrix, mode="r")[1]
     return factor
 
@@ -419,6 +422,8 @@ class PolynomialConfig(Config):
 
 def squared_distances(x: Tensor, points: Tensor) -> Tensor:
     """Return |x - x_i|^2 [..., M] between inputs [..., F] and points [M, F]."""
+    # |x - p|^2 = |x|^2 + |p|^2 - 2 x.p needs no tensor of all differences; rounding may make it
+    # slightly negative
     squared_norms = (x * x).sum(-1, keepdim=True) + (points * points).sum(-1)
     return (squared_norms - 2.0 * (x @ points.T)).clamp(min=0.0)
 
@@ -492,6 +497,7 @@ class RecursiveErrors:
         """
         column = self.states[output]
         measured = self.z[..., column]
+        # the free run adds it, so that only errors of this output accumulate
         remaining_derivative = (measured[:, 1:] - measured[:, :-1]) / self.time_step - self.target[
             :, :-1, output
         ]
@@ -607,6 +613,7 @@ class KernelRidge(Estimator):
         setting_indices: _SettingIndices,
         notes: dict[str, Any],
     ) -> Solution:
+        """Build the solution with a kernel setting and a penalty for each output."""
         output_settings = list(
             enumerate(zip(setting_indices.settings, setting_indices.penalties, strict=True))
         )

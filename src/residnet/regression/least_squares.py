@@ -25,9 +25,9 @@ from residnet.regression.estimator import (
 )
 
 _COLLINEARITY_TOLERANCE = 1e-9
-"""Share of the largest singular value below which centred columns count as collinear."""
+"""Ratio to the largest singular value below which centred columns count as collinear."""
 _MIN_COLLINEAR_LOAD = 0.1
-"""Share of the largest loading above which an error message lists a column as collinear."""
+"""Ratio to the largest loading above which an error message lists a column as collinear."""
 _ROUNDING_FACTOR = 10
 """Rounding error of a zero eigenvalue, in units of columns times machine precision."""
 _MIN_EIGENVALUE = 1e-300
@@ -39,7 +39,7 @@ _MAX_ITERATIONS = 3000
 _TOLERANCE = 1e-4
 """Duality gap at which coordinate descent ends."""
 _MIN_DAMPING = 1e-8
-"""Damping that is too small to change a step; the least value after a failed undamped step."""
+"""Damping that hardly changes a step; the smallest damping after a failed undamped step."""
 _MAX_DAMPING_TRIALS = 8
 """Number of dampings tried without a decrease before a point counts as the minimum."""
 
@@ -180,6 +180,7 @@ class ElasticNet(Estimator):
 
         x, y = to_dense(data.x), data.y
         fold_index = assign_group_folds(data.groups, self.folds)
+        # scikit-learn accepts indices of training and test samples
         cv_splits = [
             ((fold_index != k).nonzero()[:, 0].numpy(), (fold_index == k).nonzero()[:, 0].numpy())
             for k in range(int(fold_index.max()) + 1)
@@ -240,6 +241,7 @@ def _score_covariance(
         residual = y[rows] - scaled_columns @ coefficients
         for k in range(n_outputs):
             group_scores[k].index_add_(0, group_index[rows], scaled_columns * residual[:, [k]])
+    # small-sample correction G / (G - 1) of the cluster-robust estimator
     return group_scores.transpose(1, 2) @ group_scores * n_groups / (n_groups - 1)
 
 
@@ -294,6 +296,7 @@ def minimize_levenberg_marquardt(
             break
         point = trial_point
         n_steps = n_steps + 1
+        # a damping of zero stays zero: Gauss-Newton
         damping = max(damping / 10.0, min(damping, _MIN_DAMPING))
         if cost - trial_cost < min_relative_decrease * abs(cost):
             break

@@ -99,6 +99,7 @@ class FoldMoments:
             outputs_chunk = y[rows]
             fold_chunk = fold_index[rows]
             chunk = chunk.masked_fill(is_constant, 0.0)
+            # the product of [1, X, Y] with itself contains counts, means and all second moments
             augmented = torch.cat(
                 (torch.ones_like(outputs_chunk[:, :1]), chunk - shift_x, outputs_chunk - shift_y), 1
             )
@@ -127,6 +128,7 @@ class FoldMoments:
         n_regressors = self.n_regressors
         n_samples = float(summed_moments[0, 0])
         mean = summed_moments[0, 1:] / n_samples
+        # the shift by the overall means makes this difference harmless
         cross = summed_moments[1:, 1:] - n_samples * torch.outer(mean, mean)
         return CentredMoments(
             n_samples,
@@ -155,6 +157,7 @@ class FoldMoments:
         xx = fold_sums[: n_regressors + 1, : n_regressors + 1]
         xy = fold_sums[: n_regressors + 1, n_regressors + 1 :]
         yy = fold_sums[n_regressors + 1 :, n_regressors + 1 :].diagonal()
+        # |y - X w|^2 = y'y - 2 w'X'y + w'X'X w, from the moments of the fold alone
         quadratic_form = torch.einsum("cik,ij,cjk->ck", weights, xx, weights)
         return yy - 2 * torch.einsum("cik,ik->ck", weights, xy) + quadratic_form
 
@@ -309,6 +312,7 @@ class Ridge(_RegularizationPathEstimator):
         self.is_shared = is_shared
 
     def compute_path(self, xx: Tensor, xy: Tensor, n_samples: float) -> Tensor:
+        # one eigendecomposition serves all penalties
         eigenvalues, eigenvectors = torch.linalg.eigh(xx / n_samples)
         projected = eigenvectors.T @ xy / n_samples
         penalties = torch.tensor(self.penalties, dtype=xy.dtype)
@@ -445,10 +449,12 @@ def pls_path(
             left_vectors, singular_values, _ = torch.linalg.svd(
                 active_covariance, full_matrices=False
             )
+            # PLS2: the weights are the dominant left singular vector of the residual covariance
             r = w = left_vectors[..., :1]
             is_active = singular_values[..., :1] > min_covariance
         else:
             norm = torch.linalg.vector_norm(active_covariance, dim=-2, keepdim=True)
+            # PLS1: the weights are the normalised covariance
             r = w = active_covariance / norm.clamp(min=_MIN_NORM)
             is_active = norm > min_covariance[..., None, first_active:]
         # rotate the weights so that they apply to the undeflated columns

@@ -25,15 +25,15 @@ from residnet.regression.equation_rows import effective_correlation_length
 from residnet.regression.estimator import Coefficient, Estimator, EstimatorData, Solution, to_dense
 
 _DEPENDENCE_TOLERANCE = 1e-12
-"""Norm of a unit column after projection on simpler ones, below which it counts as dependent."""
+"""Norm of a unit column orthogonal to simpler ones, below which it counts as dependent on them."""
 _MIN_NORM = 1e-300
 """Norm below which a column or target counts as zero; lower bound of a denominator."""
 _MIN_REPORTED_SHARE = 1e-6
 """Minimum weight of a simpler column that is reported as a component of a dependent column."""
 _DUPLICATE_TOLERANCE = 1e-11
-"""Norm of a unit column after projection, below which only rounding errors remain."""
+"""Norm of a unit column orthogonal to a subset, below which it consists of rounding errors."""
 _SPAN_TOLERANCE = 1e-9
-"""Norm of a unit column after projection, below which it lies in the span of the subset."""
+"""Norm of a unit column orthogonal to a subset, below which it lies in its span."""
 _NOISE_SHARE = 1e-9
 """Relative error of the best equation above which the data count as noisy."""
 _POSITIVE_EVIDENCE = 3.0
@@ -168,6 +168,7 @@ def reduce_problem(
         unexcited=tuple(names[i] for i in order[column_norm <= _MIN_NORM]),
         dependent={},
     )
+    # residuals of the full model estimate how many samples are independent
     distinct = merge_similar_columns(all_candidates, _DEPENDENCE_TOLERANCE)
     columns = [excited[all_candidates.names.index(name)] for name in distinct.names]
     coefficients = (
@@ -226,6 +227,7 @@ def merge_similar_columns(reduced: ReducedProblem, resolution: float) -> Reduced
 
 
 def _r_factor(x: np.ndarray) -> np.ndarray:
+    """Return the R factor of a QR factorisation."""
     return np.asarray(np.linalg.qr(x, mode="r"))
 
 
@@ -265,6 +267,7 @@ class ForwardSearch:
 
         Errors below `precision` of the target count as equal.
         """
+        # the precision bounds the logarithm of an exact fit
         relative_rss = (
             np.maximum(np.asarray(rss), 0.0) / self.target_energy + self.config.precision**2
         )
@@ -349,6 +352,7 @@ class ForwardSearch:
         criterion_value = self.criterion_of(subset)
         while subset:
             estimate, inverse = solve_least_squares(self.r[:, subset], self.y)
+            # the smallest t statistic: its removal increases the RSS least
             weakest = int((np.square(estimate) / np.square(inverse).sum(axis=1)).argmin())
             reduced_subset = subset[:weakest] + subset[weakest + 1 :]
             reduced_criterion = self.criterion_of(reduced_subset)
@@ -376,6 +380,8 @@ def rss_with_one_added(r: np.ndarray, y: np.ndarray, subsets: np.ndarray) -> np.
     if subsets.shape[1]:
         q = np.linalg.qr(r.T[subsets].transpose(0, 2, 1))[0]
         q_transposed = q.transpose(0, 2, 1)
+        # for each extension only the component orthogonal to the subset reduces the error
+        # (orthogonal forward regression)
         columns = r - q @ (q_transposed @ r)
         for _ in range(2):
             target = target - (q @ (q_transposed @ target[..., None]))[..., 0]

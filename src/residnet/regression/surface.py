@@ -119,6 +119,7 @@ def compute_error_surface(
         )
         coefficient_size = coefficients[0].abs().masked_fill(mask[:, :n_active] == 0, torch.inf)
         weakest_column = coefficient_size.argmin(0)
+        # a model of order a needs a basis functions at least, and two for an elimination
         continues = torch.arange(n_active)[order_of_model[:n_active].clamp(min=2) < n_terms]
         removal[n_columns - n_terms, continues] = weakest_column[continues]
         mask[weakest_column[continues], continues] = 0.0
