@@ -67,6 +67,7 @@ def align_to_grid(
         raise DataError(
             f"log {log.name}: {len(log)} samples, at least 2 are needed for a time grid; exclude it"
         )
+    # looking a channel up raises the error of a missing one
     for name in config.held:
         log[name]
     n_points = int(np.floor((log.t[-1] - log.t[0]) / config.step + _GRID_TOLERANCE)) + 1
@@ -117,10 +118,12 @@ def resample_at(log: Log, config: GridConfig, times: np.ndarray) -> Log:
 
 
 def _resample(log: Log, config: GridConfig, grid: np.ndarray) -> Log:
+    """Return a log at the points of a grid [G] in s, averaged if the grid is coarser."""
     median_step = float(np.median(np.diff(log.t)))
     longest_gap = config.longest_gap if config.longest_gap is not None else 3.0 * median_step
     is_gap = np.diff(log.t) > longest_gap * (1.0 + _GRID_TOLERANCE)
     is_averaged = config.step >= 2.0 * median_step * (1.0 - _GRID_TOLERANCE)
+    # the window shrinks towards the ends of the log, so that it stays centred on its point
     half_window = (
         np.minimum(
             0.5 * config.step, np.maximum(np.minimum(grid - log.t[0], log.t[-1] - grid), 0.0)
@@ -192,6 +195,7 @@ class _GridWeights:
         self._window_start, self._start_weight = self._locate(grid - half_window)
         self._window_end, self._end_weight = self._locate(grid + half_window)
         # first and last sample with a nonzero weight
+        # a window that begins exactly at the next sample gives no weight to the previous one
         self._first_weighted = self._window_start + (self._start_weight == 1.0)
         self._last_weighted = self._window_end + (self._end_weight > 0.0)
 
@@ -231,6 +235,7 @@ class _GridWeights:
         )
 
         def integral(previous_index: np.ndarray, weight: np.ndarray) -> np.ndarray:
+            """Return the integral of the interpolant up to a fraction of a time step."""
             weights = weight[:, None]
             left_values = centred_values[previous_index]
             right_values = centred_values[previous_index + 1]

@@ -1,4 +1,4 @@
-"""Detect noise, outliers, spikes, fill values and held values in single channels."""
+"""Detect noise, outliers, spikes, fill values and repeated values in single channels."""
 
 from __future__ import annotations
 
@@ -13,22 +13,28 @@ from residnet.core.layout import SIX_DOF_LAYOUT
 from residnet.core.log import Log
 from residnet.core.stretches import find_runs
 
-# standard deviation of a Gaussian over its median absolute deviation
 SIGMA_OF_MAD = 1.4826
-# share of the expected standard deviation below which a sensor is constant: no unit error is so
-# large
+"""Ratio of the standard deviation of a Gaussian to its median absolute deviation."""
 NEGLIGIBLE_MOTION_SHARE = 1e-3
-# reason in `Log.masks`
+"""Share of the expected standard deviation below which a sensor counts as constant.
+
+No wrong unit makes a signal smaller by this factor.
+"""
 SPIKE_REASON = "spike"
-# distance of a spike from the median of its neighbours, in 99 % quantiles of the change between
-# samples or of the distance from that median, and largest length of a spike in samples
+"""Key of the mask of spikes in `Log.masks`."""
 _MIN_SPIKE_CHANGES = 12.0
+"""Minimum distance of a spike from the median of its neighbours, relative to usual changes.
+
+The usual change is the 99 % quantile of the change between samples.
+"""
 _MIN_SPIKE_DISTANCES = 30.0
+"""The same minimum, relative to the 99 % quantile of the distance from the median."""
 _MAX_SPIKE_SAMPLES = 2
-# lower bound of both limits, in 99 % quantiles of the change between samples
+"""Maximum length of a spike in samples."""
 _MIN_CHANGES_FOR_SCAN = 3.0
-# alternative limit: distance outside the range of the log, in ranges
+"""Lower bound of both minima, in 99 % quantiles of the change between samples."""
 _MIN_RANGE_EXCESS = 0.9
+"""Alternative minimum: distance outside the range of the channel, in ranges."""
 _MIN_SAMPLES = 20
 """Smallest number of samples for the detection of spikes; chosen by hand."""
 CACHED_SAMPLES = 8_192
@@ -48,6 +54,7 @@ def estimate_noise_std(values: np.ndarray) -> float:
     finite_values = values[np.isfinite(values)]
     if finite_values.size < 8:
         return 0.0
+    # the third difference of white noise has 1 + 9 + 9 + 1 = 20 times its variance
     return SIGMA_OF_MAD * nan_median(np.abs(np.diff(finite_values, 3))) / math.sqrt(20.0)
 
 
@@ -572,10 +579,11 @@ def median_update_interval(values: np.ndarray) -> float:
 
 
 def mask_held_values(log: Log) -> Log:
-    """Replace held values of slow motion sensors by NaN.
+    """Replace repeated values of slow motion sensors by NaN.
 
-    Held values are late by up to an update interval, and their derivative consists of spikes. As
-    NaN they are estimated from the other sensors, like the values of any sparse channel.
+    A value that is repeated until the next measurement is late by up to an update interval, and its
+    derivative consists of spikes. As NaN it is estimated from the other sensors, like the values of
+    any sparse channel.
     """
     fresh_values: dict[str, np.ndarray] = {}
     for sensor_channels in _SENSOR_GROUPS:
@@ -583,6 +591,7 @@ def mask_held_values(log: Log) -> Log:
         if not names:
             continue
         values = log.stack(tuple(names))
+        # channels of one sensor are updated together
         if median_update_interval(values) > 1.0:
             is_fresh = np.append(True, (np.diff(values, axis=0) != 0.0).any(axis=1))
             fresh_values |= {name: np.where(is_fresh, log[name], np.nan) for name in names}

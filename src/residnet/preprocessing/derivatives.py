@@ -49,6 +49,7 @@ class DerivativeRule(Config, ABC):
         min_samples = self.min_samples(dt)
         smoothed = np.full(values.shape, np.nan)
         rates = np.full(values.shape, np.nan)
+        # a missing sample ends a segment: polynomials must not bridge it
         segment_bounds = find_runs(np.where(np.isfinite(values).all(axis=1), segments, -1))
         for start, stop in zip(*segment_bounds, strict=True):
             segment_slice = slice(start, stop)
@@ -134,6 +135,7 @@ def fit_local_polynomials(
     last_coefficients = pseudo_inverse @ values[-window_samples:]
     results = []
     for evaluation_matrix in (vandermonde, vandermonde_slopes / (half_window * dt)):
+        # inside a segment the filter is a convolution with the weights of the centre of the window
         weights = evaluation_matrix[half_window] @ pseudo_inverse
         inner_values = [np.correlate(column, weights, "valid") for column in values.T]
         boundary_values = (

@@ -186,6 +186,8 @@ class OutlierMask(MaskRule):
             return is_outlier
         indices = np.arange(values.size)
         first_neighbours = np.clip(indices - self.samples // 2, 0, values.size - self.samples - 1)
+        # near the ends the window is not centred, so that it always has the same number of
+        # neighbours
         windows = np.lib.stride_tricks.sliding_window_view(values, self.samples + 1)[
             first_neighbours
         ]
@@ -322,6 +324,7 @@ def number_log_segments(log: Log) -> np.ndarray:
 
 
 def _combine_masks(log: Log, reasons: Sequence[str]) -> np.ndarray:
+    """Return [T] bool: samples with any of these masks."""
     is_masked = np.zeros(len(log), dtype=bool)
     return np.asarray(np.logical_or.reduce([is_masked, *(log.masks[name] for name in reasons)]))
 

@@ -32,7 +32,7 @@ from residnet.preprocessing.masks import (
 from residnet.preprocessing.motion import MotionConfig, complete_motion, fill_sparse
 
 TAIL_SHARE = 0.005
-"""Share of samples at either end of the range of a velocity that may be outliers."""
+"""Share of samples at each end of the range of a velocity that are treated as possible outliers."""
 
 
 class PrepareConfig(Config):

@@ -116,6 +116,7 @@ def estimate_agreement(
     if reference.size < 2 * max_lag + MIN_SAMPLES:
         return None
     # all lags use the same samples, so that their correlations are comparable
+    # differences of cumulative counts tell whether a window of lags has missing values
     cumulative_missing = np.append(0, np.cumsum(~np.isfinite(measured)))
     is_complete = cumulative_missing[2 * max_lag + 1 :] == cumulative_missing[: -2 * max_lag - 1]
     compared_indices = (

@@ -72,7 +72,10 @@ class WindowStore:
                 )
                 values[row_slice] = torch.from_numpy(np.nan_to_num(values_of_log)).to(values.dtype)
             segment_labels[row_slice] = np.where(
-                log.segment >= 0, log.segment + 1_000_000 * log_index, -1
+                # segment numbers must differ between logs; a log has fewer than a million segments
+                log.segment >= 0,
+                log.segment + 1_000_000 * log_index,
+                -1,
             )
             row_start += length
             paged.release_pages()
@@ -211,6 +214,7 @@ class WindowSampler:
 
     def draw_epoch(self, seed: int, epoch: int) -> Tensor:
         """Return the starts [n_batches, batch_size] of one epoch, drawn without replacement."""
+        # a generator of its own: batches do not depend on other random numbers of the process
         generator = torch.Generator().manual_seed((seed * 1_000_003 + epoch) % (2**63))
         n_starts = self.batch_size * self.n_batches
         n_permutations = -(-n_starts // self.starts.numel())
