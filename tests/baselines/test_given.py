@@ -79,7 +79,7 @@ def test_forces_made_by_thrusters() -> None:
         ("vessel: mariner", "kind 'abkowitz'.*fossen, mass_matrix or odin"),
         ("vessel: milliampere\nscale: 0", "scale"),
         ("vessel: {u: {w: 1.0}, v: {}, r: {}}", "no channel 'w'"),
-        ("vessel: {u: {tau_x^-1: 1.0}, v: {}, r: {}}", "divides by what may be zero"),
+        ("vessel: {u: {tau_x^-1: 1.0}, v: {}, r: {}}", "divides by a channel that may be zero"),
     ],
 )
 def test_wrong_configs_are_one_line(tmp_path: Path, content: str, message: str) -> None:

@@ -82,7 +82,7 @@ def test_given_gear_by_hand() -> None:
     model = ActuatedDynamics(still(("n", "delta"), 0.5), ("n", "delta"), "start", gear)
     seen = [*model.actuators.state_names, *model.actuators.input_names]
     assert [seen[i] for i in model.input_columns] == ["cmd_n", "delta"]
-    with pytest.raises(ConfigError, match="driven by 'tau'"):
+    with pytest.raises(ConfigError, match="needs the input 'tau'"):
         ActuatedDynamics(still(("tau",)), ("tau",), "start", gear)
 
 

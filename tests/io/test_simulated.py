@@ -209,7 +209,7 @@ def test_bias_noise_sampling_and_latency_of_single_channels() -> None:
     ("disturbance", "sensors", "message"),
     [
         ({"current_speed": "1 kn"}, {}, "belong together"),
-        ({"current_speed": 1, "current_direction": 0, "current_east": 0.1}, {}, "given twice"),
+        ({"current_speed": 1, "current_direction": 0, "current_east": 0.1}, {}, "specified twice"),
         ({"current_each": [0.4, 0.1]}, {}, "is faster than the fastest"),
         (
             {"wind": {"speed": 5, "direction": 0}},
@@ -309,7 +309,7 @@ def test_a_motion_that_is_not_finite_ends_there() -> None:
     assert (tame.true_log["v"][1:] == 4.0).all()
     assert (tame.measured_log["wind_speed"] == 4.0).all()
     assert (tame.measured_log["wind_dir"] == 1.0).all()
-    with pytest.raises(DataError, match="constant_01: the motion is not finite from its first"):
+    with pytest.raises(DataError, match="constant_01: the motion is not finite after the first"):
         simulate_manoeuvres(
             runaway(math.nan),
             manoeuvres,

@@ -25,7 +25,7 @@ from residnet.manoeuvres.closed_loop import (
     Zigzag,
     initial_steadiness,
     is_steady,
-    restart_wait,
+    reset_steady_time,
     update_steadiness,
 )
 from residnet.manoeuvres.open_loop import MultiSine, RandomSteps
@@ -157,7 +157,7 @@ def test_steady_by_hand() -> None:
     # steps
     assert [mean for mean, _ in seen] == [0.5, 0.75, 0.875, 0.9375, 0.9688, 0.9844]
     assert [steady for _, steady in seen] == [False] * 4 + [True] * 2
-    assert not bool(is_steady(numbers, restart_wait(memory, torch.tensor([True]))))
+    assert not bool(is_steady(numbers, reset_steady_time(memory, torch.tensor([True]))))
 
 
 def test_spiral_of_a_linear_vessel_has_no_loop() -> None:
@@ -217,7 +217,7 @@ def test_rudder_angles_and_vessels_that_cannot() -> None:
     circle = TurningCircle(drive=1, rudder=-15 * DEG)
     assert circle.steer_share(HELM) == pytest.approx(-0.5)
     assert circle.side == -1
-    with pytest.raises(UsageError, match="goes to 30 deg"):
+    with pytest.raises(UsageError, match="is 30 deg"):
         TurningCircle(drive=1, rudder=31 * DEG).steer_share(HELM)
     gains = (1.0, 1.0, 1.0)
     control = MotionPIDConfig(proportional=gains, integral=gains, derivative=gains)

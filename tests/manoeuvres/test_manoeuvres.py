@@ -267,7 +267,7 @@ def test_simulated_trials_are_split_whole() -> None:
     assert splits[-1] == "train", "kinds that are not named are for identification"
     assert splits == config.assign_splits(config.draw_manoeuvres())
     config = SimulatedTrials.model_validate(content | {"identification": {"zigzag": 4}})
-    with pytest.raises(ValueError, match="leaves a split empty"):
+    with pytest.raises(ValueError, match="a split is empty"):
         config.assign_splits(config.draw_manoeuvres())
 
 
@@ -284,5 +284,5 @@ def test_multi_sines_excite_the_sway_force_where_commands_are_forces() -> None:
     assert float(sway[:50].abs().max()) == 0.0
     assert 0.15 * 25e3 < float(sway.abs().max()) <= 0.3 * 25e3
     assert abs(float(torch.corrcoef(torch.stack((sway, moment)))[0, 1])) < 0.2
-    with pytest.raises(UsageError, match="no forces; leave it out"):
+    with pytest.raises(UsageError, match="not forces; remove it"):
         MultiSine.build_source([wave], Helm.from_plant(load_vessel("wam_v_cal").build()), t)

@@ -1,4 +1,4 @@
-"""Manoeuvres by how they steer, the families that draw them, and their indices."""
+"""Open-loop and closed-loop manoeuvres, families that draw random ones, and their indices."""
 
 from __future__ import annotations
 
@@ -80,4 +80,4 @@ else:
             },
         ),
     ]
-"""Config of any manoeuvre, those of other packages included; its `kind` says which."""
+"""Configuration of any family of manoeuvres, including those of other packages, by its `kind`."""

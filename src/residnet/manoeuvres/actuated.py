@@ -1,4 +1,4 @@
-"""A learned model with actuators in series, which is driven by commands like the vessel."""
+"""A learned model in series with actuators, which receives commands like the vessel."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.physics.plant import ROLLING_LAYOUT, SUBMERGED_LAYOUT, Plant
 from residnet.physics.symmetry import get_dof
 
-_RATES = {"rad": "rad/s", "1/s": "1/s^2", "m": "m/s", "-": "1/s"}
+_RATE_UNITS = {"rad": "rad/s", "1/s": "1/s^2", "m": "m/s", "-": "1/s"}
 
 
 class Actuators(nn.Module, ABC):
@@ -85,6 +85,7 @@ class PlantActuators(Actuators):
         """Return the states [B, k] one time step later, with the hull in its initial state."""
         if self.dynamics is None:
             return a
+        # actuators do not depend on the motion, so that any hull state gives the same result
         x = self.plant.make_initial_state(a.shape[0])
         x[:, self.columns] = a
         return self.dynamics.step(x, w, x[:, :0])[0][:, self.columns]
@@ -100,7 +101,7 @@ class PlantActuators(Actuators):
 class InputShare(Config):
     """The mapping from drive and steer of a manoeuvre to one input of a learned model.
 
-    All values are in the input's SI unit, or text with a unit.
+    Values are numbers in the SI unit of the input, or texts with a unit.
 
     Attributes:
         drive: value at full drive.
@@ -125,7 +126,7 @@ class InputShare(Config):
         """
         unit = CHANNEL_UNITS.get(name, "-")
         value = Quantity(unit)
-        rate = Quantity(_RATES[unit]) if unit in _RATES else None
+        rate = Quantity(_RATE_UNITS[unit]) if unit in _RATE_UNITS else None
         max_rate = float("inf")
         try:
             drive, steer, centre = map(value.convert, (self.drive, self.steer, self.centre))
@@ -136,15 +137,15 @@ class InputShare(Config):
             raise ConfigError(f"inputs.{name}: {error}") from None
         if limit <= 0 or max_rate <= 0:
             raise ConfigError(
-                f"inputs.{name}: limit and rate must be above zero, and a share given of drive or"
-                f" steer; {limit:g}, {max_rate:g}"
+                f"inputs.{name}: limit and rate must be above zero, and drive or steer must not be"
+                f" zero; got a limit of {limit:g} and a rate of {max_rate:g}"
             )
         return [drive, steer, centre, limit, max_rate]
 
 
 @final
 class GivenActuators(Actuators):
-    """Actuators with limits and rates, given by a config instead of a plant.
+    """Actuators with limits and rates from a config instead of a plant.
 
     Args:
         shares: mapping from demands to each input of the model by name; the command of an input
@@ -232,11 +233,13 @@ class ActuatedDynamics(Dynamics):
         names = [*actuators.state_names, *actuators.input_names]
         self.input_columns: list[int] = []
         for name in columns:
+            # a measured position comes before its command, because the model was fitted to measured
+            # inputs
             candidates = (name, command_name_for(name))
             source = next((candidate for candidate in candidates if candidate in names), None)
             if source is None:
                 raise ConfigError(
-                    f"the model is driven by '{name}', which the vessel's actuators do not"
+                    f"the model needs the input '{name}', which the actuators of the vessel do not"
                     f" have{suggest_name(name, names)}"
                 )
             self.input_columns.append(names.index(source))

@@ -1,9 +1,9 @@
 """The interface of manoeuvres.
 
-A manoeuvre demands a normalised drive (mean thrust or revolutions) and steer (difference, or
-rudder) over time, open loop or by the motion that it sees. The vessel turns the two into its own
-commands, so one manoeuvre drives any plant and any learned model that has actuators. A manoeuvre
-with a stop condition ends its row of the rollout there.
+A manoeuvre demands a normalised drive (mean thrust or revolutions) and steer (rudder, or difference
+of two propellers) over time, in open loop or by feedback of the motion. The vessel converts both to
+its commands, so that a manoeuvre applies to any plant and to any learned model with actuators. A
+manoeuvre with a stop condition ends its row of the rollout at this condition.
 """
 
 from __future__ import annotations
@@ -26,25 +26,26 @@ from residnet.physics.actuators import ForceActuators, ForceCommands
 from residnet.physics.plant import HullPlant, Plant
 
 DemandFunction = Callable[[Tensor, Tensor], Tensor]
-"""Turns drive [...] and steer [...] into commands [..., c], the first c columns of the inputs."""
+"""Converts drive [...] and steer [...] to commands [..., c], the first c columns of the inputs."""
 
 Range = tuple[float, float]
+"""Lower and upper bound of a uniform distribution."""
 
 RUDDER_INPUTS = ("cmd_delta", "delta")
-"""Names of the input that is a rudder angle."""
+"""Names that the input of a rudder angle may have."""
 
 
 @dataclass(frozen=True)
 class Helm:
-    """What a manoeuvre needs to know of the vessel that it steers.
+    """Properties of a vessel that a manoeuvre needs.
 
     Attributes:
-        demand: turns its normalised demands into the vessel's commands.
-        state: names of the columns of the vessel's state.
-        inputs: names of the columns of its inputs, commands first.
-        forces: turns forces tau [..., 3] in surge, sway and yaw into its commands; None for a
-            vessel that cannot make all three.
-        side_force: largest commanded sway force in N; None for a vessel whose commands are no
+        demand: converts normalised demands to the commands of the vessel.
+        state: names of the columns of the state.
+        inputs: names of the columns of the inputs, commands first.
+        forces: converts forces tau [..., 3] in surge, sway and yaw to commands; None for a vessel
+            that cannot produce all three.
+        side_force: largest commanded sway force in N; None for a vessel whose commands are not
             forces.
         dive_commands: commands [c] for a full dive; None for a vessel that cannot dive.
     """
@@ -57,17 +58,17 @@ class Helm:
     dive_commands: Tensor | None = None
 
     def commands_for(self, drive: Tensor, steer: Tensor, *dive: Tensor) -> Tensor:
-        """Return the commands [..., c] for shares of drive and steer, and of diving if any [...].
+        """Return the commands [..., c] for drive, steer and, for a diving manoeuvre, dive [...].
 
         Raises:
-            UsageError: where the vessel cannot dive.
+            UsageError: if dive is demanded of a vessel that cannot dive.
         """
         commands = self.demand(drive, steer)
         for share in dive:
             if self.dive_commands is None:
                 raise UsageError(
-                    "the manoeuvre dives, and the vessel does not; give a vessel with all six"
-                    " degrees of freedom, or a manoeuvre without dive"
+                    "the manoeuvre demands a dive, but the vessel cannot dive; give a vessel with"
+                    " six degrees of freedom, or a manoeuvre without dive"
                 )
             commands = commands + share.unsqueeze(-1) * self.dive_commands.to(commands.dtype)
         return commands
@@ -96,18 +97,18 @@ class Helm:
         """Return the column of a state.
 
         Raises:
-            UsageError: where the vessel has no such state.
+            UsageError: if the vessel has no such state.
         """
         if name not in self.state:
             raise UsageError(
-                f"the manoeuvre watches '{name}', which the vessel does not have; it has"
-                f" {', '.join(self.state)}"
+                f"the manoeuvre needs the state '{name}', which the vessel does not have; its"
+                f" states are {', '.join(self.state)}"
             )
         return self.state.index(name)
 
     @property
     def max_rudder(self) -> float | None:
-        """Rudder angle of full steer in rad; None where the vessel has no rudder."""
+        """Rudder angle of full steer in rad; None for a vessel without rudder."""
         name = next((name for name in RUDDER_INPUTS if name in self.inputs), None)
         if name is None:
             return None
@@ -118,16 +119,15 @@ class Helm:
 
 
 def replace_commands(command: Tensor, w: Tensor) -> Tensor:
-    """Return the inputs [B, m] with commands [B, c] in the place of their first columns."""
+    """Return the inputs [B, m] with their first columns replaced by commands [B, c]."""
     return torch.cat((command, w[:, command.shape[-1] :]), dim=-1)
 
 
 @final
 class ScheduleSource(Source):
-    """Open-loop commands given in advance."""
+    """A source of precomputed open-loop commands [B, T, c]."""
 
     def __init__(self, commands: Tensor) -> None:
-        """From the commands [B, T, c]."""
         super().__init__()
         self.commands = commands
 
@@ -136,18 +136,19 @@ class ScheduleSource(Source):
 
 
 BatchParameters = dict[str, Tensor]
-"""What rows of a batch are told by their manoeuvres, each [B] or [B, n]."""
+"""Parameters or observed states of the rows of a batch by name, [B] or [B, n] each."""
 
 
 @final
 class ClosedLoopSource(Source):
-    """Manoeuvres of one kind that steer by the motion, side by side."""
+    """Closed-loop manoeuvres of one kind, one for each row of a batch."""
 
     def __init__(self, manoeuvres: Sequence[ClosedLoopManoeuvre], helm: Helm, t: Tensor) -> None:
         super().__init__()
         self.manoeuvre_type = type(manoeuvres[0])
         manoeuvre_parameters = [manoeuvre.law_parameters(helm) for manoeuvre in manoeuvres]
         self.batch_parameters: BatchParameters = {
+            # lists of different length, such as the angles of spirals, are padded
             name: torch.nn.utils.rnn.pad_sequence(
                 [torch.tensor(row[name], dtype=torch.float64) for row in manoeuvre_parameters],
                 batch_first=True,
@@ -174,17 +175,18 @@ class ClosedLoopSource(Source):
         return replace_commands(self.demand_commands(*demands), w), memory
 
     def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Return the rows [B] whose manoeuvre has come to its end."""
+        """Return whether the manoeuvre of each row has ended, [B] bool."""
         return self.manoeuvre_type.has_ended(*self._observe(x), self.times[k], memory)
 
     def _observe(self, x: Tensor) -> tuple[BatchParameters, BatchParameters]:
+        """Return the observed states, and the parameters in the precision of the states."""
         motion = {name: x[:, column] for name, column in self.state_columns.items()}
         return motion, {name: value.to(x.dtype) for name, value in self.batch_parameters.items()}
 
 
 @final
 class StackedSource(Source):
-    """Different manoeuvres side by side in one batch: each source drives its own rows."""
+    """Manoeuvres of several kinds in one batch; each source controls a block of rows."""
 
     def __init__(self, sources: Sequence[Source], rows: Sequence[int]) -> None:
         super().__init__()
@@ -197,6 +199,7 @@ class StackedSource(Source):
         """Return the memories of all sources, padded to the widest, [B, k]."""
         blocks = zip(self.sources, x.split(self.row_counts), strict=True)
         memories = [source.initial(block) for source, block in blocks]
+        # a rollout has one memory tensor: narrower memories are padded
         self.widths = [memory.shape[1] for memory in memories]
         return torch.cat([self._pad_memory(memory, max(self.widths)) for memory in memories])
 
@@ -204,14 +207,14 @@ class StackedSource(Source):
         """Return the inputs [B, m], each block of rows from its source."""
         inputs = []
         memories = []
-        for source, xs, ws, ms in zip(
+        for source, x_block, w_block, memory_block in zip(
             self.sources,
             x.split(self.row_counts),
             w.split(self.row_counts),
             self._split_memory(memory),
             strict=True,
         ):
-            source_inputs, next_memory = source(xs, ws, k, ms)
+            source_inputs, next_memory = source(x_block, w_block, k, memory_block)
             inputs.append(source_inputs)
             memories.append(self._pad_memory(next_memory, memory.shape[1]))
         return torch.cat(inputs), torch.cat(memories)
@@ -221,7 +224,12 @@ class StackedSource(Source):
         blocks = zip(
             self.sources, x.split(self.row_counts), self._split_memory(memory), strict=True
         )
-        return torch.cat([source.is_finished(xs, k, ms) for source, xs, ms in blocks])
+        return torch.cat(
+            [
+                source.is_finished(x_block, k, memory_block)
+                for source, x_block, memory_block in blocks
+            ]
+        )
 
     @staticmethod
     def _pad_memory(memory: Tensor, width: int) -> Tensor:
@@ -234,9 +242,9 @@ class StackedSource(Source):
 
 @final
 class StopRecorder(Source):
-    """A source that remembers when its rows stopped.
+    """A source that records the step at which each row stopped.
 
-    `stop_step` [B] is the sample at which each did, -1 where it did not.
+    `stop_step` [B] is the number of this step; -1 for a row that did not stop.
     """
 
     def __init__(self, source: Source, rows: int) -> None:
@@ -264,9 +272,9 @@ class Manoeuvre(Config, ABC):
     """One manoeuvre of normalised demands; `manoeuvre_type` names it in logs and metrics.
 
     Attributes:
-        name: of its log; the kind with a number where None.
-        duration: its length, or for a manoeuvre with a stop condition the time after which it has
-            failed; None for the duration of the programme.
+        name: name of the log; None for the kind with a number.
+        duration: duration in s, or the time limit of a manoeuvre with a stop condition; None for
+            the duration of the programme of trials.
         kind: kind of the manoeuvre.
     """
 
@@ -277,10 +285,11 @@ class Manoeuvre(Config, ABC):
     @classmethod
     @abstractmethod
     def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Build the source that flies several manoeuvres of this kind side by side.
+        """Build the source of several manoeuvres of this kind, one for each row.
 
         Args:
-            manoeuvres: of this kind, one for each row.
+            manoeuvres: manoeuvres of this kind.
+            helm: properties of the vessel.
             t: times [T] of the steps in s.
         """
 
@@ -295,25 +304,26 @@ class Manoeuvre(Config, ABC):
         return ()
 
     def duration_within(self, duration: float) -> float:
-        """Return the seconds that the manoeuvre is given, in a programme of `duration`."""
+        """Return the duration of the manoeuvre in s, within trials of `duration` seconds."""
         return duration if self.duration is None else self.duration
 
     def initial_state(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
-        """Return the state [nx] that the manoeuvre starts from.
+        """Return the initial state [nx] of the manoeuvre.
 
         Args:
-            x: state [nx] that trials of the vessel start from.
+            x: default initial state of trials with the vessel [nx].
+            state: names of the states.
         """
         return x
 
     def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
         """Return the manoeuvring indices by name, SI and rad (units in `indices.UNITS`).
 
-        Those that the log is too short for are left out.
+        Indices for which the log is too short are omitted.
 
         Args:
             log: simulated or measured motion: t, x, y, psi, u, v, r.
-            length: of the hull in m, for distances in lengths; None where unknown.
+            length: length of the hull in m, for distances in lengths; None if unknown.
         """
         return {}
 
@@ -321,18 +331,19 @@ class Manoeuvre(Config, ABC):
         """Return the largest values of indices that IMO resolution MSC.137(76) allows, by index.
 
         Args:
-            length: of the ship in m.
+            helm: properties of the vessel.
+            length: length of the ship in m.
             speed: approach speed in m/s.
         """
         return {}
 
 
 class ScheduledManoeuvre(Manoeuvre):
-    """An open-loop manoeuvre: its demands are known in advance."""
+    """An open-loop manoeuvre, whose demands are functions of time."""
 
     @abstractmethod
     def demands_at(self, t: Tensor) -> tuple[Tensor, ...]:
-        """Return drive and steer, and dive where it dives, [T] at times t [T] in s."""
+        """Return drive, steer and, for a diving manoeuvre, dive, [T] each at times t [T] in s."""
 
     @classmethod
     def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
@@ -345,15 +356,15 @@ class ScheduledManoeuvre(Manoeuvre):
 
 
 class ClosedLoopManoeuvre(Manoeuvre):
-    """A manoeuvre that demands drive and steer by the motion that it sees.
+    """A manoeuvre that computes drive and steer from the motion.
 
-    Its class methods work on all rows of a batch at once. `motion` holds the states that the kind
-    `observed_states`, [B] each; `numbers` are the parameters of the rows and the step `dt` in s.
+    Its class methods evaluate all rows of a batch at once. `motion` contains the `observed_states`
+    of the kind, [B] each; `parameters` are those of the rows, and the time step `dt` in s.
     """
 
     observed_states: ClassVar[tuple[str, ...]]
     parameter_names: ClassVar[tuple[str, ...]] = ("drive", "start")
-    """Settings that the law needs to know as they are."""
+    """Attributes that are parameters of the control law without conversion."""
 
     def law_parameters(self, helm: Helm) -> dict[str, Any]:
         """Return the parameters of the control law, numbers or lists of numbers."""
@@ -378,7 +389,7 @@ class ClosedLoopManoeuvre(Manoeuvre):
     def has_ended(
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> Tensor:
-        """Return the rows [B] that have reached their goal."""
+        """Return whether each row has reached its goal, [B] bool."""
         return torch.zeros(len(memory), dtype=torch.bool)
 
     @classmethod
@@ -392,7 +403,7 @@ class ManoeuvreFamily(Config, ABC):
     """Manoeuvres of one kind that are drawn at random.
 
     Attributes:
-        count: how many.
+        count: number of manoeuvres.
     """
 
     count: int = Field(ge=1, le=10_000)
@@ -412,13 +423,13 @@ def sample_uniform(generator: np.random.Generator, limits: Range) -> float:
 
 
 class SteeringConfig(Config):
-    """The part that manoeuvres share which a vessel with a rudder may fly by its angle.
+    """Common settings of manoeuvres that steer by a share of full steer or by a rudder angle.
 
     Attributes:
-        drive: held from the beginning, as the approach.
+        drive: constant share of full drive, also in the approach.
         steer: share of full steer; positive turns to starboard.
-        rudder: the same as a rudder angle, for vessels that have one; instead of `steer`.
-        start: when the steering begins.
+        rudder: rudder angle instead of `steer`, for vessels with a rudder.
+        start: time at which the steering begins.
     """
 
     drive: float = Field(ge=-1, le=1)
@@ -437,15 +448,15 @@ class SteeringConfig(Config):
 
     @property
     def side(self) -> float:
-        """The side of the demand: +1 where it is positive, -1 where it is negative."""
+        """Sign of the demanded steer or rudder, +1 or -1."""
         return -1.0 if (self.steer if self.steer is not None else self.rudder or 0.0) < 0 else 1.0
 
     def steer_share(self, helm: Helm) -> float:
         """Return the share of full steer on a vessel.
 
         Raises:
-            UsageError: where an angle is asked of a vessel without rudder, or more than its
-                largest.
+            UsageError: if an angle is demanded of a vessel without rudder, or an angle above its
+                limit.
         """
         return self.steer if self.steer is not None else rudder_share(self.rudder or 0.0, helm)
 
@@ -454,7 +465,7 @@ def rudder_share(angle: float, helm: Helm) -> float:
     """Return the share of full steer that commands a rudder angle [rad].
 
     Raises:
-        UsageError: where the vessel has no rudder or one that does not go so far.
+        UsageError: if the vessel has no rudder, or the angle exceeds its limit.
     """
     max_rudder = helm.max_rudder
     if max_rudder is None:
@@ -465,7 +476,7 @@ def rudder_share(angle: float, helm: Helm) -> float:
     share = angle / max_rudder
     if abs(share) > 1.0 + 1e-9:
         raise UsageError(
-            f"the manoeuvre asks for {abs(angle) * 57.29578:.4g} deg of rudder, the vessel's goes"
-            f" to {max_rudder * 57.29578:.4g} deg"
+            f"the manoeuvre demands {abs(angle) * 57.29578:.4g} deg of rudder, the limit of the"
+            f" vessel is {max_rudder * 57.29578:.4g} deg"
         )
     return share

@@ -1,6 +1,4 @@
-"""Manoeuvres that steer by the motion: zigzag, turning circle, stopping trial, spiral, and those
-in depth: helix, vertical zigzag and step.
-"""
+"""Closed-loop manoeuvres: zigzag, turning circle, stopping, spiral, and manoeuvres in depth."""
 
 from __future__ import annotations
 
@@ -31,22 +29,22 @@ from residnet.manoeuvres.base import (
 )
 
 _FULL_RUDDER_DEG = 34.9
+"""Rudder angle in deg above which the IMO limits of a turning circle apply (35 deg or maximum)."""
 _ANGLE_TOLERANCE = 0.05
-"""Rudder in deg from which IMO's limits of a turning circle hold (35 deg or as much as it goes),
-and the share by which a zigzag may differ from 10/10 or 20/20."""
+"""Relative tolerance of the angles of a 10/10 or 20/20 zigzag."""
 
 
 class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
-    """Steering to one side until the heading has changed by `heading`, then to the other, repeated.
+    """Zigzag: the steering is reversed whenever the heading has changed by `heading` to its side.
 
     Source: document 003 section 4.2.2. The memory is the side of the command (+1 starboard, -1
-    port), the heading at the start and the reversals so far.
+    port), the heading at the start and the number of reversals.
 
     Attributes:
         heading: change of heading at which the steering is reversed.
-        first: side of a positive steer or rudder.
-        reversals: ends when the heading is back on its initial course after so many reversals;
-            None: the manoeuvre lasts for its full duration.
+        first: side of the first execute for a positive steer or rudder.
+        reversals: number of reversals after which the manoeuvre ends, as soon as the heading
+            returns to the initial course; None for the full duration.
     """
 
     observed_states: ClassVar[tuple[str, ...]] = ("psi",)
@@ -60,11 +58,11 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
         if self.reversals is None:
             return None
         angle = f"{math.degrees(self.heading):.4g} deg"
-        return f"{self.reversals} reversals at {angle} of heading and the way back"
+        return f"{self.reversals} reversals at {angle} of heading and the return to the course"
 
     @property
     def first_sign(self) -> float:
-        """The side of the first execute, +1 starboard or -1 port."""
+        """Sign of the first execute, +1 to starboard or -1 to port."""
         return self.side if self.first == "starboard" else -self.side
 
     def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
@@ -99,7 +97,7 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
 
     @classmethod
     def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
-        """Return the first side, the present heading and no reversals, [B, 3]."""
+        """Return the side of the first execute, the current heading and zero reversals, [B, 3]."""
         psi = motion["psi"]
         return torch.stack((parameters["first"], psi, torch.zeros_like(psi)), dim=-1)
 
@@ -107,8 +105,9 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
     def step_law(
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Reverse the side where the heading has reached its bound."""
+        """Reverse the steering if the heading has reached its bound."""
         command_sign, origin, count = memory.unbind(-1)
+        # positive towards the current side of the steering
         heading_change = command_sign * parameters["sense"] * (motion["psi"] - origin)
         has_reached = heading_change >= parameters["bound"]
         command_sign = torch.where(has_reached, -command_sign, command_sign)
@@ -123,14 +122,14 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
     def has_ended(
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> Tensor:
-        """Return the rows whose heading is back after their last reversal."""
+        """Return whether the heading has returned to the initial course after the last reversal."""
         command_sign, origin, count = memory.unbind(-1)
         is_back = command_sign * parameters["sense"] * (motion["psi"] - origin) >= 0
         return (count >= parameters["most"]) & is_back
 
 
 class SteeringFamily(ManoeuvreFamily, ABC):
-    """Manoeuvres of a steer and a drive that are uniform in their ranges.
+    """Manoeuvres whose steer and drive are drawn from uniform distributions.
 
     Attributes:
         steer: range of the share of full steer.
@@ -144,10 +143,10 @@ class SteeringFamily(ManoeuvreFamily, ABC):
 
 
 class ZigzagFamily(SteeringFamily):
-    """Zigzags drawn at random: the heading is one of some, either side comes first.
+    """Random zigzags, which begin to either side.
 
     Attributes:
-        heading: changes of heading to choose from in rad.
+        heading: candidate changes of heading in rad.
     """
 
     kind: Literal["zigzag"] = "zigzag"
@@ -164,13 +163,13 @@ class ZigzagFamily(SteeringFamily):
 
 
 class SteadyConfig(Config):
-    """Condition for a steady turn: for `window` seconds r is close to its running mean.
+    """Condition for a steady turn: the yaw rate is close to its running mean for `window` s.
 
     Attributes:
         window: duration of the condition and time constant of the running mean in s; a few times
             the time for one ship length.
-        tolerance: how far it may be off, as a share of the largest yaw rate of the manoeuvre so
-            far.
+        tolerance: largest deviation from the mean, as a share of the largest yaw rate since the
+            start of the manoeuvre.
     """
 
     window: Seconds = Field(default=10.0, gt=0)
@@ -194,28 +193,29 @@ def update_steadiness(r: Tensor, parameters: BatchParameters, memory: Tensor) ->
 
 
 def is_steady(parameters: BatchParameters, memory: Tensor) -> Tensor:
-    """Return which rows [B] have a steady turn."""
+    """Return whether the turn of each row is steady, [B] bool."""
     return memory[:, 2] >= parameters["window"] - 1e-9
 
 
-def restart_wait(memory: Tensor, is_restarted: Tensor) -> Tensor:
-    """Return the memory of a steady turn with the wait begun anew in rows [B] bool."""
+def reset_steady_time(memory: Tensor, is_restarted: Tensor) -> Tensor:
+    """Return the memory of a steady turn with the steady time set to zero in rows [B] bool."""
     return torch.cat(
         (memory[:, :2], memory[:, 2:].masked_fill(is_restarted.unsqueeze(-1), 0.0)), dim=-1
     )
 
 
 class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
-    """Straight ahead until `start`, then the helm held until the heading has changed by `until`.
+    """Turning circle: constant helm from `start` until the heading has changed by `until`.
 
-    IMO asks for 540 deg and full rudder. The memory is the heading at the helm order; 0 before the
-    heading change is reached, then 1, then 2; and the state of the steady-turn test.
+    IMO requires 540 deg with full rudder. The memory is the heading at the helm order, the phase,
+    and the state of the steady-turn test. The phase is 0 in approach and turn, 1 in the pull-out
+    and 2 at the end.
 
     Attributes:
-        until: change of heading.
-        pull_out: the helm then goes amidships until the yaw rate is steady: a vessel that is
-            straight-line stable stops turning.
-        steady: when it is.
+        until: change of heading that ends the turn.
+        pull_out: whether a pull-out follows: the helm amidships until the yaw rate is steady. A
+            vessel with straight-line stability stops turning.
+        steady: condition for the end of the pull-out.
     """
 
     observed_states: ClassVar[tuple[str, ...]] = ("psi", "r")
@@ -239,7 +239,7 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
         return turning_indices
 
     def imo_limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
-        """Return IMO's limits, which hold for 35 deg of rudder or as much as it goes."""
+        """Return the IMO limits, which apply to 35 deg of rudder or the maximum angle."""
         share = abs(self.steer_share(helm))
         angle = math.degrees(share * (helm.max_rudder or 0.0))
         is_full_rudder = share > 0.999 or angle > _FULL_RUDDER_DEG
@@ -251,7 +251,7 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
 
     @classmethod
     def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
-        """Return the memory [B, 5] at the present heading, in the approach."""
+        """Return the memory [B, 5] at the current heading, in the approach."""
         psi = motion["psi"]
         return torch.cat(
             (torch.stack((psi, psi * 0.0), -1), initial_steadiness(motion["r"])), dim=-1
@@ -261,15 +261,16 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
     def step_law(
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Hold the helm until the heading has changed, then amidships until the turn is steady."""
+        """Command the helm until the heading has changed, then amidships until r is steady."""
         origin = memory[:, 0]
         phase = memory[:, 1]
         steadiness = update_steadiness(motion["r"], parameters, memory[:, 2:])
         is_steering = time >= parameters["start"]
+        # the change of heading counts from the helm order
         origin = torch.where(is_steering, origin, motion["psi"])
         heading_change = parameters["side"] * (motion["psi"] - origin)
         turn_completed = (phase == 0) & is_steering & (heading_change >= parameters["until"])
-        steadiness = restart_wait(steadiness, turn_completed)
+        steadiness = reset_steady_time(steadiness, turn_completed)
         has_settled = (phase == 1) & is_steady(parameters, steadiness)
         phase = torch.where(
             turn_completed, parameters["after"], torch.where(has_settled, 2.0, phase)
@@ -289,7 +290,7 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
 
 
 class TurningCircleFamily(SteeringFamily):
-    """Turning circles drawn at random, to either side.
+    """Random turning circles to either side.
 
     Attributes:
         until: change of heading that ends the manoeuvre in rad.
@@ -306,9 +307,9 @@ class TurningCircleFamily(SteeringFamily):
 
 
 class Stopping(ClosedLoopManoeuvre):
-    """Stopping: `drive` until `start`, then `astern` until the surge velocity is zero.
+    """Stopping trial: `drive` until `start`, then `astern` until the surge velocity is zero.
 
-    The steer is zero; there is no memory.
+    Steer is zero, and there is no memory.
 
     Attributes:
         drive: share of full drive of the approach.
@@ -331,7 +332,7 @@ class Stopping(ClosedLoopManoeuvre):
         return indices.stopping_indices(log, self.start, length)
 
     def imo_limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
-        """Return IMO's limit, which holds for full astern."""
+        """Return the IMO limit, which applies to full astern."""
         return indices.stopping_limits(length) if self.astern <= -0.999 else {}
 
     @classmethod
@@ -342,7 +343,7 @@ class Stopping(ClosedLoopManoeuvre):
     def step_law(
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Go astern from the order on."""
+        """Command astern drive after the order."""
         drive = torch.where(time >= parameters["start"], parameters["astern"], parameters["drive"])
         return drive, torch.zeros_like(drive), memory
 
@@ -350,26 +351,27 @@ class Stopping(ClosedLoopManoeuvre):
     def has_ended(
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> Tensor:
-        """Return which rows [B] make no way any more."""
+        """Return whether each row has stopped, [B] bool."""
         return (time > parameters["start"]) & (motion["u"] <= 0)
 
 
+# finer near zero, where the loop of an unstable vessel is
 _SPIRAL_STEERS = (1.0, 0.6, 0.4, 0.2, 0.1, 0.0, -0.1, -0.2, -0.4, -0.6, -1.0)
 
 
 class Spiral(ClosedLoopManoeuvre):
-    """Dieudonne's spiral: helm angles from one side to the other and back, each until r is steady.
+    """Dieudonne spiral: a sequence of helm angles, each until the yaw rate is steady.
 
-    An unstable vessel shows a loop of yaw rate over angle. The memory is the number of the present
-    angle, and the state of the steady-turn test.
+    The yaw rate of a vessel without straight-line stability shows a hysteresis loop over the angle.
+    The memory is the number of the current angle, and the state of the steady-turn test.
 
     Attributes:
-        drive: held throughout.
-        steers: shares of full steer in their order; from one side to the other and back where
-            neither these nor `rudders` are given.
-        rudders: the same as rudder angles, for vessels that have one; instead of `steers`.
-        start: of the first; an approach straight ahead before.
-        steady: when the next follows.
+        drive: constant share of full drive.
+        steers: shares of full steer in order; without these and `rudders`, from one side to the
+            other and back.
+        rudders: rudder angles instead of `steers`, for vessels with a rudder.
+        start: time of the first helm order, after an approach straight ahead.
+        steady: condition for the next angle.
     """
 
     observed_states: ClassVar[tuple[str, ...]] = ("r",)
@@ -398,17 +400,17 @@ class Spiral(ClosedLoopManoeuvre):
         return f"a steady yaw rate at each of {len(self.helm_angles)} helm angles"
 
     def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return the steady yaw rate of each angle that was finished, and the height of the loop.
+        """Return the steady yaw rate at each completed angle, and the height of the loop.
 
-        The height is the largest difference of the yaw rates that the angle nearest to zero had;
-        `steers` are shares of full steer (rad where the log has a rudder).
+        The height is the largest difference of the yaw rates at the angle nearest to zero. `steers`
+        are rudder angles in rad if the manoeuvre has `rudders`, otherwise shares of full steer.
         """
         commands = [name for name in log.channels if name.startswith("cmd_")]
         has_moved = (np.abs(np.diff(log.stack(commands), axis=0)) > 1e-12).any(axis=1)
         change_samples = np.flatnonzero(has_moved & (log.t[1:] - log.t[0] >= self.start - 1e-9))
         angles = list(self.helm_angles)
-        # the first change is the order of the first angle, unless that is amidships as the approach
-        # is
+        # the first change is the order of the first angle, unless this angle is amidships as in the
+        # approach
         order_changes = change_samples if angles[0] == 0 else change_samples[1:]
         end_samples = [*order_changes.tolist(), len(log) - 1][: len(angles)]
         rates = [float(log["r"][i]) for i in end_samples]
@@ -424,6 +426,7 @@ class Spiral(ClosedLoopManoeuvre):
 
     def law_parameters(self, helm: Helm) -> dict[str, Any]:
         shares = [rudder_share(a, helm) if self.rudders else a for a in self.helm_angles]
+        # after the last angle the helm goes amidships
         spiral_parameters = {"shares": [*shares, 0.0], "count": float(len(shares))}
         return super().law_parameters(helm) | spiral_parameters | dict(self.steady)
 
@@ -437,16 +440,16 @@ class Spiral(ClosedLoopManoeuvre):
     def step_law(
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Go to the next angle where the turn is steady."""
+        """Advance to the next angle if the turn is steady."""
         is_steering = time >= parameters["start"]
-        steadiness = restart_wait(
+        steadiness = reset_steady_time(
             update_steadiness(motion["r"], parameters, memory[:, 1:]), ~is_steering
         )
         has_settled = is_steady(parameters, steadiness)
         angle_index = torch.minimum(memory[:, 0] + has_settled.to(memory), parameters["count"])
         share = parameters["shares"].gather(1, angle_index.long().unsqueeze(-1))[:, 0]
         memory = torch.cat(
-            (angle_index.unsqueeze(-1), restart_wait(steadiness, has_settled)), dim=-1
+            (angle_index.unsqueeze(-1), reset_steady_time(steadiness, has_settled)), dim=-1
         )
         return parameters["drive"], torch.where(is_steering, share, 0.0), memory
 
@@ -458,13 +461,13 @@ class Spiral(ClosedLoopManoeuvre):
 
 
 class Helix(ScheduledManoeuvre):
-    """Drive, steer and dive held: a turn in which the vessel descends or climbs.
+    """Helix: constant drive, steer and dive, a turn in which the vessel descends or climbs.
 
     Attributes:
         drive: share of full drive, -1 to 1.
         steer: share of full steer; positive turns to starboard.
         dive: share of full dive; positive descends.
-        start: when steer and dive begin.
+        start: time at which steer and dive begin.
     """
 
     kind: Literal["helix"] = "helix"
@@ -479,12 +482,12 @@ class Helix(ScheduledManoeuvre):
 
 
 class DivingFamily(ManoeuvreFamily, ABC):
-    """Manoeuvres in depth drawn at random, to either side, down or up first.
+    """Random manoeuvres in depth, which begin downwards or upwards.
 
     Attributes:
         drive: range of the share of full drive.
         dive: range of the share of full dive.
-        start: when it begins.
+        start: time at which the dive begins.
     """
 
     drive: Range = (0.4, 0.8)
@@ -492,7 +495,7 @@ class DivingFamily(ManoeuvreFamily, ABC):
     start: Seconds = 5.0
 
     def sample_common(self, generator: np.random.Generator) -> dict[str, Any]:
-        """Return drive and start, and the dive to either side."""
+        """Draw drive and signed dive; returns them with the start."""
         dive_sign = 1.0 if generator.random() < 0.5 else -1.0
         drive = sample_uniform(generator, self.drive)
         dive = sample_uniform(generator, self.dive)
@@ -500,7 +503,7 @@ class DivingFamily(ManoeuvreFamily, ABC):
 
 
 class HelixFamily(DivingFamily):
-    """Helices drawn at random.
+    """Random helices.
 
     Attributes:
         steer: range of the share of full steer.
@@ -517,15 +520,15 @@ class HelixFamily(DivingFamily):
 
 
 class VerticalZigzag(ClosedLoopManoeuvre):
-    """Diving until the depth has changed by `depth`, then climbing as far beyond it, repeated.
+    """Vertical zigzag: the dive is reversed whenever the depth has changed by `depth` to its side.
 
-    The memory is the side of the demand (+1 down) and the depth at the start.
+    The memory is the sign of the demand (+1 down) and the depth at the start.
 
     Attributes:
-        drive: held throughout.
-        dive: share of full dive; a negative one climbs first.
+        drive: constant share of full drive.
+        dive: share of full dive; a negative value climbs first.
         depth: change of depth at which the dive is reversed.
-        start: when it begins.
+        start: time at which the dive begins.
     """
 
     observed_states: ClassVar[tuple[str, ...]] = ("z",)
@@ -542,14 +545,14 @@ class VerticalZigzag(ClosedLoopManoeuvre):
 
     @classmethod
     def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
-        """Return the first side and the present depth, [B, 2]."""
+        """Return the sign of the first dive and the current depth, [B, 2]."""
         return torch.stack((parameters["first"], motion["z"]), dim=-1)
 
     @classmethod
     def step_law(
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, ...]:
-        """Reverse the side where the depth has reached its bound."""
+        """Reverse the dive if the depth has reached its bound."""
         dive_sign, origin = memory.unbind(-1)
         dive_sign = torch.where(
             dive_sign * (motion["z"] - origin) >= parameters["bound"], -dive_sign, dive_sign
@@ -560,10 +563,10 @@ class VerticalZigzag(ClosedLoopManoeuvre):
 
 
 class VerticalZigzagFamily(DivingFamily):
-    """Vertical zigzags drawn at random.
+    """Random vertical zigzags.
 
     Attributes:
-        depth: changes of depth to choose from.
+        depth: candidate changes of depth in m.
     """
 
     kind: Literal["vertical_zigzag"] = "vertical_zigzag"
@@ -576,16 +579,16 @@ class VerticalZigzagFamily(DivingFamily):
 
 
 class DepthStep(ClosedLoopManoeuvre):
-    """A new depth, held by a law that sees depth, its rate and the pitch rate; steer is zero.
+    """Step of the depth setpoint with a controller of depth, depth rate and pitch rate.
 
-    The memory is the depth at the start.
+    Steer is zero. The memory is the depth at the start.
 
     Attributes:
-        drive: held throughout.
+        drive: constant share of full drive.
         dive: largest share of full dive.
-        depth: change of depth; positive is deeper.
-        start: when it is ordered.
-        gain: dive per metre of depth that lacks.
+        depth: change of the setpoint; positive is deeper.
+        start: time of the step.
+        gain: dive per metre of depth error.
         damping: dive per m/s of descent.
         pitch_damping: dive per rad/s of pitch rate.
     """
@@ -605,7 +608,7 @@ class DepthStep(ClosedLoopManoeuvre):
 
     @classmethod
     def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
-        """Return the present depth, [B, 1]."""
+        """Return the current depth, [B, 1]."""
         return motion["z"].unsqueeze(-1)
 
     @classmethod
@@ -623,10 +626,10 @@ class DepthStep(ClosedLoopManoeuvre):
 
 
 class DepthStepFamily(DivingFamily):
-    """Steps of depth drawn at random.
+    """Random steps of depth.
 
     Attributes:
-        depth: changes of depth to choose from.
+        depth: candidate changes of depth in m.
     """
 
     kind: Literal["depth_step"] = "depth_step"

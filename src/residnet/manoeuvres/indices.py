@@ -1,8 +1,8 @@
-"""Manoeuvring indices from logged motion: turning circle, zigzag, stopping; and IMO's limits.
+"""Manoeuvring indices of logs: turning circle, zigzag and stopping trial, with the IMO limits.
 
-Crossings and peaks are found between samples. Definitions as in IMO resolution MSC.137(76) and
-ITTC procedure 7.5-02-06-01. All SI and rad; lengths also in hull lengths. The limits are from
-the resolution, Standards for Ship Manoeuvrability, for ships of 100 m and more.
+Crossings and peaks are interpolated between samples. The definitions are those of IMO resolution
+MSC.137(76), Standards for Ship Manoeuvrability, and ITTC procedure 7.5-02-06-01. Values are in SI
+and rad, distances also in hull lengths. The limits apply to ships of 100 m and more.
 """
 
 from __future__ import annotations
@@ -40,17 +40,18 @@ LENGTH_INDICES = {
     "advance", "transfer", "tactical_diameter", "steady_diameter", "initial_turning_distance",
     "overshoot_width", "track_reach", "head_reach", "lateral_deviation",
 }  # fmt: skip
+"""Indices that are distances, which are also expressed in hull lengths."""
 
 _QUARTER_TURN = math.pi / 2
 
 
 class SmoothTrack:
-    """The motion of a log as smooth functions of its time.
+    """The motion of a log as cubic splines over time.
 
-    Samples at which a channel is empty are left out.
+    Samples with a missing channel are omitted.
 
     Raises:
-        DataError: where fewer than four samples hold all of x, y, psi, u, v, r.
+        DataError: if fewer than four samples have all of x, y, psi, u, v, r.
     """
 
     def __init__(self, log: Log) -> None:
@@ -58,9 +59,8 @@ class SmoothTrack:
         is_complete = np.isfinite(motion).all(axis=1)
         if is_complete.sum() < 4:
             raise DataError(
-                f"log {log.name}: {int(is_complete.sum())} samples hold x, y, psi, u, v and r"
-                " together;"
-                " indices need at least 4"
+                f"log {log.name}: {int(is_complete.sum())} samples have all of x, y, psi, u, v and"
+                " r; indices need at least 4"
             )
         self.t: np.ndarray = log.t[is_complete] - log.t[0]
         x, y, self.heading, self.u, self.v, self.r = motion[is_complete].T
@@ -74,15 +74,15 @@ class SmoothTrack:
 
     @property
     def end_time(self) -> float:
-        """The last time in s."""
+        """Time of the last sample in s."""
         return float(self.t[-1])
 
     def approach_speed(self, start: float) -> float:
-        """Return the speed at the last sample before or at the order at `start`."""
+        """Return the speed at the last sample up to the order at `start`."""
         return float(self.speed[max(int(np.searchsorted(self.t, start + 1e-9)) - 1, 0)])
 
     def max_roll_angle(self, start: float) -> dict[str, float]:
-        """Return the largest roll angle from `start` on to either side; empty without one."""
+        """Return the largest roll angle to either side after `start`; empty without roll."""
         roll_magnitude = np.abs(self._roll[self.t >= start]) if self._roll.size else self._roll
         finite_roll = roll_magnitude[np.isfinite(roll_magnitude)]
         return {"largest_roll_angle": float(finite_roll.max())} if finite_roll.size else {}
@@ -92,14 +92,14 @@ class SmoothTrack:
     ) -> float | None:
         """Return the first time after `start_time` at which sign * heading rises to sign * `level`.
 
-        None where it does not.
+        The result is None if the heading does not reach the level.
         """
         return first_crossing(lambda t: sign * (self.psi(t) - level), self.t, start_time)
 
     def heading_peak(
         self, interval_start: float, interval_end: float, sign: float
     ) -> tuple[float, float]:
-        """Return the time and value of the largest sign * heading within begin .. end."""
+        """Return the time and the value of the maximum of sign * heading in an interval."""
         sample_times = self.t[(self.t > interval_start) & (self.t < interval_end)]
         times = np.concatenate(([interval_start], sample_times, [interval_end]))
         peak_index = int(np.argmax(sign * self.psi(times)))
@@ -107,6 +107,7 @@ class SmoothTrack:
         upper_time = times[min(peak_index + 1, times.size - 1)]
         derivative = self.psi.derivative()
         if (
+            # without a change of sign of the derivative the sample itself is the maximum
             peak_index in (0, times.size - 1)
             or sign * derivative(lower_time) <= 0
             or sign * derivative(upper_time) >= 0
@@ -120,9 +121,9 @@ class SmoothTrack:
         return time, float(sign * self.psi(time))
 
     def relative_position(self, time: float, origin: float) -> tuple[float, float]:
-        """Return the place at `time` in m ahead and to starboard of the vessel's place at `origin`.
+        """Return the position at `time` relative to that at `origin`, in m ahead and to starboard.
 
-        Ahead is along the heading that the vessel had at `origin`; both times are in s.
+        Ahead is the direction of the heading at `origin`. Both times are in s.
         """
         north = float(self.x(time) - self.x(origin))
         east = float(self.y(time) - self.y(origin))
@@ -135,7 +136,7 @@ def first_crossing(
 ) -> float | None:
     """Return the first time after `start_time` at which a function rises through zero.
 
-    The time lies between samples at t [T]; None where the function does not rise through zero.
+    The sign changes are searched between samples at t [T]; the result is None if there is none.
     """
     times = np.concatenate(([start_time], t[t > start_time]))
     values = function(times)
@@ -149,7 +150,7 @@ def first_crossing(
 
 
 def add_values_in_lengths(indices: dict[str, Any], length: float | None) -> dict[str, Any]:
-    """Return the indices with their distances in hull lengths as well, `<index>_lengths`."""
+    """Return the indices, with distances also in hull lengths as `<index>_lengths`."""
     if length is None:
         return indices
     return indices | {
@@ -164,16 +165,17 @@ def turning(
 ) -> dict[str, Any]:
     """Return the indices of a turning circle.
 
-    Advance is along, transfer and tactical diameter are across the heading at `start`, towards the
-    turn. The steady turn is the last half turn before the heading has changed by `until`, where
-    that is a full turn or more; its drift angle is positive with the bow inside the turn.
+    Advance is the distance along the heading at `start`; transfer and tactical diameter are the
+    distances across it, positive towards the turn. The steady turn is the last half turn before the
+    heading has changed by `until`, if `until` is at least a full turn. The drift angle is positive
+    with the bow inside the turn.
 
     Args:
         log: t, x, y, psi, u, v, r.
         start: time of the helm order in s.
         turn_sign: +1 to starboard, -1 to port.
         until: heading change that ends the steady turn, rad.
-        length: of the hull in m.
+        length: length of the hull in m; None if unknown.
     """
     track = SmoothTrack(log)
     if track.end_time <= start:
@@ -213,6 +215,7 @@ def turning(
         rate = float(np.abs(track.r[is_steady].mean()))
         drift = np.arctan2(-turn_sign * track.v[is_steady], track.u[is_steady])
         indices |= {
+            # U = r R in a steady turn
             "steady_diameter": 2 * speed / rate,
             "steady_speed": speed,
             "steady_yaw_rate": rate,
@@ -228,19 +231,19 @@ def zigzag_indices(
 ) -> dict[str, Any]:
     """Return the indices of a zigzag.
 
-    An overshoot is how far the heading goes beyond its bound after a reversal. The time to check
-    yaw is from the first reversal to the peak of the heading; the overshoot width is how far the
-    track moves on across the initial course after that reversal; the reach is the time from the
-    first execute until the heading is back on the initial course; the period is the duration of a
-    whole cycle, from reversal to reversal of the same side, mean over the log. The initial course
-    is the heading that the log begins with.
+    The overshoot is the angle by which the heading exceeds its bound after a reversal. The time to
+    check yaw is the time from the first reversal to the maximum of the heading. The overshoot width
+    is the further lateral distance from the initial course after the first reversal. The reach is
+    the time from the first execute until the heading returns to the initial course. The period is
+    the mean time between reversals to the same side. The initial course is the heading at the first
+    sample.
 
     Args:
         log: t, x, y, psi, u, v, r.
         start: time of the first execute in s.
-        turn_sign: of the first execute, +1 starboard, -1 port.
+        turn_sign: sign of the first execute, +1 to starboard, -1 to port.
         heading: change of heading at which the steering is reversed, rad.
-        length: of the hull in m.
+        length: length of the hull in m; None if unknown.
     """
     track = SmoothTrack(log)
     if track.end_time <= start:
@@ -299,8 +302,8 @@ def stopping_indices(log: Log, start: float, length: float | None) -> dict[str, 
 
     Args:
         log: t, x, y, psi, u, v, r.
-        start: time of the order astern in s; the trial ends where the surge velocity is zero.
-        length: of the hull in m.
+        start: time of the order astern in s; the trial ends when the surge velocity is zero.
+        length: length of the hull in m; None if unknown.
     """
     track = SmoothTrack(log)
     surge = scipy.interpolate.CubicSpline(track.t, track.u)
@@ -318,15 +321,20 @@ def stopping_indices(log: Log, start: float, length: float | None) -> dict[str, 
 
 
 def turning_limits(length: float) -> dict[str, float]:
-    """Return IMO's largest advance and tactical diameter in m, at full rudder (section 5.3.1)."""
+    """Return the IMO limits of advance and tactical diameter in m (section 5.3.1)."""
     return {"advance": 4.5 * length, "tactical_diameter": 5.0 * length}
 
 
 def zigzag_limits(nominal: float, length: float, speed: float) -> dict[str, float]:
-    """Return IMO's limits of the 10/10 or the 20/20 zigzag (sections 5.3.2 and 5.3.3).
+    """Return the IMO limits of the 10/10 or the 20/20 zigzag (sections 5.3.2 and 5.3.3).
 
-    These are overshoots in rad, of the 10/10 growing with length [m] over speed [m/s] between 10 s
-    and 30 s, and its distance of the initial turn in m.
+    They are overshoots in rad and, for the 10/10 zigzag, the distance of the initial turn in m. The
+    overshoots of the 10/10 zigzag increase with length / speed between 10 s and 30 s.
+
+    Args:
+        nominal: 10 or 20, the angle in deg.
+        length: length of the ship in m.
+        speed: approach speed in m/s.
     """
     if nominal == 20.0:
         return {"first_overshoot": math.radians(25.0)}
@@ -339,28 +347,27 @@ def zigzag_limits(nominal: float, length: float, speed: float) -> dict[str, floa
 
 
 def stopping_limits(length: float) -> dict[str, float]:
-    """Return IMO's limit of a full-astern stop: track reach in m (section 5.3.4)."""
+    """Return the IMO limit of a full-astern stop, the track reach in m (section 5.3.4)."""
     return {"track_reach": 15.0 * length}
 
 
 _MOVING_RATE_SHARE = 0.1
+"""Share of the largest rudder rate above which the rudder counts as moving."""
 _SIDE_ANGLE_SHARE = 0.5
-"""Share of the largest rudder rate from which the rudder moves, and share of the angle held from
-which it is on a side."""
+"""Share of the commanded angle above which the rudder counts as on one side."""
 
 
 class SteeredZigzag(NamedTuple):
-    """A zigzag as it was steered, so that a model can repeat it in closed loop.
+    """Parameters of a recorded zigzag, with which a model can repeat it in closed loop.
 
     Attributes:
-        start: time of the first execute in s, from the log's first sample.
-        first_sign: of the first execute, +1 starboard, -1 port.
-        angle: rudder angle held, mean over both sides, rad.
-        heading: change of heading at which the rudder was ordered back, mean over the reversals,
-            rad.
-        departure_heading: change of heading at which the rudder left its side, rad; beyond
-            `heading` by what the vessel turned while the order took effect.
-        departure_rate: rate of turn when it left, mean over the reversals, rad/s.
+        start: time of the first execute in s after the first sample.
+        first_sign: sign of the first execute, +1 to starboard, -1 to port.
+        angle: rudder angle, mean over both sides, rad.
+        heading: change of heading at the reversal orders, mean over the reversals, rad.
+        departure_heading: change of heading when the rudder begins to move back, rad; larger than
+            `heading` by the turn during the delay of the order.
+        departure_rate: yaw rate at that time, mean over the reversals, rad/s.
     """
 
     start: float
@@ -372,14 +379,18 @@ class SteeredZigzag(NamedTuple):
 
 
 def identify_zigzag(log: Log, rudder: str) -> SteeredZigzag:
-    """Return the zigzag of a log that holds t, psi and a rudder angle.
+    """Identify the parameters of a zigzag from heading and rudder angle.
 
-    An order is given at the last sample before the rudder moves, at a tenth of its largest rate.
-    When the rudder left its side is known to a fraction of a sample, by its rate on the way across:
-    a sample of a coarse grid can be worth half a degree of heading.
+    The order is assumed at the last sample before the rudder moves faster than a tenth of its
+    largest rate. The departure of the rudder is extrapolated from its rate between the sides to a
+    fraction of a sample, because the heading can change by half a degree within a coarse sample.
+
+    Args:
+        log: log with psi and a rudder angle.
+        rudder: name of the channel of the rudder angle.
 
     Raises:
-        DataError: where the rudder does not change sides with the heading at least twice.
+        DataError: if the rudder does not change sides with the heading at least twice.
     """
     delta = log[rudder]
     psi = log["psi"] - log["psi"][0]
@@ -388,13 +399,13 @@ def identify_zigzag(log: Log, rudder: str) -> SteeredZigzag:
     angle = 0.5 * (upper - lower)
     rate = np.abs(np.gradient(delta, log.t))
     is_moving = rate > _MOVING_RATE_SHARE * rate.max()
-    # -1, 0 or +1: the side that the rudder is held on, 0 between them
+    # side of the rudder: -1 port, +1 starboard, 0 in between
     rudder_side = np.where(
         np.abs(delta - mid_angle) > _SIDE_ANGLE_SHARE * angle, np.sign(delta - mid_angle), 0.0
     )
     held_samples = np.flatnonzero(rudder_side)
     has_changed = rudder_side[held_samples[1:]] != rudder_side[held_samples[:-1]]
-    # the rudder may rest beside the middle before the first order
+    # before the first order the rudder need not be amidships
     first_moving = int(np.argmax(is_moving))
     first_arrival = int(np.argmax(~is_moving & (np.arange(delta.size) > first_moving)))
     side_changes = zip(
@@ -414,7 +425,7 @@ def identify_zigzag(log: Log, rudder: str) -> SteeredZigzag:
         rudder_travel = np.maximum.accumulate(
             rudder_side[b] * (delta[a : b + 1] - mid_angle) / angle
         )
-        # the rudder crosses from -1/2 to +1/2, at a rate that takes it back to where it left -1
+        # the crossing from -1/2 to +1/2 gives the rate, which extrapolates back to -1
         start_crossing, end_crossing = np.interp(
             (-_SIDE_ANGLE_SHARE, _SIDE_ANGLE_SHARE), rudder_travel, log.t[a : b + 1]
         )

@@ -1,4 +1,4 @@
-"""Manoeuvres of demands that are known in advance: steps, levels, random steps, sines, replays.
+"""Open-loop manoeuvres: constant inputs, steps, random steps, multi-sines and replays.
 
 Source: document 003 section 4.2.2.
 """
@@ -33,7 +33,7 @@ from residnet.manoeuvres.base import (
 
 
 class ConstantInput(ScheduledManoeuvre):
-    """Constant drive and steer from the start, until speed or turn are steady.
+    """Constant drive and steer, for steady speeds and turns.
 
     Attributes:
         drive: share of full drive, -1 to 1.
@@ -49,7 +49,7 @@ class ConstantInput(ScheduledManoeuvre):
 
 
 class ConstantFamily(Config):
-    """Every combination of some drives and steers.
+    """All combinations of several drives and steers.
 
     Attributes:
         drive: shares of full drive, -1 to 1.
@@ -61,16 +61,16 @@ class ConstantFamily(Config):
     steer: tuple[float, ...] = Field(min_length=1)
 
     def sample_all(self, generator: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """Return one manoeuvre per combination; nothing is random."""
+        """Return one manoeuvre per combination, without random draws."""
         return [ConstantInput(drive=d, steer=s) for d, s in product(self.drive, self.steer)]
 
 
 class AccelerationDeceleration(ScheduledManoeuvre):
-    """Speed steps straight ahead: drive levels, each held from its time on; the steer is zero.
+    """Steps of the drive straight ahead, with zero steer.
 
     Attributes:
-        times: when each level begins in s, ascending.
-        levels: drive from -1 to 1 from that time on.
+        times: start of each level in s, ascending.
+        levels: share of full drive of each level, -1 to 1.
     """
 
     kind: Literal["acceleration_deceleration"] = "acceleration_deceleration"
@@ -90,9 +90,9 @@ class AccelerationDeceleration(ScheduledManoeuvre):
 
 
 class AccelerationDecelerationFamily(ManoeuvreFamily):
-    """Steps between a high and a low level, drawn at random.
+    """Random steps between a high and a low level, each uniform in its range.
 
-    The high level is lowered by a quarter and by half in turn; all is uniform in its range.
+    Successive high levels are 1, 3/4 and 1/2 of the drawn one.
 
     Attributes:
         high: range of the high level of the drive.
@@ -120,19 +120,20 @@ class AccelerationDecelerationFamily(ManoeuvreFamily):
 
 
 _STEP_PATTERN = (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, -1.0)
+"""Sign of the steering in each unit of the 3-2-1-1 pattern."""
 
 
 class ThreeTwoOneOne(ScheduledManoeuvre):
     """The 3-2-1-1 pattern: steering steps of 3, 2, 1 and 1 units to alternating sides.
 
-    It excites a broad band. The steer is zero after it.
+    The pattern excites a broad band of frequencies. The steer is zero afterwards.
 
     Attributes:
         drive: share of full drive, -1 to 1.
         steer: share of full steer, -1 to 1; positive turns to starboard first.
-        start: when the steering begins in s; before, the vessel goes straight ahead.
-        unit: length of the shortest step in s.
-        repeat: whether the pattern is repeated to the end.
+        start: time at which the steering begins in s, after an approach straight ahead.
+        unit: duration of the shortest step in s.
+        repeat: whether the pattern is repeated until the end.
     """
 
     kind: Literal["three_two_one_one"] = "three_two_one_one"
@@ -143,7 +144,7 @@ class ThreeTwoOneOne(ScheduledManoeuvre):
     repeat: bool = True
 
     def demands_at(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        # times on the grid must not fall short of their unit by rounding
+        # rounding of the grid times must not select the previous unit
         unit_index = torch.floor((t - self.start) / self.unit + 1e-9).long()
         pattern = torch.tensor(_STEP_PATTERN, dtype=t.dtype)
         steer = self.steer * pattern[unit_index.clamp(min=0) % len(_STEP_PATTERN)]
@@ -158,7 +159,7 @@ class ThreeTwoOneOneFamily(ManoeuvreFamily):
         unit: range of the shortest step in s.
         steer: range of the share of full steer.
         drive: range of the share of full drive.
-        start: when the steering begins in s.
+        start: time at which the steering begins in s.
     """
 
     kind: Literal["three_two_one_one"] = "three_two_one_one"
@@ -177,15 +178,16 @@ class ThreeTwoOneOneFamily(ManoeuvreFamily):
 def _check_band(band: tuple[float, float]) -> tuple[float, float]:
     if not 0 < band[0] < band[1]:
         raise ValueError(
-            f"a band goes from a low to a higher frequency above zero, given {band[0]:g} Hz to"
-            f" {band[1]:g} Hz"
+            "a band needs a lower and a higher frequency above zero, got"
+            f" {band[0]:g} Hz to {band[1]:g} Hz"
         )
     return band
 
 
 FrequencyBand = Annotated[tuple[Hertz, Hertz], AfterValidator(_check_band)]
 """Lowest and highest frequency."""
-_DRIVE, _STEER, _SWAY, _DIVE, _FIRST_OWN_WAVE = range(5)
+# numbers of the random waves of a manoeuvre; those of single commands follow
+_DRIVE, _STEER, _SWAY, _DIVE, _FIRST_COMMAND_WAVE = range(5)
 
 
 class Excitation(ScheduledManoeuvre, ABC):
@@ -193,16 +195,16 @@ class Excitation(ScheduledManoeuvre, ABC):
 
     Attributes:
         drive: mean drive.
-        drive_amplitude: how far the drive goes to either side of it.
-        steer_amplitude: how far the steer goes to either side of zero.
-        sway_amplitude: how far the sway force goes to either side of zero, in shares of the
-            largest; for vessels whose commands are forces.
-        dive_amplitude: how far the dive goes to either side of zero; for vessels that dive.
-        own_amplitude: how far each command moves by itself, in shares of full steer: what tells one
-            of several thrusters from the others.
-        band: frequencies that the demands excite.
-        seed: of everything random.
-        start: when they begin; before, the drive is held and the steer is zero.
+        drive_amplitude: largest deviation of the drive from its mean.
+        steer_amplitude: largest steer to either side.
+        sway_amplitude: largest sway force to either side as a share of its limit, for vessels whose
+            commands are forces.
+        dive_amplitude: largest dive to either side, for vessels that dive.
+        own_amplitude: amplitude of an independent wave of each command, as a share of full steer,
+            which makes the effects of several thrusters distinguishable.
+        band: frequencies that are excited.
+        seed: seed of the random waves.
+        start: time at which the waves begin, after an approach with the mean drive.
     """
 
     drive: float = Field(ge=-1, le=1)
@@ -220,6 +222,7 @@ class Excitation(ScheduledManoeuvre, ABC):
         """Return the wave [T] within +-1 of a demand at times t [T] since the start in s."""
 
     def _delayed_wave(self, t: Tensor, wave_index: int) -> Tensor:
+        """Return a wave [T] at times t [T] in s, zero before the start."""
         wave = self._demand_wave((t - self.start).clamp(min=0.0), wave_index)
         return torch.where(t >= self.start - 1e-9, wave, torch.zeros_like(t))
 
@@ -229,10 +232,10 @@ class Excitation(ScheduledManoeuvre, ABC):
 
     @classmethod
     def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Return the playback of the demands, including sway forces if present.
+        """Return the source of the demands, with sway forces and waves of single commands if any.
 
         Raises:
-            UsageError: where a sway force is asked of a vessel whose commands are no forces.
+            UsageError: if a sway force is demanded of a vessel whose commands are not forces.
         """
         excitations = [manoeuvre for manoeuvre in manoeuvres if isinstance(manoeuvre, Excitation)]
         drive, steer = map(torch.stack, zip(*(m.demands_at(t) for m in excitations), strict=True))
@@ -243,8 +246,8 @@ class Excitation(ScheduledManoeuvre, ABC):
             max_side_force = helm.side_force
             if max_side_force is None or "tau_y" not in helm.inputs:
                 raise UsageError(
-                    "sway_amplitude: a manoeuvre asks for a sway force, but the vessel's commands"
-                    f" are {', '.join(helm.inputs[:2])} and no forces; leave it out"
+                    "sway_amplitude: a manoeuvre demands a sway force, but the commands of the"
+                    f" vessel, {', '.join(helm.inputs[:2])}, are not forces; remove it"
                 )
             commands[..., helm.inputs.index("tau_y")] += max_side_force * sway
         if any(m.own_amplitude for m in excitations):
@@ -253,19 +256,21 @@ class Excitation(ScheduledManoeuvre, ABC):
             ).abs()
             if helm.dive_commands is not None:
                 full_commands = torch.maximum(full_commands, helm.dive_commands.abs())
+            # the amplitude is relative to the command of full steer or full dive
             for i in range(commands.shape[-1]):
                 waves = [
-                    m.own_amplitude * m._delayed_wave(t, _FIRST_OWN_WAVE + i) for m in excitations
+                    m.own_amplitude * m._delayed_wave(t, _FIRST_COMMAND_WAVE + i)
+                    for m in excitations
                 ]
                 commands[..., i] += full_commands[0, i] * torch.stack(waves)
         return ScheduleSource(commands)
 
 
 class RandomSteps(Excitation):
-    """Drive and steer that jump to random levels.
+    """Steps of drive and steer to random levels.
 
-    Levels are uniform within their amplitudes; each is held for half a period of a random frequency
-    of the band.
+    Levels are uniform within their amplitudes and last for half a period of a random frequency in
+    the band.
     """
 
     kind: Literal["random_steps"] = "random_steps"
@@ -283,20 +288,21 @@ class RandomSteps(Excitation):
 
 
 class MultiSine(Excitation):
-    """Sums of sines at frequencies spread evenly in their logarithm over the band.
+    """Sums of sines at frequencies with logarithmic spacing in the band.
 
-    Each demand has frequencies of its own. The phases are the ones with the flattest sum of some
-    random draws, so that the amplitude is well used; what is beyond it after ten periods of the
-    lowest frequency is clipped.
+    The demands have different frequencies, so that they are uncorrelated. Of 20 random sets of
+    phases, the one with the lowest peak over ten periods of the lowest frequency is used, so that
+    the signal has the largest energy for its amplitude. Later values beyond this peak are clipped.
 
     Attributes:
-        tones: frequencies of each of drive and steer.
+        tones: number of frequencies of each demand.
     """
 
     kind: Literal["multi_sine"] = "multi_sine"
     tones: int = Field(default=8, ge=2, le=200)
 
     def _demand_wave(self, t: Tensor, wave_index: int) -> Tensor:
+        # frequencies are assigned to the demands in turn
         n_demands = 3 if self.sway_amplitude else 2
         n_demands = max(n_demands, wave_index + 1)
         frequencies = np.geomspace(*self.band, n_demands * self.tones)[
@@ -323,18 +329,18 @@ class MultiSine(Excitation):
 
 
 class ExcitationFamily(ManoeuvreFamily):
-    """Random excitation: everything uniform in its range, the band as given.
+    """Random excitations, whose means and amplitudes are uniform in their ranges.
 
     Attributes:
         drive: range of the mean drive.
-        drive_amplitude: range of the drive's amplitude.
-        steer_amplitude: range of the steer's amplitude.
-        sway_amplitude: range of the amplitude of the sway force, in shares of the largest; for
+        drive_amplitude: range of the amplitude of the drive.
+        steer_amplitude: range of the amplitude of the steer.
+        sway_amplitude: range of the amplitude of the sway force as a share of its limit, for
             vessels whose commands are forces.
-        dive_amplitude: range of the amplitude of the dive; for vessels that dive.
-        own_amplitude: range of the amplitude by which each command moves by itself.
-        band: lowest and highest frequency that the demands excite in Hz.
-        start: when they begin in s.
+        dive_amplitude: range of the amplitude of the dive, for vessels that dive.
+        own_amplitude: range of the amplitude of an independent wave of each command.
+        band: lowest and highest excited frequency in Hz.
+        start: time at which the waves begin in s.
     """
 
     drive: Range = (0.3, 0.7)
@@ -347,11 +353,14 @@ class ExcitationFamily(ManoeuvreFamily):
     start: Seconds = 5.0
 
     def _sample_common(self, generator: np.random.Generator) -> dict[str, Any]:
+        """Draw the settings that all excitations have."""
         settings: dict[str, Any] = {
             name: sample_uniform(generator, getattr(self, name))
             for name in ("drive", "drive_amplitude", "steer_amplitude")
         }
         settings |= {"band": self.band, "seed": int(generator.integers(2**31)), "start": self.start}
+        # unused amplitudes are not drawn, so that the random numbers of earlier configs are
+        # unchanged
         for name in ("sway_amplitude", "dive_amplitude", "own_amplitude"):
             if getattr(self, name)[1] > 0:
                 settings[name] = sample_uniform(generator, getattr(self, name))
@@ -371,7 +380,7 @@ class MultiSineFamily(ExcitationFamily):
     """Multi-sines with means and amplitudes uniform in their ranges.
 
     Attributes:
-        tones: frequencies of each of drive and steer.
+        tones: number of frequencies of each demand.
     """
 
     kind: Literal["multi_sine"] = "multi_sine"
@@ -382,15 +391,14 @@ class MultiSineFamily(ExcitationFamily):
 
 
 class Replay(Manoeuvre):
-    """The recorded inputs, each held until the next sample, from the recorded initial state.
+    """Replay of recorded inputs with zero-order hold, from the recorded initial state.
 
-    It lasts as long as the log unless `duration` is less.
+    It lasts as long as the log, or `duration` if that is shorter.
 
     Attributes:
-        log: file of the log; canonical, or any that the reader of the programme reads.
-        channels: channel of the log that is taken for an input or state of the vessel, by the
-            latter's name; the one of the same name where absent (`{cmd_port: n_port}` replays
-            measured revolutions as commands).
+        log: file of the log, canonical or in a format that the reader of the task reads.
+        channels: channel of the log for an input or state of the vessel, by the name of the latter,
+            if the names differ (`{cmd_port: n_port}` replays measured revolutions as commands).
     """
 
     kind: Literal["replay"] = "replay"
@@ -399,7 +407,7 @@ class Replay(Manoeuvre):
     _recorded: Log | None = PrivateAttr(default=None)
 
     def use_log(self, log: Log) -> None:
-        """Take a log that was read already."""
+        """Set the log, which was read before, instead of reading the file."""
         self._recorded = log
 
     @property
@@ -407,19 +415,17 @@ class Replay(Manoeuvre):
         """The log that is replayed.
 
         Raises:
-            UsageError: where the file is not canonical and was not read before.
+            UsageError: if the file is not canonical and was not read before.
         """
         if self._recorded is None:
             self._recorded = Log.load(self.log)
         return self._recorded
 
     def recorded_values(self, name: str) -> np.ndarray | None:
-        """Return the channel [T] of a log for an input or state of the vessel.
-
-        None where it has nothing.
+        """Return the channel [T] of the log for an input or state of the vessel; None without one.
 
         Raises:
-            UsageError: where `channels` names a channel that the log does not have.
+            UsageError: if `channels` names a channel that the log does not have.
         """
         channel = self.channels.get(name, name)
         if channel in self.recorded.channels:
@@ -432,18 +438,18 @@ class Replay(Manoeuvre):
         return None
 
     def duration_within(self, duration: float) -> float:
-        """Return the seconds that the log lasts, or `self.duration` where that is less."""
+        """Return the duration of the log in s, or `self.duration` if that is shorter."""
         log_duration = float(self.recorded.t[-1] - self.recorded.t[0])
         return log_duration if self.duration is None else min(log_duration, self.duration)
 
     def initial_state(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
-        """Return the state [nx] at the log's first sample.
+        """Return the state [nx] at the first sample of the log.
 
-        States that the log does not have are taken from x [nx].
+        States that the log does not have are those of x [nx].
 
         Raises:
-            UsageError: where the log lacks position, heading or a velocity.
-            DataError: where the first sample of one is empty.
+            UsageError: if the log lacks position, heading or a velocity.
+            DataError: if one of them has no value.
         """
         initial_state = x.clone()
         for i, name in enumerate(state):
@@ -452,24 +458,24 @@ class Replay(Manoeuvre):
                 finite_samples = np.flatnonzero(np.isfinite(values))
                 if finite_samples.size == 0:
                     raise DataError(
-                        f"log {self.recorded.name}: channel '{name}' is empty; a replay starts from"
-                        " its first value"
+                        f"log {self.recorded.name}: channel '{name}' is empty; a replay needs its"
+                        " first value"
                     )
                 initial_state[i] = float(values[finite_samples[0]])
             elif name in STATE_NAMES:
                 raise UsageError(
-                    f"log {self.recorded.name}: no channel '{name}', which a replay starts"
-                    f" from{suggest_name(name, self.recorded.channels)}"
+                    f"log {self.recorded.name}: no channel '{name}', which a replay needs for its"
+                    f" initial state{suggest_name(name, self.recorded.channels)}"
                 )
         return initial_state
 
     def recorded_inputs(self, helm: Helm, t: Tensor) -> Tensor:
         """Return the inputs [T, m] at times t [T].
 
-        Exogenous columns that the log does not have are NaN.
+        Exogenous inputs that the log does not have are NaN.
 
         Raises:
-            UsageError: where the log lacks a command.
+            UsageError: if the log lacks a command.
         """
         no_demand = torch.zeros(1, dtype=torch.float64)
         n_commands = helm.demand(no_demand, no_demand).shape[-1]
@@ -479,8 +485,8 @@ class Replay(Manoeuvre):
             values = self.recorded_values(name)
             if values is None and i < n_commands:
                 raise UsageError(
-                    f"log {self.recorded.name}: no channel '{name}', which the vessel is commanded"
-                    " with; name one that it has in replay.channels; it has"
+                    f"log {self.recorded.name}: no channel '{name}', a command of the vessel; map"
+                    " one of its channels to it in replay.channels:"
                     f" {', '.join(self.recorded.channels)}"
                 )
             if values is not None and np.isfinite(values).any():
@@ -492,16 +498,16 @@ class Replay(Manoeuvre):
         return torch.from_numpy(input_values)
 
     def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return how far the motion is from the recorded one.
+        """Return the errors of the motion relative to the recorded one.
 
-        These are root mean square errors of u, v, r, and the errors of position and heading at the
-        end.
+        These are the root mean square errors of u, v and r, and the final errors of position and
+        heading.
         """
         log_time = self.recorded.t - self.recorded.t[0]
         errors: dict[str, np.ndarray] = {}
         for name in STATE_NAMES:
             values = self.recorded_values(name)
-            assert values is not None, "a replay does not begin without it"
+            assert values is not None, "initial_state requires it"
             is_known = np.isfinite(values)
             errors[name] = log[name] - np.interp(
                 log.t - log.t[0], log_time[is_known], values[is_known]

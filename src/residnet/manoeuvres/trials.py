@@ -1,6 +1,6 @@
-"""Simulated sea trials: manoeuvres that a plant or a learned model flies, and their logs.
+"""Simulated sea trials: manoeuvres of a plant or a learned model, and their logs.
 
-Forces, current, wind and waves surround a vessel, and sensors measure it.
+Disturbances are forces, current, wind and waves; sensors add noise to the logs.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ from residnet.physics.vessel import VesselName, load_vessel
 class WindConfig(Config):
     """Mean wind with gusts.
 
-    The gusts along and across the mean wind are independent Ornstein-Uhlenbeck processes, whose
-    one-sided spectrum is the first-order form that Dryden gave the longitudinal turbulence:
+    The gusts along and across the mean wind are independent Ornstein-Uhlenbeck processes. Their
+    one-sided spectrum is the first-order form of Dryden's longitudinal turbulence,
     S(omega) = (2 sigma^2 T / pi) / (1 + (omega T)^2).
 
     Attributes:
         speed: mean true wind speed at the height of the vessel's coefficients.
-        direction: where the mean wind comes FROM, clockwise from north.
+        direction: direction FROM which the mean wind blows, clockwise from north.
         gust: standard deviation sigma of each component.
-        correlation: time T of the gusts, their length over the mean speed.
+        correlation: correlation time T of the gusts, their length divided by the mean speed.
     """
 
     speed: MetresPerSecond = Field(ge=0)
@@ -64,17 +64,18 @@ class DisturbanceConfig(Config):
 
     Attributes:
         force_x: standard deviation of the random surge force, an Ornstein-Uhlenbeck process, in N.
-        force_y: the same of the sway force in N.
-        force_n: the same of the yaw moment in N m.
+        force_y: standard deviation of the random sway force in N.
+        force_n: standard deviation of the random yaw moment in N m.
         correlation: correlation time of the three processes in s.
         force_north: constant force towards north in N.
         force_east: constant force towards east in N.
         current_north: current towards north in m/s.
         current_east: current towards east in m/s.
-        current_speed: speed of the same current in m/s, given with its direction instead.
-        current_direction: where it sets to in rad, clockwise from north.
-        current_each: slowest and fastest speed in m/s of a further current that each trial has of
-            its own, constant in speed and direction.
+        current_speed: speed of the current in m/s, with its direction an alternative to the
+            components.
+        current_direction: direction TO which the current sets in rad, clockwise from north.
+        current_each: range of the speed in m/s of an additional current that differs between
+            trials; it is constant within a trial, with a random direction.
         wind: mean wind and gusts, for vessels with wind coefficients.
         waves: first-order wave forces.
     """
@@ -105,8 +106,8 @@ class DisturbanceConfig(Config):
             )
         if self.current_speed is not None and (self.current_north or self.current_east):
             raise ValueError(
-                "the current is given twice; give current_speed and current_direction, or"
-                " current_north and current_east"
+                "the current is specified twice; give either current_speed and current_direction,"
+                " or current_north and current_east"
             )
         if self.current_each is not None and self.current_each[0] > self.current_each[1]:
             raise ValueError(
@@ -119,6 +120,8 @@ class DisturbanceConfig(Config):
         """Return the current of each trial towards north and east in m/s, [B, 2]."""
         currents = np.tile(self.common_current(), (n_trials, 1))
         if self.current_each is not None:
+            # each kind of disturbance has its own random stream, so that adding one does not change
+            # the others
             generator = np.random.default_rng([seed, 7])
             speed = generator.uniform(*self.current_each, n_trials)
             direction = generator.uniform(0.0, 2.0 * np.pi, n_trials)
@@ -138,7 +141,7 @@ class DisturbanceConfig(Config):
         return WIND_INPUTS if self.wind is not None else ()
 
     def required_plant_inputs(self) -> dict[str, str]:
-        """Return the inputs that a plant must have for this disturbance, each with its key."""
+        """Return the inputs that a plant needs for this disturbance, with the key of the config."""
         north, east = self.common_current()
         force_names = ("force_x", "force_y", "force_n", "force_north", "force_east")
         keys_by_input = {name: name for name in force_names if getattr(self, name) != 0}
@@ -149,7 +152,11 @@ class DisturbanceConfig(Config):
         return keys_by_input
 
     def check_plant(self, plant: Plant, vessel: str) -> None:
-        """Stop where a plant cannot feel this disturbance."""
+        """Check that a plant has the inputs of this disturbance.
+
+        Raises:
+            ConfigError: with the first missing input.
+        """
         for name, key in self.required_plant_inputs().items():
             if name not in plant.input_names:
                 hint = "; give its vessel file a section 'wind'" if key == "wind" else ""
@@ -172,12 +179,11 @@ class DisturbanceConfig(Config):
         seed: int,
         generator: np.random.Generator,
     ) -> np.ndarray:
-        """Return the inputs of the plant [B, T, m], of all that does not depend on its place.
+        """Return the inputs of the plant [B, T, m] by disturbances that do not depend on position.
 
-        The commands are zero.
-
-        The random forces are drawn from `generator` (three values per step for any magnitude, so
-        that data of one seed are reproducible), the gusts from separate generators with `seed`.
+        The commands are zero. Random forces are drawn from `generator`, three values per step for
+        any magnitude, so that the subsequent numbers of the generator do not depend on the config.
+        Gusts and currents are drawn from separate generators with `seed`.
         """
         forces = sample_ornstein_uhlenbeck(generator, (n_trials, n_steps, 3), dt, self.correlation)
         currents = self.draw_currents(n_trials, seed)
@@ -199,7 +205,7 @@ class DisturbanceConfig(Config):
     def add_waves(
         self, source: Source, plant: Plant, n_trials: int, dt: float, seed: int
     ) -> Source:
-        """Return a source with the waves added to its inputs; the same one in calm water."""
+        """Return a source with wave forces added to its inputs; the source itself without waves."""
         if self.waves is None:
             return source
         return WaveForceSource(
@@ -209,9 +215,9 @@ class DisturbanceConfig(Config):
 
 @final
 class WaveForceSource(Source):
-    """A source that adds the waves' forces to the inputs of another source.
+    """A source that adds wave forces to the inputs of another source.
 
-    They are those at the vessel's place at the start of each step, held over it.
+    The forces are those at the position of the vessel at the start of each step, constant over it.
     """
 
     def __init__(self, source: Source, waves: IrregularWaves, plant: Plant, dt: float) -> None:
@@ -250,14 +256,15 @@ class WaveForceSource(Source):
 def sample_ornstein_uhlenbeck(
     generator: np.random.Generator, shape: tuple[int, int, int], dt: float, correlation: float
 ) -> np.ndarray:
-    """Return stationary first-order processes [B, T, k] of unit variance.
+    """Sample stationary Ornstein-Uhlenbeck processes [B, T, k] of unit variance.
 
-    They run along T and are discretised exactly.
+    The discretisation along T is exact for any time step.
     """
     from scipy.signal import lfilter
 
     decay = np.exp(-dt / correlation)
     driving_noise = generator.standard_normal(shape) * np.sqrt(1 - decay**2)
+    # the first sample has the stationary variance
     driving_noise[:, 0] /= np.sqrt(1 - decay**2)
     processes: np.ndarray = lfilter([1.0], [1.0, -decay], driving_noise, axis=1)
     return processes
@@ -266,9 +273,9 @@ def sample_ornstein_uhlenbeck(
 def simulate_wind(
     wind: WindConfig | None, n_trials: int, n_steps: int, dt: float, seed: int
 ) -> dict[str, np.ndarray]:
-    """Return the speed in m/s and direction in rad [B, T] of the wind with gusts, by input.
+    """Return the speed in m/s and the direction in rad of the wind with gusts [B, T], by input.
 
-    The direction is the direction that the wind comes from; empty without wind.
+    The direction is the one FROM which the wind blows. The result is empty without wind.
     """
     if wind is None:
         return {}
@@ -284,15 +291,15 @@ def simulate_wind(
 
 
 class SensorConfig(Config):
-    """What one channel's sensor does to it.
+    """Errors of the sensor of one channel.
 
     Attributes:
-        noise: standard deviation of white noise, in the channel's unit (`0.5 deg`); not for u, v,
-            r, which have separate settings in `sensors`.
-        bias: constant error, in the channel's unit.
-        interval: time between its samples, a multiple of the log's step; the channel is empty in
-            between. None: every sample of the log.
-        latency: delay of the measurement: the log shows at t the value of t - latency.
+        noise: standard deviation of white noise, with unit (`0.5 deg`); not for u, v and r, whose
+            noise is set in `SensorsConfig`.
+        bias: constant error, with unit.
+        interval: time between measurements, a multiple of the step of the log; other samples are
+            missing. None for a measurement at every sample.
+        latency: delay of the measurement; the value at t is that of t - latency.
     """
 
     noise: float | str = 0.0
@@ -302,13 +309,13 @@ class SensorConfig(Config):
 
 
 class SensorsConfig(Config):
-    """White noise on the measured velocities; all else is exact unless `sensors` says otherwise.
+    """White noise of the measured velocities, and errors of the sensors of other channels.
 
     Attributes:
         u: standard deviation in m/s.
         v: standard deviation in m/s.
         r: standard deviation in rad/s.
-        sensors: sensors of single channels, by the channel's name.
+        sensors: sensors by channel; other channels are exact.
     """
 
     u: MetresPerSecond = Field(default=0.03, ge=0)
@@ -330,12 +337,12 @@ class SensorsConfig(Config):
                 raise ValueError(f"sensors.{name}: {error}") from None
             if noise < 0:
                 raise ValueError(
-                    f"sensors.{name}.noise: a standard deviation must not be negative, given"
+                    f"sensors.{name}.noise: a standard deviation must not be negative, got"
                     f" {noise:g}"
                 )
             if noise and name in VELOCITY_NAMES:
                 raise ValueError(
-                    f"sensors.{name}.noise: the white noise of {name} is given as noise.{name}"
+                    f"sensors.{name}.noise: set the white noise of {name} as noise.{name}"
                 )
             converted_sensors[name] = sensor.model_copy(update={"noise": noise, "bias": bias})
         object.__setattr__(self, "sensors", converted_sensors)
@@ -367,13 +374,13 @@ class SensorsConfig(Config):
         white_noise: np.ndarray,
         seed: tuple[int, ...],
     ) -> dict[str, np.ndarray]:
-        """Build the log.
+        """Return the measured channels [T].
 
         Args:
-            true_channels: channels [T] as they were.
+            true_channels: true channels [T].
             t: times [T] in s, evenly spaced.
             white_noise: noise [T, 3] of u, v, r.
-            seed: of the noise of all other channels.
+            seed: seed of the noise of all other channels.
         """
         measured_channels = {}
         for name, true_values in true_channels.items():
@@ -399,14 +406,14 @@ class SensorsConfig(Config):
 
 @dataclass(frozen=True)
 class SimulatedVessel:
-    """A vessel that flies manoeuvres: a plant or a learned model.
+    """A vessel in simulated trials: a plant or a learned model.
 
     Attributes:
-        name: in logs and tables.
-        dynamics: a plant or a learned model, stepping as the logs do.
-        helm: of it.
-        n_commands: how many of its inputs are commands.
-        initial_state: state [1, nx] that trials start from, or one for each, [B, nx]; float64.
+        name: name in logs and tables.
+        dynamics: plant or learned model with the time step of the logs.
+        helm: properties of the vessel for manoeuvres.
+        n_commands: number of commands among its inputs.
+        initial_state: initial state of all trials [1, nx] or of each [B, nx], float64.
     """
 
     name: str
@@ -418,14 +425,14 @@ class SimulatedVessel:
 
 @dataclass(frozen=True)
 class TrialEnvironment:
-    """What surrounds a craft, and what measures it.
+    """Disturbances and sensors of simulated trials.
 
     Attributes:
-        plant: whose inputs the disturbance is laid out for; None for a model without a vessel,
-            which feels the wind alone.
+        plant: plant whose inputs the disturbances are; None for a learned model without a vessel,
+            which is disturbed by wind only.
         disturbance: forces, current, wind, waves.
-        sensors: of the sensors.
-        seed: of everything random in both.
+        sensors: noise and errors of the sensors.
+        seed: seed of all random numbers of both.
     """
 
     plant: Plant | None
@@ -436,14 +443,14 @@ class TrialEnvironment:
 
 @dataclass(frozen=True)
 class ManoeuvreRun:
-    """One manoeuvre as it was flown.
+    """A simulated manoeuvre and its logs.
 
     Attributes:
-        manoeuvre: simulated manoeuvre.
-        true_log: the motion itself.
-        measured_log: what sensors measured of it. Its meta says `timed_out` where the stop
-            condition was not reached, `diverged` where the motion ceased to be finite; both logs
-            end there.
+        manoeuvre: the manoeuvre.
+        true_log: true motion.
+        measured_log: motion measured by the sensors. Its `meta` has `timed_out` if the stop
+            condition was not reached, and `diverged` if the motion was not finite; both logs end
+            at this time.
     """
 
     manoeuvre: Manoeuvre
@@ -452,7 +459,7 @@ class ManoeuvreRun:
 
     @property
     def fault_text(self) -> str | None:
-        """Why the manoeuvre did not end as it should, in words; None where it did."""
+        """Reason why the manoeuvre ended early or without its goal; None if it did not."""
         duration_text = f"{self.true_log.t[-1] - self.true_log.t[0]:.5g} s"
         if self.measured_log.meta.get("diverged"):
             return f"the motion was no longer finite after {duration_text}"
@@ -464,12 +471,15 @@ class ManoeuvreRun:
 
 
 def make_manoeuvre_source(manoeuvres: Sequence[Manoeuvre], helm: Helm, times: Tensor) -> Source:
-    """Return the source that flies manoeuvres of any kinds side by side.
+    """Return the source of manoeuvres of any kinds, one for each row of a batch.
 
-    t [T] are the times of the steps.
+    Args:
+        manoeuvres: the manoeuvres; those of one kind are consecutive.
+        helm: properties of the vessel.
+        times: times [T] of the steps in s.
 
     Raises:
-        UsageError: where the vessel lacks what a manoeuvre needs.
+        UsageError: if the vessel lacks a state or command that a manoeuvre needs.
     """
     manoeuvres_by_kind = [
         list(manoeuvres_of_kind)
@@ -492,18 +502,19 @@ def simulate_manoeuvres(
     dt: float,
     metadata: Mapping[str, Any] | None = None,
 ) -> list[ManoeuvreRun]:
-    """Fly the manoeuvres in one batch.
+    """Simulate manoeuvres in one batch.
 
     Args:
         vessel: plant or learned model.
-        manoeuvres: in the order of the result; rows that reach their stop condition end there.
-        duration: of manoeuvres that give none, in s.
-        dt: of the logs in s.
+        manoeuvres: manoeuvres in the order of the result; a row ends at its stop condition.
+        environment: disturbances and sensors.
+        duration: duration in s of manoeuvres without one.
+        dt: time step of the logs in s.
         metadata: metadata of the logs.
 
     Raises:
-        UsageError: where the vessel lacks what a manoeuvre needs.
-        DataError: where the motion of a manoeuvre is not finite from its first step on.
+        UsageError: if the vessel lacks a state or command that a manoeuvre needs.
+        DataError: if the motion of a manoeuvre is not finite after the first step.
     """
     n_trials = len(manoeuvres)
     max_steps_by_trial = [
@@ -564,7 +575,7 @@ def simulate_manoeuvres(
             log_metadata["timed_out"] = True
         if n_valid_steps < 2:
             raise DataError(
-                f"{vessel.name}, {log_name}: the motion is not finite from its first step on"
+                f"{vessel.name}, {log_name}: the motion is not finite after the first step"
             )
         simulated_channels = dict(zip(vessel.helm.state, states[i, :n_valid_steps].T, strict=True))
         simulated_channels |= dict(
@@ -585,7 +596,7 @@ def simulate_manoeuvres(
 
 
 def list_logged_channels(vessel: SimulatedVessel, environment: TrialEnvironment) -> tuple[str, ...]:
-    """Return the channel names of a simulated log: states, commands, measured inputs."""
+    """Return the channels of a simulated log: measured states, commands, and the wind if any."""
     channel_names = [
         *(name for name in vessel.helm.state if not name.startswith("_")),
         *vessel.helm.inputs[: vessel.n_commands],
@@ -595,7 +606,7 @@ def list_logged_channels(vessel: SimulatedVessel, environment: TrialEnvironment)
 
 
 def make_log_names(manoeuvres: Sequence[Manoeuvre]) -> list[str]:
-    """Return the names of the logs: as given, else the kind with its number."""
+    """Return the names of the logs: the name of the manoeuvre, or its kind with a number."""
     n_by_kind: dict[str, int] = {}
     names = []
     for manoeuvre in manoeuvres:
@@ -605,23 +616,23 @@ def make_log_names(manoeuvres: Sequence[Manoeuvre]) -> list[str]:
 
 
 class SimulatedTrials(Config):
-    """A programme of sea trials on a simulated vessel, from zero speed.
+    """A programme of sea trials with a simulated vessel, starting at rest.
 
-    A model that only holds near its service speed starts there.
+    A model that is valid only near its service speed starts at this speed.
 
     Attributes:
         vessel: name of a vessel of residnet, or path of a vessel file.
-        trials: families of manoeuvres; random quantities are drawn with `seed`.
-        duration: of each manoeuvre.
+        trials: families of manoeuvres, drawn with `seed`.
+        duration: duration of each manoeuvre.
         step: sampling interval of the logs.
-        substeps: steps of the plant within one sampling interval.
-        identification: number of manoeuvres of each kind that models may be fitted on, drawn by
-            `seed`; all manoeuvres of unlisted kinds are for identification. The others are the test
-            set.
-        validation: number of identification manoeuvres reserved for model selection.
-        seed: of everything random in the data (the run's own seed moves only the training).
-        noise: of the sensors.
-        disturbance: of the sea.
+        substeps: integration steps of the plant within a sampling interval.
+        identification: number of manoeuvres of each kind for training and validation, drawn with
+            `seed`; the others are the test set. All manoeuvres of kinds that are not listed are for
+            training.
+        validation: number of these manoeuvres that are reserved for model selection, by kind.
+        seed: seed of all random numbers of the data; the seed of the run affects only the training.
+        noise: noise and errors of the sensors.
+        disturbance: forces, current, wind and waves.
     """
 
     kind: Literal["simulated"] = "simulated"
@@ -640,7 +651,7 @@ class SimulatedTrials(Config):
     def check_plant(self) -> SimulatedTrials:
         try:
             plant = load_vessel(self.vessel).build()
-            # actuators with dead time move by a step of their own
+            # raises an error if the step of a delay line differs from that of the simulation
             plant.finish_step(
                 plant.make_initial_state(1),
                 torch.zeros(1, len(plant.input_names), dtype=torch.float64),
@@ -663,7 +674,7 @@ class SimulatedTrials(Config):
         return self
 
     def draw_manoeuvres(self) -> list[Manoeuvre]:
-        """Return the manoeuvres, by family."""
+        """Draw the manoeuvres of all families, in this order."""
         generator = np.random.default_rng([self.seed, 1])
         return [
             manoeuvre
@@ -672,7 +683,7 @@ class SimulatedTrials(Config):
         ]
 
     def assign_splits(self, manoeuvres: Sequence[Manoeuvre]) -> list[str]:
-        """Return `train`, `validation` or `test` of each manoeuvre; whole manoeuvres only."""
+        """Return the split of each manoeuvre: train, validation or test."""
         generator = np.random.default_rng([self.seed, 2])
         split_names = ["train"] * len(manoeuvres)
         for manoeuvre_kind, n_identification in self.identification.items():
@@ -686,8 +697,7 @@ class SimulatedTrials(Config):
             ):
                 raise ValueError(
                     f"{n_identification} of {len(members_of_kind)} '{manoeuvre_kind}' manoeuvres"
-                    f" for identification, {n_validation}"
-                    " of them for validation: leaves a split empty"
+                    f" for identification, {n_validation} of them for validation: a split is empty"
                 )
             shuffled_indices = generator.permutation(members_of_kind)
             for i in shuffled_indices[:n_validation]:
@@ -698,10 +708,10 @@ class SimulatedTrials(Config):
 
 
 def simulate_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[ManoeuvreRun]:
-    """Fly the manoeuvres in one batch and return the motion and the logs of sensors on it.
+    """Simulate manoeuvres in one batch and return their true and measured logs.
 
-    Channels: the plant's state (for the WAM-V x, y, psi, u, v, r, n_port, n_stbd), the commands,
-    and the true wind, if present. Float64.
+    The channels are the states of the plant (for the WAM-V x, y, psi, u, v, r, n_port, n_stbd), the
+    commands, and the true wind if present, float64.
     """
     plant = build_plant(config.vessel, config.disturbance)
     traced_dynamics = RecordedPlantDynamics(plant, config.step, config.substeps)
@@ -718,7 +728,7 @@ def make_dummy_logs(config: SimulatedTrials) -> list[Log]:
     Their channels are slow sines, for checks of a config without a simulation.
 
     Raises:
-        UsageError: where the vessel lacks what a manoeuvre needs.
+        UsageError: if the vessel lacks a state or command that a manoeuvre needs.
     """
     plant = load_vessel(config.vessel).build()
     vessel = build_trial_vessel(config)
@@ -744,9 +754,9 @@ def make_dummy_logs(config: SimulatedTrials) -> list[Log]:
 
 
 def build_plant(vessel: str, disturbance: DisturbanceConfig) -> Plant:
-    """Return the plant of a vessel, in calm water where nothing disturbs it.
+    """Return the plant of a vessel, without environment if there is no disturbance.
 
-    The numbers are the same there: a vessel under water is flown in half the time.
+    The results are equal, and the simulation of an underwater vehicle takes half the time.
     """
     plant = load_vessel(vessel).build()
     if isinstance(plant, HullPlant) and not disturbance.required_plant_inputs():
@@ -755,7 +765,7 @@ def build_plant(vessel: str, disturbance: DisturbanceConfig) -> Plant:
 
 
 def build_trial_vessel(config: SimulatedTrials) -> SimulatedVessel:
-    """Return the vessel of the trials."""
+    """Return the simulated vessel of the trials."""
     plant = build_plant(config.vessel, config.disturbance)
     return SimulatedVessel(
         config.vessel,
