@@ -76,7 +76,7 @@ def test_an_optional_head_is_left_out_where_its_package_is_absent(
             "constant_velocity",
             "baseline",
         ]
-    assert "bred is left out" in " ".join(said)
+    assert "bred is skipped" in " ".join(said)
 
 
 def test_a_band_says_why_its_model_could_not_be_fitted_without_some_logs(

@@ -222,7 +222,7 @@ def test_bias_noise_sampling_and_latency_of_single_channels() -> None:
         ({}, {"psy": {"noise": 1}}, "no channel 'psy'; did you mean 'psi'"),
         ({}, {"psi": {"noise": "2 m"}}, "does not measure"),
         ({}, {"psi": {"noise": -0.1}}, "must not be negative"),
-        ({}, {"u": {"noise": 0.1}}, "given as noise.u"),
+        ({}, {"u": {"noise": 0.1}}, "as noise.u"),
         ({}, {"x": {"interval": 0.25}}, "not a multiple of the log's step, 0.1 s"),
         ({}, {"x": {"interval": 0.01}}, "not a multiple"),
         ({}, {"x": {"latency": -1}}, "latency"),

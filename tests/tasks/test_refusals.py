@@ -92,7 +92,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("~programme.vessel", "no vessel"),
         (f"'{M}zigzag, drive: 0.5, heading: 10 deg}}]'", "give either steer"),
         (f"'{M}zigzag, drive: 0.5, rudder: 10 deg, heading: 10 deg}}]'", "has no rudder"),
-        (f"programme.vessel=mariner '{M}turning_circle, drive: 1, rudder: 60 deg}}]'", "to 40 deg"),
+        (f"programme.vessel=mariner '{M}turning_circle, drive: 1, rudder: 60 deg}}]'", "is 40 deg"),
         ("'programme.initial={uu: 1}'", "no state 'uu'"),
         ("'programme.initial={u: 3 deg}'", "does not measure [m/s]"),
         ("'programme.disturbance.wind={speed: 3, direction: 0}'", "has no input 'wind_speed'"),

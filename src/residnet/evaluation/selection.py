@@ -258,7 +258,7 @@ def _simplest_equivalent(
         diverged_text = ", ".join(f"{model.name} ({model.faults[0]})" for model in diverged_models)
         reason += f"; passed over: {diverged_text}"
     if not candidate.is_sound:
-        reason += f"; against it speaks: {'; '.join(candidate.faults)}"
+        reason += f", with these faults: {'; '.join(candidate.faults)}"
     return candidate, reason + "."
 
 

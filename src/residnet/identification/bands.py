@@ -1,4 +1,4 @@
-"""Bands of the models of a fit, calibrated over logs that no model was fitted on."""
+"""Prediction intervals (bands) of fitted models, calibrated on logs not used in their fit."""
 
 from __future__ import annotations
 
@@ -56,8 +56,11 @@ def assign_logs_to_folds(manoeuvre_kinds: Sequence[str], max_folds: int, seed: i
     """Return the fold of each log [L]; logs of one kind are spread over the folds.
 
     Args:
+        manoeuvre_kinds: kind of manoeuvre of each log.
         max_folds: largest number of folds; no more than the number of logs.
+        seed: seed of the random order within a kind.
     """
+    # the second number separates this random stream from others with the same seed
     generator = np.random.default_rng([seed, 3])
     shuffled_indices = [
         log_index
@@ -74,13 +77,14 @@ def assign_logs_to_folds(manoeuvre_kinds: Sequence[str], max_folds: int, seed: i
 
 
 class LeaveFoldOutModels:
-    """The models of a fit that can quickly be fitted without a fold of the training logs.
+    """Models of a fit, fitted again without each fold of the training logs.
 
-    Baselines that went through a refit take one step of Gauss-Newton; what has a closed form is
-    solved again, with the complexity that the whole fit chose. Networks, searched equations and
-    ensembles are not here.
+    Refitted baselines take one Gauss-Newton step from the parameters of the whole fit; closed forms
+    are solved again with the complexity selected in the whole fit. Networks, symbolic equations and
+    ensembles are not included, because fitting them again would take too long.
 
     Args:
+        identified: fitted models.
         fold_of_log: number of the fold of each training log [L].
     """
 
@@ -95,7 +99,7 @@ class LeaveFoldOutModels:
 
     @cached_property
     def models_by_fold(self) -> list[dict[str, HybridDynamics]]:
-        """The models by name for each fold that is left out."""
+        """The models by name, fitted without each fold."""
         models_by_fold: list[dict[str, HybridDynamics]] = [{} for _ in range(self.n_folds)]
         for name, fitted_model in self.identified.items():
             try:
@@ -110,7 +114,7 @@ class LeaveFoldOutModels:
     def _fit_without_folds(
         self, fitted_model: FittedModel, models_by_fold: Sequence[dict[str, HybridDynamics]]
     ) -> list[HybridDynamics]:
-        """Return a model without each fold; none where it cannot quickly be fitted again."""
+        """Return a model fitted without each fold; empty if it cannot quickly be fitted again."""
         role = fitted_model.spec.role
         if role == CONSTANT_VELOCITY:
             return [copy.deepcopy(fitted_model.model) for _ in range(self.n_folds)]
@@ -171,7 +175,7 @@ class LeaveFoldOutModels:
 def _load_matching_solution(
     module: nn.Module, solutions: Sequence[Solution], fitted_model: FittedModel
 ) -> None:
-    """Fill a part with the solution that has the complexity of the fitted one, else the first."""
+    """Load the solution with the hyperparameters of the fitted model, or the first solution."""
     matching_solutions = (
         solution
         for solution in solutions
@@ -183,7 +187,7 @@ def _load_matching_solution(
 
 
 _MAX_CALIBRATION_SAMPLES = 1_000_000
-"""Samples of all windows together that calibrate; of more windows, every second or so is taken."""
+"""Largest total number of samples of the calibration windows; more windows are thinned."""
 
 
 def calibrate_bands(
@@ -222,7 +226,7 @@ def calibrate_bands(
             bands_by_model.setdefault(name, {})[protocol] = band
     models_with_bands = dict(identified)
     for name, bands in bands_by_model.items():
-        # the description of a model takes the band that reaches furthest
+        # an exported model has one band: the one with the longest horizon
         longest_band = max(bands.values(), key=lambda band: band.horizon)
         spec = models_with_bands[name].spec.model_copy(update={"band": longest_band.to_table()})
         models_with_bands[name] = replace(models_with_bands[name], spec=spec, bands=bands)
@@ -230,10 +234,13 @@ def calibrate_bands(
 
 
 class _ProtocolCalibration:
-    """The free runs that calibrate the bands under one protocol.
+    """Free runs that calibrate the prediction intervals of one protocol.
 
     Args:
-        failure_reasons: why a model cannot be fitted without some of the logs, by its name.
+        identified: fitted models.
+        protocol_name: name of the protocol.
+        config: settings of the calibration.
+        failure_reasons: by model, why it could not be fitted without some of the logs.
     """
 
     def __init__(
@@ -268,7 +275,7 @@ class _ProtocolCalibration:
     def add_runs(
         self, models: Mapping[str, HybridDynamics], logs: Sequence[PreparedLog], is_validation: bool
     ) -> None:
-        """Run models over logs that they were not fitted on."""
+        """Add the errors of free runs over logs that the models were not fitted on."""
         windows = self._make_windows(logs)[:: 1 if is_validation else self.window_stride]
         if not windows or not models:
             return
@@ -302,7 +309,7 @@ class _ProtocolCalibration:
         ]
 
     def calibrate_all(self) -> dict[str, Band]:
-        """Return the band of each model; none where no log is long enough."""
+        """Return the band of each model; empty if no log is long enough."""
         reference_errors = self.cross_validated_errors.get(
             CONSTANT_VELOCITY, []
         ) + self.validation_errors.get(CONSTANT_VELOCITY, [])
@@ -314,7 +321,7 @@ class _ProtocolCalibration:
         score_unit[is_scored] = np.sqrt(
             np.nanmean(np.compress(is_scored, constant_velocity_errors, axis=1) ** 2, axis=0)
         )
-        # a channel that zero predicts without any error has no scale of its own
+        # a channel without any error of constant velocity would give a zero scale
         score_unit = np.where(score_unit > 0, score_unit, 1.0)
         bands_by_model: dict[str, Band] = {}
         for name in self.cross_validated_errors:
@@ -348,7 +355,11 @@ class _ProtocolCalibration:
         reference_name: str,
         score_unit: np.ndarray,
     ) -> Band:
-        """Return the band of a model that was not fitted again without logs."""
+        """Return the band of a model that was not fitted again without some of the logs.
+
+        It has the shape of the reference's band, which is known from many logs. The factor on its
+        width is the ratio of the two models' error quantiles over the same validation logs.
+        """
         errors_of_runs = self.validation_errors[fitted_model.name]
         n_logs = len({run.log for run in errors_of_runs})
         if reference_name not in known_bands or not self.validation_errors.get(reference_name):
@@ -383,16 +394,16 @@ class _ProtocolCalibration:
 
 
 _SCALED_CAUTION = (
-    "This model was not fitted again without the logs that calibrate: its band has the form of that"
-    " of {}, and its width from {} validation logs, which also chose between models or stopped the"
-    " training early."
+    "This model was not fitted again without the calibration logs: its band has the shape of that"
+    " of {} and a width from {} validation logs, which also selected models or stopped the training"
+    " early."
 )
 _VALIDATION_ONLY_CAUTION = (
-    "Only {} validation logs calibrate this band: no model could be fitted without some of the"
-    " training logs{}. They also chose between models or stopped the training early."
+    "This band is calibrated on only {} validation logs, because no model could be fitted without"
+    " some of the training logs{}. These logs also selected models or stopped the training early."
 )
 _REFERENCE_BAND_CAUTION = (
-    "Short logs leave none that this model was not fitted on: its band is that of {}, which was"
+    "This model was fitted on all logs, because they are short: its band is that of {}, which was"
     " fitted again without some of them."
 )
 
@@ -400,11 +411,12 @@ _REFERENCE_BAND_CAUTION = (
 def _normalized_error_quantile(
     errors_of_runs: Sequence[RunErrors], band: Band, level: float
 ) -> np.ndarray:
-    """Return the quantile [c] of errors over the half widths of a band."""
+    """Return the quantile [c] of the ratios of errors to the half widths of a band."""
     names = [run.log for run in errors_of_runs]
     run_weights_ = compute_run_weights(names)
     normalized_errors = [run.error / run.half_widths(band) for run in errors_of_runs]
     coverage = np.array([np.nanmean(ratio <= 1.0) for ratio in normalized_errors])
+    # correction for the small number of independent runs, as in the calibration of a band
     corrected_level = conformal_level(
         level, effective_sample_size(coverage, run_weights_, names, level)
     )

@@ -1,4 +1,4 @@
-"""What may have changed on a vessel, around it or in its sensors, and a model with such changes."""
+"""Possible changes of a vessel, its environment or its sensors, and a model with such changes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from residnet.physics.symmetry import get_dof
 
 _AXIS_NAMES = {"u": "surge", "v": "sway", "r": "yaw", "p": "roll", "w": "heave", "q": "pitch"}
 _DAMPING_PROBE_SHARES = {"u": 0.1}
-"""Share of a velocity whose absence shows what damps it; all of others."""
+"""Share of a velocity that is removed to find its damping; 1 for velocities not listed."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def make_fault_hypotheses(signals: SignalsConfig) -> list[SystemChange]:
 
 
 def make_nuisance_changes() -> list[SystemChange]:
-    """Return what wind and current do, which is no change of the vessel."""
+    """Return changes of wind and current, which must not be attributed to the vessel."""
     return [
         SystemChange("current north", "", "m/s", 0.05, sensor="current_north"),
         SystemChange("current east", "", "m/s", 0.05, sensor="current_east"),
@@ -112,7 +112,14 @@ def make_nuisance_changes() -> list[SystemChange]:
 def compute_sensor_effect(
     sensor: str, x: Tensor, accelerations: Tensor, change_size: float
 ) -> Tensor:
-    """Return what a sensor adds to states [..., 3 + n] where what moves has the rates [..., n]."""
+    """Return the change of measured states [..., 3 + n] due to a sensor fault.
+
+    Args:
+        sensor: sensor fault, see `SystemChange`; empty for none.
+        x: true states [..., 3 + n].
+        accelerations: rates of the dynamic states [..., n], for a lag.
+        change_size: size of the fault.
+    """
     effect = torch.zeros_like(x)
     if sensor == "gyro_scale":
         effect[..., YAW_RATE] = change_size * x[..., YAW_RATE]
@@ -121,6 +128,7 @@ def compute_sensor_effect(
     elif sensor == "speed_scale":
         effect[..., SURGE : SWAY + 1] = change_size * x[..., SURGE : SWAY + 1]
     elif sensor == "lag":
+        # first order in the lag: nu(t - lag) = nu(t) - lag nu_dot(t)
         effect[..., DYNAMIC_STATES] = -change_size * accelerations
     elif sensor in ("current_north", "current_east"):
         north = x.new_tensor(change_size if sensor == "current_north" else 0.0)
@@ -144,11 +152,13 @@ def resolve_in_body_axes(x: Tensor, north: Tensor, east: Tensor) -> Tensor:
 
 @final
 class PerturbedDynamics(Dynamics):
-    """A model with a change of its own for every block of rows.
+    """A model with a different change in each block of rows.
 
     Args:
-        changes: C of them; rows [C * B] are blocks of B.
-        block_size: B.
+        model: unchanged model.
+        changes: C changes; rows [C * B] are blocks of B.
+        block_size: B, the number of rows of a block.
+        n_inputs: number of inputs of the model.
     """
 
     def __init__(
@@ -180,8 +190,8 @@ class PerturbedDynamics(Dynamics):
         self.push_acceleration = repeat_per_row(
             [[change.size * axis for axis in change.push_direction] for change in changes]
         )
-        self.input_gain = 1.0 + size_per_input(lambda one: one.gain_input)
-        self.input_offset = size_per_input(lambda one: one.offset_input)
+        self.input_gain = 1.0 + size_per_input(lambda change: change.gain_input)
+        self.input_offset = size_per_input(lambda change: change.offset_input)
         damping_change_indices = [k for k, change in enumerate(changes) if change.damping]
         self.has_damping_changes = len(damping_change_indices) > 0
         self.damped_rows = torch.tensor(damping_change_indices).repeat_interleave(
@@ -234,7 +244,8 @@ class PerturbedDynamics(Dynamics):
                 0.5 * self.dt * (changed_next_state - nominal_next_state)[:, rate_columns]
             )
             return self.model.add_change(changed_next_state, rotation_vector), next_memory
-        # angles follow what their rates have gained over the step
+        # angles change by half of the velocity change times dt: the mean over a step in which the
+        # change grows linearly from zero
         angle_increments = (
             changed_velocities - nominal_next_state[:, DYNAMIC_STATES]
         ) @ self.model.angle_rate_matrix
@@ -256,7 +267,7 @@ class PerturbedDynamics(Dynamics):
         """Return the effect of changed damping on the velocities after a step [B, n].
 
         Damping is the difference of the step with and without the velocity; for surge only a part
-        of the speed is removed, since models may hold near a service speed only.
+        of the speed is removed, since models may be valid only near the service speed.
         """
         damped_rows = self.damped_rows
         damped_columns = self.damped_columns

@@ -1,4 +1,4 @@
-"""The fit: prepared logs to baselines, heads and ensembles, judged in free run."""
+"""Fits baselines, heads and ensembles on prepared logs; models are compared in free run."""
 
 from __future__ import annotations
 
@@ -38,8 +38,9 @@ from residnet.training.config import TrainingConfig
 
 Logs = Mapping[str, Sequence[PreparedLog]]
 _MIN_PARALLEL_STEPS = 100_000
-"""Steps of windows that a training runs through, from which it is worth a process of its own: they
-take 13 s, and a process that imports all that it needs 4.5 s of a processor.
+"""Number of integration steps from which a training gets a separate process.
+
+So many steps take 13 s, and the start of a process with its imports takes 4.5 s of CPU time.
 """
 
 
@@ -51,8 +52,8 @@ def fit_models(
     Args:
         logs: prepared logs by split; `train` is fitted, `validation` selects and stops early.
         settings: settings of the identification.
-        store: saves every finished model and returns finished heads of an interrupted fit; None for
-            none.
+        store: saves every finished model and returns finished heads of an interrupted fit; None to
+            save nothing.
 
     Raises:
         FitError: if the data do not determine a part, or no training gave a finite free run.
@@ -62,7 +63,9 @@ def fit_models(
     fitter = Fitter(logs, settings, store)
     if not should_include_validation(fitter.settings, logs["train"]):
         return _fit_all_parts(fitter, logs)
-    log_message("  logs are short, and nothing is chosen: validation logs are fitted too")
+    log_message(
+        "  logs are short and validation selects no model: validation logs are used in training"
+    )
     logs_with_validation = {**logs, "train": [*logs["train"], *logs["validation"]]}
     return _fit_all_parts(
         Fitter(
@@ -133,11 +136,11 @@ def _skip_if_optional(settings: FitSettings, name: str) -> Iterator[None]:
     except MissingPackageError as error:
         if not (isinstance(head, GeneticConfig) and head.optional):
             raise
-        log_message(f"  {name} is left out: {error}")
+        log_message(f"  {name} is skipped: {error}")
     except (DataError, FitError) as error:
         if settings.recipe is None or name == "baseline":
             raise
-        log_message(f"  {name} is left out: {error}")
+        log_message(f"  {name} is skipped: {error}")
 
 
 def _describe_validation(fitted_model: FittedModel) -> str:
@@ -147,7 +150,7 @@ def _describe_validation(fitted_model: FittedModel) -> str:
 
 
 def _fit_heads(fitter: Fitter, logs: Logs, models: dict[str, FittedModel]) -> None:
-    """Fit the heads whose baseline is there, long trainings but one in processes of their own."""
+    """Fit the heads whose baseline was fitted; all long trainings but one in worker processes."""
     settings = fitter.settings
     n_threads = torch.get_num_threads()
     head_names = [name for name in settings.heads if settings.get_baseline_name(name) in models]
@@ -159,7 +162,8 @@ def _fit_heads(fitter: Fitter, logs: Logs, models: dict[str, FittedModel]) -> No
         and is_long_training(fitter, name)
         and fitter.store.load_finished(name) is None
     ]
-    # this process trains the first itself, where each of the others has one
+    # this process would only wait while workers train, so it trains the first head itself; with
+    # more long trainings than workers, all of them queue for the pool
     worker_heads = long_heads[1:] if len(long_heads) <= n_parallel else long_heads
     initializer_arguments = (dict(logs), settings, fitter.store.training_folder, n_threads)
     with _forward_progress() if worker_heads else nullcontext() as progress_queue:
@@ -194,10 +198,11 @@ def _fit_heads(fitter: Fitter, logs: Logs, models: dict[str, FittedModel]) -> No
 
 
 def count_parallel_heads(fitter: Fitter) -> int:
-    """Return how many heads are to be fitted at a time.
+    """Return how many heads are fitted in parallel.
 
-    Only what takes longer than a process needs to start is worth one. Large logs lie in files that
-    processes do not share, and a GPU and trainings in several processes are shared out already.
+    Only trainings that take longer than the start of a process run in parallel. Heads are fitted
+    one after another if the samples are kept in memory-mapped files, which worker processes would
+    have to copy, or if a training already uses a GPU or several processes.
     """
     settings = fitter.settings
     trainings = [settings.training.get(name, TrainingConfig()) for name in settings.heads]
@@ -212,7 +217,7 @@ def count_parallel_heads(fitter: Fitter) -> int:
 
 
 def is_long_training(fitter: Fitter, name: str) -> bool:
-    """Return whether a head is trained through so many steps that a process pays."""
+    """Return whether the training of a head takes long enough for a separate process."""
     settings = fitter.settings
     if isinstance(settings.heads[name].build(fitter.signals.names), ClosedFormHead):
         return False
@@ -230,7 +235,7 @@ def is_long_training(fitter: Fitter, name: str) -> bool:
 
 
 _SerializedModel = tuple[ModelSpec, dict[str, Any], Tensor | None, dict[str, Tensor]]
-"""A fitted model as it goes from one process to another: numbers in place of modules."""
+"""A fitted model as passed between processes: its description and parameter values."""
 
 
 def _serialize_model(fitted_model: FittedModel) -> _SerializedModel:
@@ -250,7 +255,7 @@ def _deserialize_model(serialized: _SerializedModel) -> FittedModel:
 
 
 _fit_in_worker: Callable[[str, _SerializedModel], _SerializedModel]
-"""Fits a head on a baseline, in a process that `_initialize_worker` has prepared."""
+"""Function that fits a head on a baseline, set by `_initialize_worker` in each worker process."""
 
 
 def _initialize_worker(
@@ -263,6 +268,7 @@ def _initialize_worker(
 
     def fit_head_in_worker(name: str, serialized_baseline: _SerializedModel) -> _SerializedModel:
         with on_progress(progress_queue.put):
+            # built at the first head: its samples take memory, and a worker may get no head
             if not fitters:
                 fitters.append(Fitter(logs, settings, FitStore(folder), resolve_recipe=False))
             return _serialize_model(
@@ -278,14 +284,16 @@ def _submit_to_worker(name: str, serialized_baseline: _SerializedModel) -> _Seri
 
 @contextmanager
 def _forward_progress() -> Iterator[Any]:
-    """Hold a queue whose reports of progress reach who listens to this process."""
+    """Provide a queue that forwards progress reports of workers to the callback of this process."""
     callback = get_callback()
     stop_event = Event()
     progress_queue: Any = get_context("spawn").SimpleQueue()
 
-    def hand_on() -> None:
+    def forward_reports() -> None:
         with on_progress(callback):
             while (
+                # after the stop event the reports still in the queue are forwarded before the
+                # thread ends
                 not stop_event.wait(0.0 if not progress_queue.empty() else 0.1)
                 or not progress_queue.empty()
             ):
@@ -299,7 +307,7 @@ def _forward_progress() -> Iterator[Any]:
                         progress.score,
                     )
 
-    thread = Thread(target=hand_on, daemon=True)
+    thread = Thread(target=forward_reports, daemon=True)
     thread.start()
     try:
         yield progress_queue

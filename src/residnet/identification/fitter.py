@@ -82,11 +82,11 @@ class FitStore:
         self.training_folder = training_folder
 
     def load_finished(self, name: str) -> FittedModel | None:
-        """Return a head that an earlier, interrupted fit had finished; None where it had not."""
+        """Return a head that an interrupted fit had finished, or None."""
         return None
 
     def save(self, fitted_model: FittedModel) -> None:
-        """Keep a model that is done."""
+        """Save a finished model."""
 
 
 _FIRST_BASELINE = "baseline"
@@ -99,7 +99,7 @@ def find_reference_names(models: Iterable[FittedModel]) -> dict[str, str]:
     smallest validation error. Any other model refers to the first baseline, which has no reference.
     """
     models_by_name = {model.name: model for model in models}
-    # a baseline that diverged is the worse one, whatever its error
+    # the number of divergences precedes the error, which excludes diverged windows
     validation_scores = {
         name: (
             int(model.notes.get("validation_diverged", 0)),
@@ -145,10 +145,11 @@ class ValidationScorer:
     """Free-run scores of models on the windows of the validation logs.
 
     Args:
+        logs: prepared validation logs.
         config: evaluation settings with the `selection` protocol and the scales.
         dt: time step in s.
         velocity_limits: magnitude of the velocities [n] above which a free run has diverged.
-        use_overlapping_windows: overlapping windows, which use few logs better.
+        use_overlapping_windows: whether windows overlap, which uses short logs better.
 
     Raises:
         DataError: if no log is as long as a window of the protocol.
@@ -173,7 +174,7 @@ class ValidationScorer:
         )
 
     def __call__(self, model: HybridDynamics) -> Score:
-        """Return the divergences and the mean nrmse of the validation windows, run in float32."""
+        """Return the divergences and the mean NRMSE of the validation windows, run in float32."""
         candidate = Candidate("validated", "head", model)
         predictions = run_free_runs(
             [candidate], self.windows, self.logs, self.dt, self.velocity_limits, dtype=torch.float32
@@ -209,7 +210,7 @@ def find_harmful_member(members: Sequence[FittedModel]) -> FittedModel | None:
     """
     if len(members) < 2:
         return None
-    worst_member = max(members, key=lambda one: one.notes["validation"])
+    worst_member = max(members, key=lambda member: member.notes["validation"])
     sum_of_squares_of_others = sum(
         member.notes["validation"] ** 2 for member in members if member is not worst_member
     )
@@ -229,6 +230,7 @@ def select_by_free_run(
     Neighbours of the best solution are evaluated as long as the error decreases.
 
     Args:
+        model: model with the part.
         module: baseline or head that the solutions belong to.
         solutions: at least one; a single one is used without evaluation.
         score_model: free-run score on validation data; fewer divergences precede a smaller error.
@@ -244,6 +246,7 @@ def select_by_free_run(
             scored_solutions.append((solution, score_model(model)))
 
     attempt(solutions if len(solutions) > 1 else ())
+    # local search in the hyperparameters, around the best solution so far
     search_centre = _find_best_with_neighbours(scored_solutions)
     while search_centre is not None and search_centre[0].neighbours is not None:
         tried_choices = [solution.hyperparameters for solution, _ in scored_solutions]
@@ -296,6 +299,7 @@ class Fitter:
 
     Args:
         logs: prepared logs by split; `train` and `validation` are used.
+        settings: settings of the identification.
         store: storage of finished models.
         resolve_recipe: whether the recipe's parts are still to be derived from the logs.
         validation_in_training: whether training uses the validation logs, which then select
@@ -364,12 +368,12 @@ class Fitter:
         )
 
     def build_constant_velocity(self) -> FittedModel:
-        """Return the model that holds the velocities."""
+        """Return the model of constant velocities, the reference of all skill scores."""
         spec = self.build_spec(CONSTANT_VELOCITY, CONSTANT_VELOCITY, ZeroBaselineConfig())
         return self._save_and_reload(FittedModel(spec, spec.build(), {}))
 
     def fit_baseline(self, name: str = "baseline") -> FittedModel:
-        """Identify a baseline; refit it through rollouts where the settings ask for it."""
+        """Identify a baseline by least squares and, if set, refit it through rollouts."""
         spec = self.build_spec(name, "baseline", self.settings.all_baselines[name])
         model = spec.build()
         start_time = time.perf_counter()
@@ -402,7 +406,7 @@ class Fitter:
         coefficients: list[Coefficient],
         notes: dict[str, Any],
     ) -> tuple[list[Coefficient], torch.Tensor]:
-        """Move coefficients through rollouts, to their new table and covariance."""
+        """Refit coefficients through rollouts; return their new table and covariance."""
         refit_config = self.settings.refit[name]
         window_store = WindowStore.from_logs(self.training_logs, torch.float64)
         refitted = refit(
@@ -436,7 +440,7 @@ class Fitter:
         if finished_model is not None:
             return finished_model
         spec = self.build_spec(name, "head", self.settings.get_baseline_config(name))
-        # seeded by the head's name, so that adding a head changes no other
+        # the seed depends on the head's name only, so that another head does not change this one
         seed = self.settings.seed * 1_000 + sum(map(ord, name))
         torch.manual_seed(seed)
         model = spec.build_single_model()
@@ -454,7 +458,7 @@ class Fitter:
                 raise FitError(f"head {name}: {error}") from None
             notes = solution.hyperparameters | solution.notes | choice_notes
         else:
-            # its module imports Lightning, which a fit without networks must not wait for
+            # imported here because it imports Lightning, which takes seconds to load
             from residnet.training.heads import train
 
             training_config = self.settings.training.get(name, TrainingConfig())
@@ -503,7 +507,7 @@ class Fitter:
         excluded_names = [member.name for member in members if member not in retained_members]
         if excluded_names:
             log_message(
-                f"  {name}: {', '.join(excluded_names)} diverged on validation logs and is left out"
+                f"  {name}: {', '.join(excluded_names)} diverged on validation logs and is excluded"
             )
         ensemble = (
             self._build_ensemble(name, retained_members) if len(retained_members) > 1 else None
@@ -523,12 +527,14 @@ class Fitter:
             )
             if reduced_ensemble.notes["validation"] >= ensemble.notes["validation"]:
                 break
-            log_message(f"  {name}: without {worst_member.name} it errs less on validation logs")
+            log_message(
+                f"  {name}: excluding {worst_member.name} reduces its error on validation logs"
+            )
             excluded_names = [*excluded_names, worst_member.name]
             retained_members = remaining_members
             ensemble = reduced_ensemble if len(retained_members) > 1 else None
         if ensemble is None:
-            raise FitError("no mean errs less on validation logs than one of its members")
+            raise FitError("no mean has a smaller error on validation logs than one of its members")
         ensemble.notes["left_out"] = excluded_names
         return self._save_and_reload(ensemble)
 
@@ -554,15 +560,15 @@ class Fitter:
         return FittedModel(spec, model, notes)
 
     def _validation_notes(self, model: HybridDynamics) -> dict[str, Any]:
-        """Notes on a model's free runs over the validation logs."""
+        """Return the validation error and the number of diverged windows for the notes."""
         score = self.score_on_validation(model)
         return {"validation": score.error, "validation_diverged": score.diverged}
 
     def _save_and_reload(self, fitted_model: FittedModel) -> FittedModel:
         """Store a model and return the reloaded one.
 
-        The evaluated model is then bit for bit the stored one, and a resumed fit gives the same
-        results.
+        The evaluated model is then identical to the stored one in every bit, and a resumed fit
+        gives the same results.
         """
         reloaded = replace(
             fitted_model, model=rebuild_module(fitted_model.spec, fitted_model.model)
@@ -572,20 +578,20 @@ class Fitter:
 
 
 def check_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
-    """Check that prepared logs hold the manoeuvres, folds and windows that a fit asks for.
+    """Check that prepared logs hold the manoeuvres, folds and windows that a fit requires.
 
-    The fit itself calls the same functions, so that it refuses with the same lines.
+    The fit calls the same functions and therefore refuses with the same messages.
 
     Returns:
-        What would fit the parts, nothing fitted yet.
+        The fitter of the logs; no part is fitted yet.
 
     Raises:
-        DataError: where a split holds no sample, or no window of a protocol or of a training.
-        FitError: where manoeuvres are missing that a baseline is fitted on, are too few for the
-            folds of a head, or too short for a refit.
+        DataError: if a split holds no sample, or no window of a protocol or of a training.
+        FitError: if manoeuvres that a baseline requires are missing, too few for the folds of a
+            head, or too short for a refit.
     """
     fitter = Fitter(logs, settings, FitStore())
-    # with the parts of the recipe for these logs, where it is asked for
+    # the fitter's settings include the parts of a recipe, which follow from the logs
     settings = fitter.settings
     dt = settings.prepare.grid.step
     window_store = WindowStore.from_logs(fitter.training_logs)

@@ -50,11 +50,11 @@ class SplitEvaluation:
 
     Attributes:
         split: train, validation, test or external.
-        logs: of the split, in the order that the windows count them in.
-        free_runs: free runs by protocol; protocols without a window are left out.
-        rows: of metrics.json, without `selected`.
+        logs: logs of the split; `log_index` of the windows refers to this order.
+        free_runs: free runs by protocol, without protocols that have no window.
+        rows: rows of metrics.json, without `selected`.
         limits_by_protocol: contents of limits.json by protocol.
-        bands_by_model: that the models were judged with, by model and protocol.
+        bands_by_model: prediction intervals of the models, by model and protocol.
     """
 
     split: str
@@ -66,7 +66,7 @@ class SplitEvaluation:
 
     @property
     def metrics_table(self) -> pd.DataFrame:
-        """The rows as a table, see `residnet.evaluation.metrics.metrics_table`."""
+        """The rows as a table, see `residnet.evaluation.metrics.build_metrics_table`."""
         return build_metrics_table(self.rows)
 
 
@@ -77,13 +77,14 @@ def evaluate_splits(
     dt: float,
     velocity_limits: np.ndarray,
 ) -> dict[str, SplitEvaluation]:
-    """Free-run models over all protocols of several splits, all windows of a model side by side.
+    """Free-run models over all protocols of several splits, all windows of a model in one batch.
 
     Args:
-        models: to be judged, see `make_candidates`.
-        splits: their logs, at least one each.
-        dt: of the grid in s.
-        velocity_limits: size of what moves [n] beyond which a free run has diverged.
+        models: models to evaluate, see `make_candidates`.
+        splits: logs by split, at least one each.
+        config: protocols and scales.
+        dt: time step of the grid in s.
+        velocity_limits: magnitude of the velocities [n] above which a free run has diverged.
     """
     windows_by_split_and_protocol = {
         (split, name): [
@@ -95,6 +96,7 @@ def evaluate_splits(
         for name, protocol in config.protocols.items()
     }
     all_logs = [log for logs in splits.values() for log in logs]
+    # windows of all splits refer to one list of logs while they are run as one batch
     log_offsets = dict(
         zip(splits, np.cumsum([0, *map(len, splits.values())]).tolist(), strict=False)
     )
@@ -132,11 +134,11 @@ def evaluate_splits(
 def make_candidates(
     fitted_models: Iterable[FittedModel], data: MeasuredLogs | SimulatedTrials | None = None
 ) -> list[Candidate]:
-    """Return the models to judge, each with the one that it is compared with.
+    """Return the models to evaluate, each with its reference.
 
     Args:
-        data: where the logs came from; simulated trials add the plant that made them as
-            `plant_candidate`.
+        fitted_models: fitted models.
+        data: source of the logs; simulated trials add the plant that generated them.
     """
     models_by_name = {fitted_model.name: fitted_model for fitted_model in fitted_models}
     reference_names = find_reference_names(models_by_name.values())
@@ -159,7 +161,7 @@ def make_candidates(
 
 
 def trajectory_member_names(fitted_model: FittedModel) -> tuple[str, ...]:
-    """Return the models whose trajectories a model is the mean of; empty for any other."""
+    """Return the members of an ensemble that averages trajectories; empty for other models."""
     return tuple(
         member.name
         for member in fitted_model.spec.members
@@ -181,17 +183,17 @@ def spread_member_names(fitted_models: Iterable[FittedModel]) -> tuple[str, ...]
 
 
 def has_closed_form_head(fitted_model: FittedModel) -> bool:
-    """Return whether a model has a head of closed form that is solved again in no time."""
+    """Return whether a model has a closed-form head that is quickly solved again."""
     head = fitted_model.model.head
     is_quickly_refitted = isinstance(head, ClosedFormHead) and not isinstance(head, EquationHead)
     return fitted_model.spec.role == "head" and is_quickly_refitted
 
 
 def _make_plant_candidate(data: SimulatedTrials) -> Candidate | None:
-    """The plant that made the logs; None where a log does not show all of its state."""
+    """Return the plant that generated the logs; None if its state is not completely logged."""
     plant = build_plant(data.vessel, data.disturbance)
     if any(name.startswith("_") for name in plant.state_names):
-        # no log shows what is under way in a delay line, so that the plant could not start from one
+        # the content of a delay line is not logged, so that a free run could not start from a log
         return None
     command_names = plant.input_names[: plant.n_commands]
     model = RecordedPlantDynamics(plant, data.step, data.substeps)
@@ -202,11 +204,11 @@ def _make_plant_candidate(data: SimulatedTrials) -> Candidate | None:
 
 
 _DIVERGENCE_CHECKED_SPLITS = ("train", "validation")
-"""Splits whose divergences exclude a model from the selection; test data must not."""
+"""Splits in which a divergence excludes a model from the selection; test data must not count."""
 
 
 def model_family(fitted_model: FittedModel) -> str:
-    """Return what a model is, in the words of `residnet.evaluation.selection.FAMILIES`."""
+    """Return the family of a model, one of `residnet.evaluation.selection.FAMILIES`."""
     if isinstance(fitted_model.model, MeanOfTrajectories):
         return "ensemble"
     if fitted_model.spec.role != "head":
@@ -232,11 +234,11 @@ class IdentifiedModels(Mapping[str, FittedModel]):
     """The fitted models by name: constant_velocity, baselines, heads and ensembles, in this order.
 
     Attributes:
-        settings: of the fit.
-        models: by name.
-        velocity_limits: size of what moves [n] beyond which a free run has diverged.
-        training_logs: the logs that fitted them.
-        validation_in_training: whether the validation logs are among them.
+        settings: settings of the fit.
+        models: fitted models by name.
+        velocity_limits: magnitude of the velocities [n] above which a free run has diverged.
+        training_logs: logs used in training.
+        validation_in_training: whether they include the validation logs.
     """
 
     settings: FitSettings
@@ -285,15 +287,16 @@ class IdentifiedModels(Mapping[str, FittedModel]):
     def select_models(self, evaluations: Mapping[str, SplitEvaluation]) -> Selection:
         """Choose a single model and an ensemble by their free runs over the validation logs.
 
-        The recipe chooses neither: the evidence is smaller than its noise. Its hull is the single
-        model, unless it diverged in a window, and its mean the ensemble.
+        With the recipe nothing is chosen, since the differences between its models are smaller than
+        their uncertainty: the hull is the single model, unless it diverged in a window, and the
+        mean of the trajectories is the ensemble.
 
         Args:
-            evaluations: what `evaluate_splits` returned, by split; `validation` is needed, and
-                divergences on `training_logs` count where it is there.
+            evaluations: results of `evaluate_splits` by split; `validation` is required, and
+                divergences in `train` count if it is included.
 
         Raises:
-            UsageError: where the validation logs have not been judged.
+            UsageError: if the validation logs have not been evaluated.
         """
         config = self.settings.evaluation
         validation = evaluations.get("validation")
@@ -365,7 +368,7 @@ class IdentifiedModels(Mapping[str, FittedModel]):
         if hull_candidate is None or hull_candidate.n_diverged:
             return selection
         faults_text = (
-            f"; against it speaks: {'; '.join(hull_candidate.faults)}"
+            f", with these faults: {'; '.join(hull_candidate.faults)}"
             if hull_candidate.faults
             else ""
         )
@@ -387,7 +390,7 @@ class IdentifiedModels(Mapping[str, FittedModel]):
 
 @dataclass(frozen=True)
 class TeacherForcedRun:
-    """What a model computes along the measured states of a log, its memory empty at first.
+    """Accelerations of a model along the measured states of a log, with zero initial memory.
 
     Attributes:
         channels: channels that baseline and head see [T, nz].
@@ -488,7 +491,7 @@ def build_term_table(
 
 
 def _concatenate_table(column_names: list[str], rows: list[tuple[Any, ...]]) -> pd.DataFrame:
-    """Return a table of rows, each with some arrays of one length in the place of a number."""
+    """Return a table from rows of scalars and arrays; scalars are repeated along the arrays."""
     import pandas as pd
 
     tables = [pd.DataFrame(dict(zip(column_names, row, strict=True))) for row in rows]
@@ -512,7 +515,8 @@ def build_goodness_rows(
     Large data sets are thinned to evenly spaced logs with 200,000 samples.
 
     Args:
-        logs: by split; training and test logs are used.
+        fitted_models: fitted models.
+        logs: prepared logs by split; training and test logs are used.
         dt: time step in s.
     """
     models_by_name = {fitted_model.name: fitted_model for fitted_model in fitted_models}
@@ -552,7 +556,7 @@ def build_goodness_rows(
 
 
 def _trainable_segments(log: PreparedLog, values: np.ndarray) -> list[np.ndarray]:
-    """Return values [T, n] of each stretch that may be learned from."""
+    """Return the values [T, n] of each trainable segment."""
     return [
         values[segment_start:segment_stop]
         for segment_start, segment_stop in zip(*find_runs(log.trainable), strict=True)
@@ -560,7 +564,7 @@ def _trainable_segments(log: PreparedLog, values: np.ndarray) -> list[np.ndarray
 
 
 def _count_parameters_by_axis(model: HybridDynamics) -> list[float]:
-    """Fitted parameters of each axis, baseline and head together."""
+    """Return the number of fitted parameters of each axis, of baseline and head together."""
     if isinstance(model, MeanOfTrajectories):
         member_counts = map(_count_parameters_by_axis, model.members)
         return [sum(counts_of_axis) for counts_of_axis in zip(*member_counts, strict=True)]

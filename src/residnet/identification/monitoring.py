@@ -40,15 +40,15 @@ from residnet.preprocessing.prepare import PreparedLog
 
 
 def innovation_columns(dof: DegreesOfFreedom) -> dict[str, int]:
-    """Return what innovations are taken of, and its columns in states."""
+    """Return the channels of the innovations with their columns in states."""
     columns = {name: dof.state_names.index(name) for name in dof.active_states}
     return columns | ({"heading": HEADING} if dof.has_heading else {})
 
 
 _WARMUP_DURATION = 5.0
-"""Time in s before a window that warms a memory up."""
+"""Measured time in s before a window from which the memory of a head is initialised."""
 _MAX_BLOCKS = 5
-"""Parts of a window whose means count."""
+"""Largest number of blocks of a window; errors are averaged over each, which reduces noise."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class MeasuredWindow:
     Attributes:
         y: states [K + 1, 3 + n].
         w: inputs held over each step [K, m].
-        past_y: states before it that warm a memory up [P, 3 + n].
-        past_w: inputs before it [P, m].
+        past_y: states before the window, which initialise a memory [P, 3 + n].
+        past_w: inputs before the window [P, m].
     """
 
     y: np.ndarray
@@ -71,16 +71,17 @@ class MeasuredWindow:
 def compute_innovations(
     model: HybridDynamics, windows: Sequence[MeasuredWindow], changes: Sequence[SystemChange]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return innovations [B, k] and what a unit of each change adds to them [B, C, k].
+    """Return innovations [B, k] and their derivatives by the size of each change [B, C, k].
 
     Args:
         model: float64, in evaluation mode.
-        windows: B windows of one length, with pasts of one length.
-        changes: C of them.
+        windows: B windows of equal length, with pasts of equal length.
+        changes: C changes.
     """
     y = torch.from_numpy(np.stack([window.y for window in windows]))
     w = torch.from_numpy(np.stack([window.w for window in windows]))
     no_change = SystemChange("none", "", "", 1.0)
+    # the nominal run and all changed ones are one batch: C + 1 blocks of B rows
     all_changes = [no_change, *changes]
     n_windows = len(windows)
     n_steps = w.shape[1]
@@ -110,7 +111,8 @@ def compute_innovations(
             x0, w.repeat(n_changes, 1, 1), initial_memory.repeat(n_changes, 1)
         )
     predicted_states = predicted_states.reshape(n_changes, n_windows, n_steps + 1, -1)
-    # what a sensor shows is taken of the prediction: noise of the measurement is in the error too
+    # sensor faults are computed from predicted states: with measured states, their effects would be
+    # correlated with the measurement noise in the innovations
     mean_accelerations = (
         block_average @ predicted_states[0].diff(dim=1)[..., DYNAMIC_STATES] / model.dt
     )
@@ -174,7 +176,7 @@ def make_measured_windows(log: PreparedLog, n_steps: int, n_warmup: int) -> list
             & (log.segment[window_start] >= 0)
         )
         if not is_trusted.all():
-            # the next window begins behind the last sample that is not to be trusted
+            # the next window starts after the last unusable sample
             window_start = row_slice.start + int(np.flatnonzero(~is_trusted)[-1]) + 1 + n_warmup
             continue
         windows.append(
@@ -190,14 +192,14 @@ def make_measured_windows(log: PreparedLog, n_steps: int, n_warmup: int) -> list
 
 
 def count_warmup_samples(model: HybridDynamics) -> int:
-    """Return the samples before a window that warm a model's memory up; 0 where it has none."""
+    """Return the number of samples that initialise the memory of a model; 0 without memory."""
     return round(_WARMUP_DURATION / model.dt) if model.n_state else 0
 
 
 _SHRINKAGE = 0.1
-"""Share of the diagonal in the covariance of innovations."""
+"""Shrinkage of the covariance of innovations towards its diagonal."""
 PRIOR_STD = 15.0
-"""Standard deviation of what a model has always got wrong, in the causes' own small sizes."""
+"""Prior standard deviation of the bias of a model, in units of the `size` of each change."""
 
 
 @dataclass(frozen=True)
@@ -254,6 +256,7 @@ def compute_robust_score_sums(
     scores, informations, squares = zip(*sums_by_look, strict=True)
     score = np.sum(scores, axis=0)
     information = np.sum(informations, axis=0)
+    # the most plausible sizes for each window alone; the rest of the square is unexplained
     estimated_sizes = np.linalg.solve(information + prior_precision, score[..., None])[..., 0]
     unexplained_squares = np.sum(
         [squares_of_look.sum(axis=1) for squares_of_look in squares], axis=0
@@ -280,6 +283,7 @@ def marginalise(
     """
     target_information = information[..., :n_target_changes, :n_target_changes]
     cross_information = information[..., n_target_changes:, :n_target_changes]
+    # Schur complement: information about the changes that wind and current do not also explain
     regression_coefficients = np.linalg.solve(
         information[..., n_target_changes:, n_target_changes:] + prior_precision, cross_information
     )
@@ -298,18 +302,20 @@ def marginalise(
 def estimate_model_bias(
     innovation: np.ndarray, effects: np.ndarray, hypotheses: Sequence[SystemChange], n_channels: int
 ) -> np.ndarray:
-    """Return what a model has always got wrong: a size [Q, 4] of each cause for each channel.
+    """Return the bias of a model on clean logs: a size [Q, 4] of each change for each channel.
 
-    Channels may disagree: a model whose form is wrong has no single set of sizes that mends it.
+    The sizes differ between channels, since no single set of sizes corrects an error of the model
+    structure.
 
     Args:
         innovation: innovations [B, n] of clean logs.
-        effects: of a unit of each change [B, C, n], the causes first.
-        hypotheses: Q of them.
-        n_channels: number of channels that innovations are taken of.
+        effects: derivatives by the size of each change [B, C, n], hypotheses first.
+        hypotheses: Q changes.
+        n_channels: number of channels of the innovations.
     """
     n_causes = len(hypotheses)
-    # sensors are taken to be right: how they are wrong looks like the motion itself
+    # clean logs are assumed to have correct sensors: a sensor fault such as a gain is nearly
+    # collinear with the motion itself and would absorb other biases
     prior_std = np.array([0.0 if cause.sensor else cause.size * PRIOR_STD for cause in hypotheses])
     bias_by_channel = np.zeros((n_causes, n_channels))
     for channel in range(n_channels):
@@ -331,7 +337,7 @@ def estimate_model_bias(
 
 def compute_whitening_matrix(innovations: np.ndarray, n_parts: int) -> np.ndarray:
     """Return the matrix [n, n] that makes innovations [B, parts n] of clean logs uncorrelated."""
-    # windows that ran away were made nothing of
+    # windows with a diverged free run have zero innovations, see `compute_innovations`
     innovations = innovations[(innovations != 0.0).any(axis=1)]
     innovations = innovations.reshape(len(innovations) * n_parts, -1)
     second_moment = innovations.T @ innovations / len(innovations)
@@ -347,9 +353,10 @@ _NOISE_VARIANCE_GRID = np.geomspace(1.0, 30.0, 25)
 _SIZE_VARIANCE_GRID = np.concatenate(([0.0], np.geomspace(1e-4, 1e3, 40)))
 """Grid of size variances, relative to the median information of a group."""
 _MAX_DEVIANCE_DIFFERENCE = 1.0
-"""Twice the logarithm of the likelihood by which a larger scatter may fall short of the likeliest.
+"""Largest deviance, relative to the maximum likelihood, of an accepted larger scatter.
 
-That is one standard error: clean logs have fitted the model too, and look better than others.
+A difference of 1 is one standard error. The larger scatter is used because the model was fitted on
+the clean logs, so that they scatter less than new logs.
 """
 _TINY_INFORMATION = 1e-12
 """Avoids division by zero information."""
@@ -359,7 +366,7 @@ _HUBER_CONSTANT = 1.345
 It has 95 % efficiency for normal errors.
 """
 _HUBER_ITERATIONS = 8
-"""Of reweighting."""
+"""Number of reweighting iterations."""
 
 
 @dataclass(frozen=True)
@@ -387,7 +394,7 @@ class GroupScores:
         return np.diagonal(self.information, axis1=1, axis2=2) + _TINY_INFORMATION
 
     def subtract_bias(self, bias: np.ndarray) -> GroupScores:
-        """Return the groups without what sizes [Q], such as clean logs ask for, say of them."""
+        """Return the groups without the scores expected from a bias [Q] of the sizes."""
         return replace(self, score=self.score - self.information @ bias)
 
     def sum_by_log(self, values: np.ndarray) -> np.ndarray:
@@ -421,7 +428,7 @@ class ScoreDistribution:
     inflation_factor: float = 1.0
 
     def variance(self, diagonal_information: np.ndarray) -> np.ndarray:
-        """Return the variance of scores [..., Q] whose information is `own` [..., Q]."""
+        """Return the variance of scores [..., Q] with diagonal information [..., Q]."""
         return np.asarray(
             self.noise_factor * diagonal_information + self.size_variance * diagonal_information**2
         )
@@ -458,9 +465,10 @@ class ScoreDistribution:
         )
 
     def weigh_by_log(self, groups: GroupScores) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return scores [K, ..., Q] and information [K, Q, Q] of each log, weighed by the scatter.
+        """Return scores [K, ..., Q] and information [K, Q, Q] of each log, weighted by the scatter.
 
-        Groups of one log say in part the same: how many times over [K, Q] comes with them.
+        The groups of one log are correlated. The third result is the variance inflation by this
+        correlation (design effect 1 + (m - 1) rho) [K, Q].
         """
         diagonal_information = groups.diagonal_information
         variance = self.variance(diagonal_information)
@@ -506,8 +514,8 @@ class ScoreDistribution:
 def _huber_mean(weighted_sizes: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the size [Q] on which logs agree, and the weight behind it (P. J. Huber, 1964).
 
-    A vessel that has changed shows it in all logs. One that is at odds with the others, as a rare
-    manoeuvre may be, counts by how far it is and not by the square of that.
+    A change of the vessel appears in all logs. A single log with a deviating size, such as one with
+    a rare manoeuvre, has a linear instead of a quadratic influence.
 
     Args:
         weighted_sizes: sizes times weights of the logs [K, Q].
@@ -541,13 +549,14 @@ def fit_score_distribution(groups: GroupScores) -> ScoreDistribution:
     standardized_scores = score / np.sqrt(variance)
     second_moment = standardized_scores.T @ standardized_scores / n_groups
     root_mean_squares = np.sqrt(np.diag(second_moment)) + _TINY_INFORMATION
-    # few groups say little about how scores scatter together
+    # correlations estimated from few groups are unreliable: shrinkage towards independence
     shrinkage_weight = n_groups / (n_groups + n_causes)
     correlation = shrinkage_weight * second_moment / np.outer(
         root_mean_squares, root_mean_squares
     ) + (1.0 - shrinkage_weight) * np.eye(n_causes)
     np.fill_diagonal(correlation, 1.0)
-    # what pairs of groups of one log have in common; where no log holds two, all is taken for it
+    # covariance of pairs of groups within logs: (sum)^2 - sum of squares = sum over pairs; without
+    # any pair all variance is assumed to be common, the conservative case
     common_square, common_weight = (
         (groups.sum_by_log(values) ** 2 - groups.sum_by_log(values**2)).sum(axis=0)
         for values in (diagonal_information * score / variance, diagonal_information**2 / variance)
@@ -597,7 +606,7 @@ def estimate_score_inflation(
 def _fit_variance_components(
     scores: np.ndarray, diagonal_information: np.ndarray
 ) -> tuple[float, float]:
-    """Return the variances of noise and sizes that scores [G] ask for, one standard error above."""
+    """Return the variances of noise and sizes of scores [G], at their upper standard error."""
     size_variances = _SIZE_VARIANCE_GRID / np.median(diagonal_information)
     variance = (
         _NOISE_VARIANCE_GRID[:, None, None] * diagonal_information[None, None, :]
@@ -605,7 +614,7 @@ def _fit_variance_components(
     )
     log_determinant = np.log(variance).sum(axis=2)
     deviance = log_determinant + (scores**2 / variance).sum(axis=2)
-    # few logs leave open how much others scatter
+    # the largest scatter among the acceptable ones, since few logs determine it poorly
     is_acceptable = deviance <= deviance.min() + _MAX_DEVIANCE_DIFFERENCE
     i, j = np.unravel_index(
         int(np.where(is_acceptable, log_determinant, -np.inf).argmax()), deviance.shape
@@ -614,31 +623,32 @@ def _fit_variance_components(
 
 
 _LOOKS_PER_STRETCH = 3.0
-"""Independent looks that a sliding stretch gives while it slides by its own length."""
+"""Equivalent number of independent tests while a sliding stretch moves by its own length."""
 _N_FOLDS = 5
 """Number of folds of clean windows for cross-fitted scales."""
 _MIN_GROUPS = 5
-"""Groups of clean windows below which nothing can be said about false alarms."""
+"""Smallest number of groups of clean windows from which a false alarm rate can be estimated."""
 _N_WINDOW_PARTS = 5
-"""Parts that a window is also looked at in, each from its own measured start."""
+"""Number of parts of a window that are also free-run, each from its measured start."""
 _MIN_PART_STEPS = 10
-"""Steps of a part below which windows are looked at as a whole only."""
+"""Smallest number of steps of a part; shorter windows are not divided."""
 _DIVERGENCE_FACTOR = 3.0
+"""Innovation above which a free run has diverged, relative to the largest clean velocity."""
 _MAX_HEADING_INNOVATION = 2.0 * np.pi
-"""Innovation beyond which a free run ran away: in largest clean velocities; turns of heading."""
+"""Innovation of the heading above which a free run has diverged."""
 _MAX_DIVERGED_SHARE = 0.5
-"""Share of clean windows that may run away."""
+"""Largest share of clean windows with a diverged free run."""
 _CURRENT_STD = 0.5
 _PUSH_STD = 0.05
-"""Standard deviations of a current in m/s and of a push in m/s^2 that are thought possible."""
+"""Prior standard deviations of a current in m/s and of a push by the wind in m/s^2."""
 
 
 class MonitorConfig(Config):
     """Settings of a monitor.
 
     Attributes:
-        window: length of the free runs whose ends are compared, in s.
-        stretch: time that is looked back over, in s.
+        window: length of the free runs, in s.
+        stretch: length of the recent period that is tested, in s.
         false_alarm: mean time between false alarms, in s.
         group: length of the stretches of clean logs whose scatter sets the scale, in s.
     """
@@ -651,15 +661,14 @@ class MonitorConfig(Config):
 
 @dataclass(frozen=True)
 class FaultHypothesis:
-    """A cause, how well it explains the last minutes, and how large it would be.
+    """A possible change with its test statistic and estimated size.
 
     Attributes:
-        change: the cause.
-        test_statistic: of its test by the scores of all causes, in standard deviations of clean
-            logs.
-        estimated_size: of the change, in its unit.
+        change: the change.
+        test_statistic: statistic of the score test, in standard deviations of clean logs.
+        estimated_size: size of the change in its unit.
         standard_error: standard error of the size.
-        explained_square: square that it alone takes off the scores of all causes.
+        explained_square: reduction of the joint score statistic by this change alone.
     """
 
     change: SystemChange
@@ -671,13 +680,13 @@ class FaultHypothesis:
 
 @dataclass(frozen=True)
 class MonitorVerdict:
-    """What a monitor says after a window.
+    """Verdict of a monitor after a window.
 
     Attributes:
-        is_alarm: whether the largest score exceeds the threshold; of a watcher also where it has
-            not fallen clearly below it since it did.
-        threshold: of the scores.
-        hypotheses: causes, the one that explains most first.
+        is_alarm: whether the largest score exceeds the threshold; an online detector keeps the
+            alarm until the scores are clearly below the threshold.
+        threshold: threshold of the scores.
+        hypotheses: possible changes in descending order of their explained squares.
         innovation_rms: root mean square of the whitened innovations of each channel; 1 on clean
             logs.
     """
@@ -689,8 +698,8 @@ class MonitorVerdict:
 
     @property
     def max_score(self) -> float:
-        """The largest score of any cause."""
-        return max(suspect.test_statistic for suspect in self.hypotheses)
+        """The largest score of any change."""
+        return max(hypothesis.test_statistic for hypothesis in self.hypotheses)
 
 
 _InnovationsAndEffects = tuple[np.ndarray, np.ndarray]
@@ -700,7 +709,10 @@ class ChangeDetector:
     """Statistics of clean logs, and score tests against them.
 
     Args:
-        clean_windows: windows of clean logs, ordered by log; all of one length.
+        spec: description of the model.
+        model: the model.
+        clean_windows: windows of clean logs, ordered by log; all of equal length.
+        config: settings of the monitor.
 
     Raises:
         DataError: if there are too few clean logs.
@@ -732,8 +744,7 @@ class ChangeDetector:
         if len(indexed_groups) < _MIN_GROUPS:
             raise DataError(
                 f"the clean logs hold {len(indexed_groups)} stretches of {config.group:g} s; a"
-                f" monitor"
-                f" needs at least {_MIN_GROUPS} to know how innovations scatter"
+                f" monitor needs at least {_MIN_GROUPS} to estimate the scatter of innovations"
             )
         log_of_group = np.array([k for k, _ in indexed_groups])
         max_states = np.max(
@@ -760,10 +771,9 @@ class ChangeDetector:
         )
         if has_diverged.mean() > _MAX_DIVERGED_SHARE:
             raise DataError(
-                f"model {spec.name}: free runs of {config.window:g} s run away in"
-                f" {has_diverged.sum()} of"
-                f" {len(has_diverged)} clean windows; watch with another model, or with a shorter"
-                f" window"
+                f"model {spec.name}: free runs of {config.window:g} s diverge in"
+                f" {has_diverged.sum()} of {len(has_diverged)} clean windows; use another model or"
+                f" a shorter window"
             )
         model_bias = self._estimate_bias(innovations_by_group)
         self.whitening_matrices = [
@@ -780,10 +790,10 @@ class ChangeDetector:
             for i, parts in enumerate(self.part_counts)
         ]
 
-        def learned(
+        def estimate_size_bias(
             model_bias: list[np.ndarray], is_used: np.ndarray
         ) -> tuple[np.ndarray, GroupScores]:
-            """Return the sizes [Q] that groups ask for together, and all groups without these."""
+            """Return the joint size bias [Q] of the used groups, and all groups without it."""
             group_scores = self._to_group_scores(
                 log_of_group,
                 [
@@ -791,7 +801,7 @@ class ChangeDetector:
                     for innovations_of_group in innovations_by_group
                 ],
             )
-            # two causes that are wrong alike, such as damping and gain, must not look like one
+            # the prior regularises changes with similar effects, such as damping and gain
             regularized_information = group_scores.information[is_used].sum(axis=0) + np.diag(
                 prior_precisions
             )
@@ -800,15 +810,16 @@ class ChangeDetector:
             )
             return size_bias, group_scores.subtract_bias(size_bias)
 
-        self.bias_by_fold = [(model_bias, learned(model_bias, log_of_group >= 0)[0])]
-        # groups of one log are alike
+        self.bias_by_fold = [(model_bias, estimate_size_bias(model_bias, log_of_group >= 0)[0])]
+        # groups of one log are correlated, so that folds consist of whole logs if there are enough
         fold_of_group = (
             log_of_group
             if len(set(log_of_group)) >= _N_FOLDS
             else np.arange(len(innovations_by_group))
         ) % _N_FOLDS
         held_out_groups = []
-        # scores scatter more where others say what is always wrong, as they do in service
+        # cross-validation: in service the bias is estimated from other logs than those tested, so
+        # that scores scatter more than on the clean logs themselves
         for k in range(_N_FOLDS):
             model_bias = self._estimate_bias(
                 [
@@ -819,7 +830,7 @@ class ChangeDetector:
                     if innovations_of_group != k
                 ]
             )
-            bias, groups = learned(model_bias, fold_of_group != k)
+            bias, groups = estimate_size_bias(model_bias, fold_of_group != k)
             self.bias_by_fold.append((model_bias, bias))
             held_out_groups.append(vars(groups[fold_of_group == k]).values())
         cross_validated_groups = GroupScores(
@@ -832,13 +843,14 @@ class ChangeDetector:
                 cross_validated_groups, np.sort(fold_of_group), groups_per_stretch
             ),
         )
+        # two-sided threshold with a Bonferroni correction over tests in time and hypotheses
         n_looks = config.false_alarm / config.stretch * _LOOKS_PER_STRETCH * len(self.hypotheses)
         self.threshold = float(scipy.stats.t.isf(0.5 / n_looks, len(innovations_by_group) - 1))
 
     def _estimate_bias(
         self, innovations_by_group: Sequence[Sequence[_InnovationsAndEffects]]
     ) -> list[np.ndarray]:
-        """Return the mean innovations of the model, from groups of clean windows."""
+        """Return the model bias for each division of windows, from groups of clean windows."""
         bias_by_look = []
         for innovations_of_look in zip(*innovations_by_group, strict=True):
             innovation, effects = map(np.concatenate, zip(*innovations_of_look, strict=True))
@@ -871,19 +883,19 @@ class ChangeDetector:
         """Return the windows of a new log.
 
         Raises:
-            DataError: where it holds none.
+            DataError: if it holds none.
         """
         windows = make_measured_windows(log, self.window_steps, self.n_warmup)
         if not windows:
             raise DataError(
-                f"log {log.log.name}: holds no window of {self.config.window:g} s without a break;"
-                " shorten the window or leave the log out"
+                f"log {log.log.name}: holds no window of {self.config.window:g} s without a gap;"
+                " shorten the window or remove the log"
             )
         return windows
 
     @property
     def all_changes(self) -> list[SystemChange]:
-        """The causes, then what surrounds the vessel."""
+        """The changes of the vessel, then those of its environment."""
         return [*self.hypotheses, *self.nuisance_changes]
 
     def group_windows(self, windows: Sequence[MeasuredWindow]) -> list[Sequence[MeasuredWindow]]:
@@ -930,7 +942,7 @@ class ChangeDetector:
         effects = effects_by_change.reshape(n_windows, len(self.all_changes), -1)
         limits = np.tile(self.divergence_limits, innovation.shape[1] // len(self.divergence_limits))
         change_sizes = np.array([change.size for change in self.all_changes])[:, None]
-        # comparisons with what is no number are false
+        # comparisons with NaN are false, so that NaN counts as diverged
         is_innovation_valid = (np.abs(innovation) <= limits).all(axis=1)
         has_diverged = np.asarray(
             ~(is_innovation_valid & (np.abs(effects * change_sizes) <= limits).all(axis=(1, 2)))
@@ -966,7 +978,7 @@ class ChangeDetector:
     def _to_group_scores(
         self, log_indices: Sequence[int] | np.ndarray, sums_by_group: Sequence[ScoreSums]
     ) -> GroupScores:
-        """Return scores and information of the causes once the surroundings have had their part."""
+        """Return scores and information of the changes with the environment marginalised."""
         score, information = (
             np.stack([getattr(group_sums, name) for group_sums in sums_by_group])
             for name in ("score", "information")
@@ -979,10 +991,11 @@ class ChangeDetector:
     def evaluate(
         self, log_indices: Sequence[int], sums_by_group: Sequence[ScoreSums]
     ) -> MonitorVerdict:
-        """Return the verdict on groups of windows; wind and current are their own in each.
+        """Return the verdict on groups of windows, each with its own wind and current.
 
         Args:
-            log_indices: number of the log that each group is of.
+            log_indices: index of the log of each group.
+            sums_by_group: score sums of each group.
         """
         group_scores = self._to_group_scores(log_indices, sums_by_group).subtract_bias(
             self.bias_by_fold[0][1]
@@ -997,7 +1010,7 @@ class ChangeDetector:
             )
         ]
         is_alarm = max(hypothesis.test_statistic for hypothesis in hypotheses) > self.threshold
-        hypotheses.sort(key=lambda suspect: -suspect.explained_square)
+        hypotheses.sort(key=lambda hypothesis: -hypothesis.explained_square)
         n_windows = sum(group_sums.n_windows for group_sums in sums_by_group)
         squares = (
             np.sum([group_sums.squared_innovations for group_sums in sums_by_group], axis=0)
@@ -1023,12 +1036,12 @@ class OnlineChangeDetector:
         detector: statistics of clean logs.
     """
 
-    def __init__(self, watch: ChangeDetector) -> None:
-        self.detector = watch
-        self.n_warmup = watch.n_warmup
-        self.window_steps = watch.window_steps
-        self.windows_per_group = max(round(watch.config.group / watch.config.window), 1)
-        self.max_windows = max(round(watch.config.stretch / watch.config.window), 1)
+    def __init__(self, detector: ChangeDetector) -> None:
+        self.detector = detector
+        self.n_warmup = detector.n_warmup
+        self.window_steps = detector.window_steps
+        self.windows_per_group = max(round(detector.config.group / detector.config.window), 1)
+        self.max_windows = max(round(detector.config.stretch / detector.config.window), 1)
         self.recent_groups: deque[tuple[int, ScoreSums]] = deque()
         self.log_index = 0
         self.is_group_closed = True
@@ -1040,8 +1053,7 @@ class OnlineChangeDetector:
         """Take one sample: measured state [3 + n], and the inputs [m] held over the step after it.
 
         Returns:
-            The verdict where a window is complete, else None. A sample that is no measurement ends
-            the window that it lies in.
+            The verdict if a window is complete, else None. A sample with NaN ends its window.
         """
         if not (np.isfinite(y).all() and np.isfinite(w).all()):
             self.start_new_log()
@@ -1058,14 +1070,14 @@ class OnlineChangeDetector:
             states[: self.n_warmup],
             inputs[: self.n_warmup],
         )
-        # the next window begins where this one ends
+        # the last state of this window is the first of the next one
         n_retained = self.n_warmup + 1
         self.measured_states = self.measured_states[-n_retained:]
         self.measured_inputs = self.measured_inputs[-n_retained:]
         return self.update_with_sums(self.detector.compute_sums([window])[0])
 
     def start_new_log(self) -> None:
-        """Begin a new log, whose wind and current are its own."""
+        """Begin a new log with its own wind and current."""
         self.measured_states = []
         self.measured_inputs = []
         self.log_index += 1

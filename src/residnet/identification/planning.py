@@ -1,4 +1,9 @@
-"""Optimal design of the next manoeuvre for the parameters of a refitted baseline."""
+"""Optimal design of the next trials for the parameters of a refitted baseline.
+
+Sequential optimal experiment design: candidates are simulated with the fitted model, the Fisher
+information of each is computed from output sensitivities, and trials are chosen greedily by the
+reduction of the uncertainty of predictions per minute (Pronzato 2008, Automatica 44, 303-325).
+"""
 
 from __future__ import annotations
 
@@ -53,8 +58,9 @@ def sensitivity_information(
 ) -> Tensor:
     """Return the Fisher information of each run about the parameters, [R, P, P].
 
-    Sums over samples of squared scaled sensitivities of the velocities. Each run is divided into
-    free runs of `horizon` steps from measured states, as in a refit; a remainder is dropped.
+    It is the sum over samples of S^T S with the sensitivities S of the velocities, divided by their
+    scales. Each run is divided into free runs of `horizon` steps, as in a refit, because the
+    information of one long free run would overstate what a refit can use; a remainder is dropped.
 
     Args:
         model: a baseline without a head.
@@ -83,37 +89,38 @@ def sensitivity_information(
 
 
 def update_covariance(covariance: Tensor, information: Tensor) -> Tensor:
-    """Return the covariance [P, P] after data with some information [P, P].
+    """Return the covariance [P, P] after data with Fisher information [P, P].
 
-    Parameters without a covariance are unchanged.
+    Parameters with zero covariance keep it.
     """
+    # P (I + J P)^-1 equals (P^-1 + J)^-1 and also holds for a singular P
     identity = torch.eye(len(covariance), dtype=covariance.dtype)
     posterior: Tensor = covariance @ torch.linalg.inv(identity + information @ covariance)
     return posterior
 
 
 def compute_volume_gain(covariance: Tensor, information: Tensor) -> float:
-    """Return by how much the logarithm of the ellipsoid's volume shrinks (D-optimality)."""
+    """Return the reduction of the logarithm of the confidence ellipsoid's volume (D-optimality)."""
     identity = torch.eye(len(covariance), dtype=covariance.dtype)
     return 0.5 * float(torch.linalg.slogdet(identity + information @ covariance)[1])
 
 
 def compute_expected_uncertainty(covariance: Tensor, goal_weights: Tensor) -> float:
-    """Return the root mean square uncertainty of what a goal [P, P] weighs (A-optimality)."""
+    """Return the root mean square uncertainty of predictions with Gramian [P, P] (A-optimality)."""
     return float((goal_weights * covariance).sum().clamp(min=0.0).sqrt())
 
 
 _SIDE_STEER_SIGNS = {"port": 1.0, "stbd": -1.0, "starboard": -1.0, "left": 1.0, "right": -1.0}
-"""Which way more of a side's thrust turns the vessel."""
+"""Sign of the yaw moment of more thrust on the side that an input is named after."""
 
 
 class TrialLimits(Config):
-    """What a trial may use.
+    """Limits of the trials.
 
     Attributes:
-        time: that each candidate lasts, in s.
-        area: largest distance from the start, in m; none where not given.
-        speed: largest speed in m/s; none where not given.
+        time: duration of each candidate, in s.
+        area: largest distance from the start, in m; null for no limit.
+        speed: largest speed in m/s; null for no limit.
         rudder: largest share of full steer.
         count: number of trials to choose.
     """
@@ -130,8 +137,8 @@ def propose_manoeuvres(
 ) -> list[Manoeuvre]:
     """Return zigzags, turns, 3-2-1-1, multi-sines and speed changes at several drives.
 
-    Those that wait for a heading are for a vessel that turns, and several drives and changes of
-    speed for one that moves ahead.
+    Zigzags and turns, which depend on the heading, require a model of the heading; several drives
+    and speed changes require a model with a position.
     """
     manoeuvres: list[Manoeuvre] = []
     duration = trial_limits.time
@@ -218,14 +225,18 @@ def infer_input_shares(spec: ModelSpec) -> Mapping[str, InputShare]:
             shares[name] = InputShare(steer=max_input, limit=max_input)
         elif steer_sign:
             shares[name] = InputShare(
-                drive=0.6 * max_input, steer=0.6 * steer_sign * max_input, limit=max_input
+                # differential thrust: at full drive and full steer the sum is limited to max_input
+                drive=0.6 * max_input,
+                steer=0.6 * steer_sign * max_input,
+                limit=max_input,
             )
         else:
             shares[name] = InputShare(drive=max_input, limit=max_input)
     if spec.signals.dof.has_heading and not any(share.steer for share in shares.values()):
         raise UsageError(
-            f"model {spec.name}: none of {', '.join(spec.signals.inputs)} is known to steer; say"
-            " how inputs follow drive and steer in the run's `booklet.inputs`"
+            f"model {spec.name}: none of {', '.join(spec.signals.inputs)} is recognised as a"
+            " steering input by its name or unit; define the shares of drive and steer in the run's"
+            " `booklet.inputs`"
         )
     return shares
 
@@ -236,7 +247,7 @@ class PredictionGoal:
 
     Attributes:
         manoeuvres: the manoeuvres.
-        duration: duration of manoeuvres without an own one, s.
+        duration: duration of manoeuvres that define none, s.
         initial: initial states by name.
     """
 
@@ -247,15 +258,15 @@ class PredictionGoal:
 
 @dataclass(frozen=True)
 class CandidateTrial:
-    """A candidate as the model flies it.
+    """A candidate trial, simulated with the model.
 
     Attributes:
-        simulated_run: of the model.
-        information: summed squares of its sensitivities [P, P].
-        duration_minutes: that it lasts.
-        volume_gain_per_minute: logarithm by which it shrinks the ellipsoid of the parameters, per
-            minute.
-        uncertainty_reduction: share by which it narrows the intervals of predictions.
+        simulated_run: simulated manoeuvre.
+        information: Fisher information about the parameters [P, P].
+        duration_minutes: duration in minutes.
+        volume_gain_per_minute: reduction of the logarithm of the confidence ellipsoid's volume,
+            per minute.
+        uncertainty_reduction: relative reduction of the width of the prediction intervals.
         max_distance: largest distance from the start in m.
     """
 
@@ -269,12 +280,13 @@ class CandidateTrial:
 
 @dataclass(frozen=True)
 class TrialPlan:
-    """Candidates, the most telling per minute first, and the trials to run.
+    """Candidates in descending order of their information per minute, and the selected trials.
 
     Attributes:
         candidates: all candidates within the limits.
         selected_trials: the trials to run, in their order.
-        uncertainty_reduction: share by which they narrow the intervals of predictions together.
+        uncertainty_reduction: relative reduction of the width of the prediction intervals by all
+            selected trials.
     """
 
     candidates: Sequence[CandidateTrial]
@@ -298,10 +310,13 @@ def plan_trials(
     greedily, each given the previous ones.
 
     Args:
-        unidentified: parameters that the refit did not determine.
+        fitted_model: model with a refitted baseline.
+        unidentified: uncertainty of the refitted parameters.
+        refit_config: settings of the refit, whose horizon and correlation time are used.
         state_scales_array: scales of the velocities [n].
         input_shares: shares of the inputs in drive and steer.
         velocity_limits: velocities [n] above which a simulation has diverged.
+        trial_limits: limits and number of the trials.
         goal_manoeuvres: manoeuvres to predict; None for all candidates.
 
     Raises:
@@ -313,7 +328,7 @@ def plan_trials(
     horizon = round(refit_config.horizon / spec.dt)
     state_scales = torch.from_numpy(state_scales_array)
     manoeuvres = propose_manoeuvres(trial_limits, spec.signals.dof)
-    # those of one kind fly together
+    # manoeuvres of the same class are simulated as one batch
     all_candidates = PredictionGoal(
         sorted(manoeuvres, key=lambda one: one.kind), trial_limits.time, {}
     )
@@ -328,14 +343,14 @@ def plan_trials(
     ]
     if not allowed_trajectories:
         raise DataError(
-            f"none of {len(simulated_trajectories)} candidates stays within the limits; allow"
-            f" more area, speed or"
-            " rudder, or less time"
+            f"none of {len(simulated_trajectories)} candidates stays within the limits;"
+            " increase area, speed or rudder, or reduce the time"
         )
     grams = sensitivity_information(
         model, [(states, w) for _, states, w in allowed_trajectories], horizon, state_scales
     )
-    # so many samples hang together that they count as one
+    # Errors of successive samples are correlated over `correlation` seconds: a sample counts as
+    # dt / correlation independent ones. Information is in units of the residual variance.
     information_per_gram = spec.dt / refit_config.correlation / max(unidentified.square, 1e-12)
     goal_weights = grams.sum(dim=0)
     if goal_manoeuvres is not None:
@@ -349,17 +364,17 @@ def plan_trials(
     initial_uncertainty = compute_expected_uncertainty(unidentified.covariance, goal_weights)
     if not (np.isfinite(initial_uncertainty) and initial_uncertainty > 0.0):
         raise DataError(
-            f"model {fitted_model.name}: its refit leaves nothing open of the manoeuvres to"
-            f" predict, or"
-            f" it cannot fly them for {refit_config.horizon:g} s; add logs that cover their"
-            f" speeds and"
-            " rudder angles, or shorten refit.horizon"
+            f"model {fitted_model.name}: its refit leaves no uncertainty in the manoeuvres to"
+            f" predict, or it cannot simulate them for {refit_config.horizon:g} s; add logs that"
+            " cover their speeds and rudder angles, or shorten refit.horizon"
         )
     trials = []
     for (simulated_run, states, _), gram in zip(allowed_trajectories, grams, strict=True):
         duration_minutes = (len(states) - 1) * spec.dt / 60.0
         information = information_per_gram * gram
-        volume_gain_ = compute_volume_gain(unidentified.covariance, information) / duration_minutes
+        volume_gain_per_minute = (
+            compute_volume_gain(unidentified.covariance, information) / duration_minutes
+        )
         uncertainty_reduction = (
             1.0
             - compute_expected_uncertainty(
@@ -372,7 +387,7 @@ def plan_trials(
                 simulated_run,
                 information,
                 duration_minutes,
-                volume_gain_,
+                volume_gain_per_minute,
                 uncertainty_reduction,
                 _distance_from_start(states),
             )
@@ -383,6 +398,7 @@ def plan_trials(
     for _ in range(min(trial_limits.count, len(trials))):
         current_uncertainty = compute_expected_uncertainty(current_covariance, goal_weights)
 
+        # the gain of a trial depends on the previous ones: two equal trials add little
         def gain(
             trial: CandidateTrial,
             covariance: Tensor = current_covariance,
@@ -422,7 +438,7 @@ def _simulate_manoeuvres(
     actuators = GivenActuators(input_shares, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.input_columns, spec.hold, actuators)
     initial_state = actuated.make_initial_state(1)
-    # trials begin at a speed in the middle of what the model knows
+    # trials start at the middle of the training range of the speed, where the model is reliable
     initial_state[:, SURGE] = 0.5 * (max(spec.low[0], 0.0) + spec.high[0])
     for name, value in goal_manoeuvres.initial.items():
         initial_state[:, actuated.state_names.index(name)] = float(value)
@@ -440,11 +456,11 @@ def _simulate_manoeuvres(
 
 
 def _to_trajectory(simulated_run: ManoeuvreRun, signals: SignalsConfig) -> tuple[Tensor, Tensor]:
-    """Return states [T + 1, 3 + n] and inputs [T, m] of a flight."""
+    """Return states [T + 1, 3 + n] and inputs [T, m] of a simulated run."""
     motion = simulated_run.true_log
     channel_values: dict[str, Any] = motion.channels
     zeros = np.zeros(len(motion))
-    # what nobody commands, such as the wind, is left at rest
+    # inputs that are not commanded, such as the wind, are zero
     inputs = [
         channel_values.get(name, channel_values.get(command_name_for(name), zeros))
         for name in signals.input_columns

@@ -1,4 +1,4 @@
-"""Logs of a fit, prepared by split, and the checks that they can be learned from and judged on."""
+"""Preparation of the logs of a fit by split, and checks that they suffice for it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_l
 from residnet.training.current import estimate_currents, through_water
 
 _MAX_SAMPLES = 500_000
-"""Samples of a log that are prepared at once."""
+"""Largest number of samples of a log that are prepared at once, which bounds the memory used."""
 PreparedSplits = dict[str, paged.PageReleasingList[PreparedLog]]
 
 
@@ -30,10 +30,10 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
 
     Args:
         splits: canonical logs by split (train, validation, test).
-        settings: whose grid, masks, derivatives and inputs are used.
+        settings: settings of the fit: grid, masks, derivatives and inputs.
 
     Raises:
-        DataError: where a log has nothing to learn from or to predict.
+        DataError: if a training log has no usable sample, or another log no window of a protocol.
     """
     signals = settings.signals
     splits = mask_unexplained_idle(splits, settings.prepare, signals.input_columns)
@@ -50,9 +50,11 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
             if not log.trainable.any():
                 duration = len(log) * settings.prepare.grid.step
                 raise DataError(
-                    f"log {log.log.name}: its {duration:.1f} s hold no stretch as long as the"
-                    " derivative's window; leave it out or shorten prepare.derivative.window"
+                    f"log {log.log.name}: no part of its {duration:.1f} s without a gap is as"
+                    " long as the window of the derivative; remove the log from the splits or"
+                    " shorten prepare.derivative.window"
                 )
+            # training logs need no window: least squares uses single samples
             if log.split != "train":
                 check_window_fits(log, settings)
     _report_sources([log for logs in prepared.values() for log in logs])
@@ -62,10 +64,10 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
 def _report_sources(logs: Sequence[PreparedLog]) -> None:
     """Log which channels were not measured, and where spikes were removed."""
     for key, source_text in (
-        ("smoothed", "come from a smoother of the measured motion"),
+        ("smoothed", "are estimated by a smoother from the measured motion"),
         (
             "integrated",
-            "are integrated from the velocities: their errors are not errors of a measured"
+            "are integrated from the velocities: their errors are not relative to a measured"
             " position",
         ),
     ):
@@ -88,12 +90,12 @@ def mask_unexplained_idle(
 ) -> dict[str, Sequence[Log]]:
     """Mask unexplained motion with constant inputs in training logs, if the config asks for it.
 
-    Validation and test logs are returned unchanged: an error of such a stretch is an error of the
-    models.
+    Validation and test logs are returned unchanged, since errors of the models in such stretches
+    must count.
 
     Args:
         splits: canonical logs by split.
-        config: whose `dead_commands` is the decision of the user.
+        config: preparation settings; `dead_commands` says whether to mask.
         input_names: input channels of the model.
     """
     if config.dead_commands == "keep" or "train" not in splits:
@@ -137,32 +139,38 @@ def split_long_log(log: Log) -> list[Log]:
 
 
 def check_window_fits(log: PreparedLog, settings: FitSettings) -> None:
-    """Check that a log holds at least one window of some protocol.
+    """Check that a log holds at least one window of any protocol.
+
+    Args:
+        log: prepared log.
+        settings: settings of the fit with its protocols and grid.
 
     Raises:
-        DataError: where it does not.
+        DataError: if the log holds no window.
     """
     dt = settings.prepare.grid.step
     protocols = settings.evaluation.protocols
     if not any(protocol.make_windows(log, 0, dt) for protocol in protocols.values()):
         raise DataError(
             f"log {log.log.name}: lasts {len(log) * dt:.1f} s, its longest stretch without a gap"
-            f" {longest_segment_length(log) * dt:.1f} s: no window of a protocol"
-            f" ({', '.join(protocols)}) fits; fill gaps that may be interpolated, leave it out or"
-            " shorten evaluation.protocols"
+            f" {longest_segment_length(log) * dt:.1f} s: too short for a window of any protocol"
+            f" ({', '.join(protocols)}); fill gaps that may be interpolated, remove the log from"
+            " the splits or shorten evaluation.protocols"
         )
 
 
 def compute_velocity_limits(
     lower: np.ndarray, upper: np.ndarray, divergence_factor: float, dof: DegreesOfFreedom
 ) -> np.ndarray:
-    """Return the size [n] of what moves beyond which a free run has diverged.
+    """Return the magnitude of the velocities [n] above which a free run has diverged.
 
     Args:
-        lower: smallest training velocities (and inputs, which are not used), [n + m], from robust
-            quantiles (`residnet.preprocessing.prepare.envelope`).
-        upper: largest ones, [n + m].
-        divergence_factor: the multiple of the largest training value.
+        lower: lower ends of the training ranges of velocities and inputs [n + m], from robust
+            quantiles (`residnet.preprocessing.prepare.compute_training_ranges`); those of the
+            inputs are not used.
+        upper: upper ends of the training ranges [n + m].
+        divergence_factor: factor on the largest training value.
+        dof: degrees of freedom of the model.
     """
     return divergence_factor * dof.range_limits(lower, upper)
 
@@ -170,18 +178,19 @@ def compute_velocity_limits(
 def convert_to_motion_through_water(
     logs: Mapping[str, Sequence[PreparedLog]], settings: FitSettings
 ) -> tuple[PreparedSplits, list[dict[str, Any]]]:
-    """Return logs by split as motion through the water, and the table of their currents.
+    """Convert logs by split to motion through the water; return them with a table of currents.
 
-    Training and validation logs are moved by the currents that are fitted with the coefficients,
-    others by those that these coefficients see in them. Where the settings name no current, nothing
-    changes and the table is empty.
+    The currents of training and validation logs are fitted together with the coefficients of a
+    baseline. Those of the other logs are then estimated with these coefficients held fixed, so that
+    test logs do not influence the model. Without `current` in the settings the logs are returned
+    unchanged and the table is empty.
 
     Args:
         logs: prepared logs by split.
-        settings: of the fit; `current` says how currents are estimated.
+        settings: settings of the fit; `current` says how currents are estimated.
 
     Raises:
-        FitError: where the logs do not determine their currents.
+        FitError: if the logs do not determine their currents.
     """
     splits = {split: paged.PageReleasingList(split_logs) for split, split_logs in logs.items()}
     if settings.current is None:
@@ -189,6 +198,7 @@ def convert_to_motion_through_water(
     signals = settings.signals.build()
     baseline = settings.all_baselines[settings.current.baseline].build(signals.names)
     assert isinstance(baseline, RegressorBaseline), "the settings were validated"
+    # fitted logs first: estimate_currents takes the logs it fits and the others separately
     split_order = sorted(splits, key=lambda split: split not in ("train", "validation"))
     all_logs = [log for split in split_order for log in logs[split]]
     n_fitted = sum(len(logs[split]) for split in ("train", "validation"))
@@ -200,9 +210,8 @@ def convert_to_motion_through_water(
     )
     current_speeds = np.hypot(north, east)
     log_message(
-        f"  currents of {len(current_rows)} logs: {current_speeds.mean():.3f} m/s on average, at"
-        f" most"
-        f" {current_speeds.max():.3f} m/s"
+        f"  currents of {len(current_rows)} logs: {current_speeds.mean():.3f} m/s on average,"
+        f" at most {current_speeds.max():.3f} m/s"
     )
     converted_logs = iter(
         [

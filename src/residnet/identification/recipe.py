@@ -34,11 +34,11 @@ from residnet.preprocessing.prepare import TAIL_SHARE, PrepareConfig, PreparedLo
 _MIN_RELATIVE_SPREAD = 1e-3
 """Smallest spread of a varying channel, as a share of its magnitude."""
 _MIN_ASTERN_SHARE = 0.01
-"""Share of the samples from which a propeller that turns astern counts."""
+"""Smallest share of samples of each sign for an input to count as reversing."""
 _MAX_SEGMENT_SHARE = 0.6
-"""Share of a usual stretch that a free run may take, so that it can start at several places."""
+"""Largest length of a free run relative to a typical segment, so that starts can vary."""
 _DEFAULT_FREE_RUN_LENGTH = 60.0
-"""Length of a free run in s where no log says how long it is."""
+"""Length of a free run in s if no log determines it."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class TrainingDataSummary:
 
     @classmethod
     def from_channel_names(cls, channel_names: tuple[str, ...]) -> TrainingDataSummary:
-        """Return facts before any log is read: every channel moves, ahead only, for long."""
+        """Return assumed properties before any log is read: all inputs vary, in long logs."""
         return cls(
             channel_names,
             _input_names(channel_names),
@@ -86,10 +86,13 @@ class TrainingDataSummary:
     def from_logs(
         cls, samples: Samples, logs: Sequence[PreparedLog], evaluation: EvaluationConfig, dt: float
     ) -> TrainingDataSummary:
-        """Return what training logs and the protocol that chooses say.
+        """Return the properties of training logs and of the selection protocol.
 
         Args:
-            dt: of the grid, s.
+            samples: training samples.
+            logs: training logs.
+            evaluation: protocols.
+            dt: time step of the grid, s.
         """
         channel_values = samples.z
         channel_names = samples.names
@@ -110,6 +113,7 @@ class TrainingDataSummary:
         segment_lengths = np.concatenate(
             [np.diff(np.stack(find_runs(log.segment)), axis=0).flatten() for log in logs]
         )
+        # median weighted by length (N50): most samples are in segments of at least this length
         sorted_lengths = np.sort(segment_lengths)[::-1]
         median_segment_length = sorted_lengths[
             np.searchsorted(np.cumsum(sorted_lengths), 0.5 * sorted_lengths.sum())
@@ -118,6 +122,7 @@ class TrainingDataSummary:
         roll_time_per_radian = math.inf
         if "p" in channel_names:
             angle_std, rate_std = (float(std[channel_names.index(name)]) for name in ("phi", "p"))
+            # for an oscillation phi = a sin(omega t) the ratio of the deviations is 1 / omega
             roll_time_per_radian = angle_std / max(rate_std, 1e-9)
         return cls(
             channel_names,
@@ -133,17 +138,17 @@ class TrainingDataSummary:
 
     @property
     def max_free_run_length(self) -> float:
-        """Length of the longest free runs that there is a use and enough room for, s."""
+        """Length in s of the longest useful free runs that fit into a typical segment."""
         return min(self.free_run_length, _MAX_SEGMENT_SHARE * self.median_segment_duration)
 
     @property
     def varying_inputs(self) -> tuple[str, ...]:
-        """Channels that drive the vessel and vary; forces where the model makes them."""
+        """Varying inputs, or the forces computed from them; without the wind."""
         return tuple(name for name in self.varying_channels if name not in WIND_CHANNELS)
 
     @property
     def has_wind(self) -> bool:
-        """Whether the true wind is known."""
+        """Whether a wind channel varies in the logs."""
         return any(name in WIND_CHANNELS for name in self.varying_channels)
 
 
@@ -160,7 +165,7 @@ def _input_names(channel_names: Sequence[str]) -> tuple[str, ...]:
 def _free_run_length(
     logs: Sequence[PreparedLog], evaluation: EvaluationConfig, dt: float
 ) -> tuple[float, float]:
-    """Return how long the free runs are that choose between models, and their measured past, s."""
+    """Return length and measured history in s of the free runs of the selection protocol."""
     protocol = evaluation.protocols[evaluation.selection]
     if isinstance(protocol, WindowProtocol):
         return protocol.length, protocol.history
@@ -177,9 +182,9 @@ def _free_run_length(
 _LONG_LOG_TERMS = ("u^2 v", "u^2 r", "v^2", "r^2")
 """Terms that only long logs determine."""
 LONG_TRAINING_DURATION = 1200.0
-"""Length of the training logs in s from which they are taken in."""
+"""Total length in s from which training logs count as long."""
 _MIN_PROPELLERS_WITHOUT_RACE = 3
-"""Number of propellers from which rudders get no propeller-race terms."""
+"""Number of propellers from which rudders get no propeller-race terms, which would be too many."""
 
 
 def make_hull_terms(data_summary: TrainingDataSummary) -> list[str] | dict[str, list[str]]:
@@ -207,7 +212,7 @@ def make_hull_terms(data_summary: TrainingDataSummary) -> list[str] | dict[str, 
 
 
 def make_full_hull_terms(data_summary: TrainingDataSummary) -> list[str]:
-    """Return the terms of a hull with all that long logs determine."""
+    """Return the terms of a hull for long logs."""
     _, rudders, propellers = _classify_inputs(data_summary)
     additional_terms = ["wind_mag r", "wind_u r"] if data_summary.has_wind else []
     additional_terms += [
@@ -222,12 +227,12 @@ def make_full_hull_terms(data_summary: TrainingDataSummary) -> list[str]:
 
 
 def has_long_logs(data_summary: TrainingDataSummary) -> bool:
-    """Return whether the training logs are long enough for a hull of many terms."""
+    """Return whether the training logs determine a hull with many terms."""
     return data_summary.n_samples * data_summary.dt >= LONG_TRAINING_DURATION
 
 
 def _classify_inputs(data_summary: TrainingDataSummary) -> tuple[list[str], list[str], list[str]]:
-    """Return the inputs that are forces, that turn the flow, and that drive."""
+    """Return the varying inputs as forces, rudders and propellers, without azimuth thrusters."""
     forces = [name for name in data_summary.varying_inputs if name in FORCE_CHANNELS]
     rotatable_thrusters = azimuth_thrusters(data_summary.varying_inputs)
     remaining_inputs = [
@@ -242,7 +247,7 @@ def _classify_inputs(data_summary: TrainingDataSummary) -> tuple[list[str], list
 def _all_terms(data_summary: TrainingDataSummary) -> list[str]:
     """Return the terms of all axes together.
 
-    A thruster that turns pushes along and across; its thrust falls with the inflow.
+    An azimuth thruster has forces ahead and to the side; its thrust decreases with the inflow.
     """
     forces, rudders, propellers = _classify_inputs(data_summary)
     rotatable_thrusters = azimuth_thrusters(data_summary.varying_inputs)
@@ -284,7 +289,7 @@ def _is_rudder(name: str) -> bool:
 
 
 def _propeller_terms(name: str, is_reversing: bool) -> list[str]:
-    """Return the thrust of a propeller; one that turns astern differs from one ahead."""
+    """Return the terms of a propeller; a reversing one has a different thrust astern."""
     astern_terms = [f"{name}^2", f"{name} u"] if is_reversing else []
     return [name, f"{name}|{name}|", f"|{name}| u", *astern_terms]
 
@@ -309,7 +314,7 @@ def _rudder_terms(
 
 
 def _large_angle_terms(name: str, propellers: Sequence[str]) -> list[str]:
-    """Return how the lift of a rudder flattens, and its drag."""
+    """Return terms for the saturation of the lift of a rudder at large angles, and for its drag."""
     if len(propellers) != 1:
         return [name, f"u|u| {name}|{name}|", f"u|u| |{name}|"]
     race_terms = (f"{propellers[0]}|{propellers[0]}|", f"u {propellers[0]}")
@@ -321,20 +326,20 @@ def _large_angle_terms(name: str, propellers: Sequence[str]) -> list[str]:
 
 
 _NETWORK_STEPS_PER_RUN = 100
-"""Steps of the networks in a free run of the protocol's length."""
+"""Number of network steps in a free run of the protocol's length."""
 _STEP_PER_ROLL_RADIAN = 0.5
-"""Steps of the networks in radians of a roll."""
+"""Largest step of the networks in radians of a roll oscillation."""
 _REFIT_STEPS = 200
-"""Steps of the free runs of a refit, where its share of the protocol's length is less."""
+"""Smallest number of steps of the free runs of a refit."""
 _BATCH_PER_NETWORK = 32
 """Windows in a batch for each network."""
 _BATCHES_PER_EPOCH = 15
 _BATCHES_PER_EPOCH_LONG = 40
-"""Batches in each of twenty epochs, for short logs and for long ones."""
+"""Batches per epoch, for short and for long logs."""
 
 
 def make_refit_settings(data_summary: TrainingDataSummary) -> dict[str, Any]:
-    """Return the refit of a baseline: its prior weak where logs are long."""
+    """Return the settings of the refit of a baseline; long logs get a weaker prior."""
     horizon = min(
         data_summary.max_free_run_length,
         max(0.2 * data_summary.free_run_length, _REFIT_STEPS * data_summary.dt),
@@ -350,7 +355,7 @@ def make_refit_settings(data_summary: TrainingDataSummary) -> dict[str, Any]:
 
 
 def make_training_settings(data_summary: TrainingDataSummary, effort: float) -> dict[str, Any]:
-    """Return the training of networks in free run, over growing horizons and of a fixed length."""
+    """Return the training settings of networks: free runs with growing horizons, no early stop."""
     stages = [
         {
             "horizon": round_to_three_digits(
@@ -364,7 +369,7 @@ def make_training_settings(data_summary: TrainingDataSummary, effort: float) -> 
             "learning_rate": learning_rate,
             "final": final_rate_share,
         }
-        # one cosine over all stages, down to a fiftieth
+        # the learning rates and their final shares form one cosine over all stages
         for horizon_share, epochs, learning_rate, final_rate_share in (
             (0.3, 5, 3.0e-3, 0.854),
             (0.6, 5, 2.56e-3, 0.586),
@@ -386,13 +391,13 @@ def make_training_settings(data_summary: TrainingDataSummary, effort: float) -> 
         "weight_decay": 0.001,
         "robust": 0.05,
         "mirror": mirror_channels(data_summary.channel_names) is not None,
-        # the length is fixed: the last weights are kept
+        # validation at the end only: the schedule is fixed and the last weights are used
         "validate_every": 20,
     }
 
 
 def round_to_three_digits(value: float) -> float:
-    """Return a number of at most three digits."""
+    """Return a number rounded to three significant digits, for readable configs."""
     return float(f"{value:.3g}")
 
 
@@ -421,7 +426,7 @@ PART_KEYS = (
 )  # fmt: skip
 """Config keys of a fit that the recipe sets."""
 SINGLE_MODEL_NAME = "hull"
-"""Name of the model that is taken where one single is needed."""
+"""Name of the model that is used where a single model is required."""
 _HEAD_BASELINES = {"hull_network": SINGLE_MODEL_NAME, "network": CONSTANT_VELOCITY}
 """Baselines of the networks."""
 
@@ -476,14 +481,15 @@ def make_portfolio(data_summary: TrainingDataSummary, effort: float = 1.0) -> di
 
 
 def _regressor_settings(ridge: float, terms: list[str] | dict[str, list[str]]) -> dict[str, Any]:
-    """Return a model of regressors that neither feeds itself energy nor runs away."""
+    """Return settings of a dissipative regressor baseline with bounded free runs."""
     stability_settings = {"dissipative": True, "bounded": True}
     return {"kind": "regressors", "ridge": ridge, "terms": terms, **stability_settings}
 
 
 _WINDOW_LENGTHS = (100.0, 60.0, 40.0, 30.0, 20.0, 10.0, 5.0, 2.0, 1.0)
+"""Possible lengths of free runs in s: round values, which name the protocols."""
 _MIN_LENGTH_RATIO = 1.15
-"""Times of a free run that a log lasts so that it starts somewhere in it."""
+"""Smallest ratio of the duration of a log to a free run, for a choice of starts."""
 _N_PROBED_SAMPLES = 40_000
 """Number of first samples of a long log that are searched for segments."""
 
@@ -540,7 +546,7 @@ class PreparationPlan:
                 or [20.0 * sample_interval]
             )
         )
-        # a roll is quicker than the yaw
+        # roll is faster than yaw, so that it limits the time step
         roll_correlation_times = (
             [_correlation_time(log, ("phi",)) for log in logs] if dof.has_roll else []
         )
@@ -556,9 +562,11 @@ class PreparationPlan:
         grid_step = float(
             f"{sample_interval * max(1, int(shortest_time / 40.0 / sample_interval)):.4g}"
         )
+        # an odd number of samples, as a symmetric filter needs
         window_samples = min(max(5, 2 * round(0.5 * shortest_time / 5.0 / grid_step) + 1), 41)
         held_inputs = tuple(name for name in inputs if _is_held(logs, name))
-        # a true wind acts from where the vessel points, and one from the bow tells it by itself
+        # True wind is resolved in body axes by the heading. A heading integrated from r drifts,
+        # unless the wind relative to the bow is measured too.
         has_wind = not dof.fixed_states and all(
             {*WIND_INPUTS} <= {*log.channels}
             and (
@@ -583,15 +591,15 @@ class PreparationPlan:
     def reason(self) -> str:
         """The reason of the time constants, for the drafted config."""
         return (
-            f"logs have a sample each {self.sample_interval:.3g} s, and a"
-            f" {self.correlated_quantity} that stays alike"
-            f" for {self.correlation_time:.3g} s"
+            f"logs have a sample interval of {self.sample_interval:.3g} s and a correlation time of"
+            f" the {self.correlated_quantity} of {self.correlation_time:.3g} s"
         )
 
     def to_config(self) -> dict[str, Any]:
-        """Return `prepare` as a config has it.
+        """Return the settings `prepare` of a config.
 
-        Angles that swing are set against means, as a smoothed rate is one itself.
+        Roll angles are averaged over the derivative window, since the smoothed roll rate beside
+        them is an average over this window too.
         """
         grid: dict[str, Any] = {"step": f"{self.grid_step:g} s"}
         grid |= {"held": list(self.held_inputs)} if self.held_inputs else {}
@@ -621,12 +629,14 @@ def longest_usable_duration(
 ) -> float:
     """Return the duration in s of the longest gap-free segment of a prepared log.
 
-    It is 0 without usable samples. Of a long log the first part is searched, and all of it if this
-    part holds no free run of the longest kind.
+    It is 0 without usable samples. Only the first part of a long log is searched, unless it is
+    too short for the longest free run.
 
     Args:
         log: log as read.
         input_names: inputs of the model.
+        config: preparation settings.
+        dof: degrees of freedom of the model.
 
     Raises:
         DataError: if no sample is usable.
@@ -701,6 +711,8 @@ def _correlation_time(log: Log, names: Sequence[str] = ("r", "u", "v")) -> float
         dt = float(np.median(np.diff(t)))
         elapsed = remove_pauses(t)
         resampled = np.interp(np.arange(0.0, elapsed[-1], dt), elapsed, centred_values)[:20_000]
+        # zero padding to twice the length: linear instead of circular autocorrelation
+        # (Wiener-Khinchin)
         power_spectrum = np.abs(np.fft.rfft(resampled, 2 * resampled.size)) ** 2
         correlation = np.fft.irfft(power_spectrum)[: resampled.size]
         low_correlation_lags = np.flatnonzero(correlation < correlation[0] / np.e)
@@ -710,26 +722,28 @@ def _correlation_time(log: Log, names: Sequence[str] = ("r", "u", "v")) -> float
 
 
 def choose_window_length(usable_durations: Sequence[float], correlation_time: float) -> float:
-    """Return the length in s of free runs that most of the logs hold.
+    """Return a length in s of free runs that fits into most of the logs.
 
     Args:
-        usable_durations: the longest time in s without a gap of each log to be judged on; none ask
-            for half a second.
-        correlation_time: how long the vessel remembers, s.
+        usable_durations: longest duration in s without a gap of each log; if empty, the length is
+            half a second.
+        correlation_time: correlation time of the motion, s.
     """
     sorted_durations = sorted(usable_durations) or [1.0]
+    # three quarters of the logs are at least this long
     lower_quartile = sorted_durations[int(0.25 * (len(sorted_durations) - 1))]
     possible_lengths = [
         length for length in _WINDOW_LENGTHS if _MIN_LENGTH_RATIO * length <= lower_quartile
     ] or [0.5 * lower_quartile]
     return next(
+        # a free run over many correlation times adds no information about the dynamics
         (length for length in possible_lengths if length <= 15.0 * correlation_time),
         possible_lengths[-1],
     )
 
 
 def make_protocols(window_duration: float) -> dict[str, Any]:
-    """Return two protocols: free runs of a length and of a third of it."""
+    """Return two protocols: free runs of a length, and of at most 0.4 times this length."""
     short_length = max(
         (
             window_length_

@@ -39,26 +39,26 @@ from residnet.identification.monitoring import (
 from residnet.training.refit import require_parametric_baseline
 
 _MAX_CHANGES = 3
-"""Changes that a refit puts into a model at most."""
+"""Largest number of changes in one refit: the sizes of more cannot be told apart."""
 _DIRECTION_RIDGE = 1e-6
-"""Of the least squares that find a direction, as a share of each parameter's information."""
+"""Ridge of the least squares for a direction, relative to the information of each parameter."""
 _MIN_EXPRESSED_SHARE = 0.7
-"""Share of a change's accelerations that the parameters must be able to follow."""
+"""Smallest share of the accelerations of a change that the parameters must explain."""
 _SHORT_STEP_SHARE = 1e-4
-"""Share of a step over which the accelerations of a change are found."""
+"""Step of the finite difference that gives the accelerations of a change, in time steps."""
 _MAX_SAMPLES = 4_000
-"""Samples that a direction is found from, at most."""
+"""Largest number of samples for the least squares of a direction."""
 
 
 @dataclass(frozen=True)
 class IdentifiedChange:
-    """A change that a refit has put into a model.
+    """A change that a refit has added to a model.
 
     Attributes:
         change: the cause that the monitor named.
-        estimated_size: of the change, in its unit.
+        estimated_size: estimated size in the unit of the change.
         standard_error: standard error of the size.
-        size_by_log: size after each log, in their order.
+        size_by_log: size estimated from the logs up to each one, in time order.
     """
 
     change: SystemChange
@@ -121,8 +121,8 @@ def refit_recursively(
             _, expressed_share = _parameter_direction(detector.model, first_change, indexed_groups)
             if expressed_share < _MIN_EXPRESSED_SHARE:
                 stopping_reason = (
-                    f"the baseline's terms can follow only {expressed_share:.0%} of"
-                    f" what '{first_change.name}' does"
+                    f"the terms of the baseline explain only {expressed_share:.0%}"
+                    f" of the accelerations due to '{first_change.name}'"
                 )
         if stopping_reason:
             return RecursiveRefit(
@@ -177,7 +177,7 @@ def _evaluate_groups(
 
 
 def _stopping_reason(verdict: MonitorVerdict, changes_in_model: Sequence[SystemChange]) -> str:
-    """Return why no further change is taken, empty where one is."""
+    """Return why no further change is estimated; empty if one is."""
     first_hypothesis = verdict.hypotheses[0]
     if not verdict.is_alarm:
         return (
@@ -186,17 +186,16 @@ def _stopping_reason(verdict: MonitorVerdict, changes_in_model: Sequence[SystemC
         )
     if first_hypothesis.change.sensor:
         return (
-            f"'{first_hypothesis.change.name}' is named first, which is an error of the data;"
-            f" mend the sensor,"
-            " since a refit would put its error into the vessel"
+            f"'{first_hypothesis.change.name}' is the first hypothesis, an error of the data;"
+            " correct the sensor, since a refit would attribute its error to the vessel"
         )
     if first_hypothesis.change in changes_in_model:
         return (
-            f"'{first_hypothesis.change.name}' is named again, so that its size does not"
-            f" explain the logs"
+            f"'{first_hypothesis.change.name}' is the first hypothesis again, although"
+            " its size has been estimated"
         )
     if len(changes_in_model) >= _MAX_CHANGES:
-        return f"{_MAX_CHANGES} changes are in the model; fit it anew from the new logs"
+        return f"{_MAX_CHANGES} changes have been estimated; fit the model again with the new logs"
     return ""
 
 
@@ -205,9 +204,10 @@ def _parameter_direction(
     change: SystemChange,
     indexed_groups: Sequence[tuple[int, Sequence[MeasuredWindow]]],
 ) -> tuple[Tensor, float]:
-    """Return what a unit of a change adds to the free parameters [P].
+    """Return the derivative of the free parameters [P] by the size of a change.
 
-    The share of its accelerations that they can follow comes with it.
+    It is found by least squares on the accelerations of the change. The share of the accelerations
+    that the parameters explain is returned too.
     """
     windows = [window for _, group in indexed_groups for window in group]
     states = torch.from_numpy(np.concatenate([window.y[:-1] for window in windows]))
@@ -216,7 +216,7 @@ def _parameter_direction(
     states = states[::sample_stride]
     inputs = inputs[::sample_stride]
     initial_memory = states.new_zeros(len(states), model.n_state)
-    # over a whole step the vessel answers to the change already, which would hide a part of it
+    # over a whole step the feedback through the changed velocities would reduce the effect
     short_step_model = copy.deepcopy(model)
     short_step_model.dt = _SHORT_STEP_SHARE * model.dt
     with torch.no_grad():
@@ -235,7 +235,8 @@ def _parameter_direction(
             .parameter_jacobian(model.compute_channels(states, inputs))
             .flatten(0, 1)
         )
-        # axes count alike, though an acceleration in yaw is no acceleration in surge
+        # each axis is divided by its root mean square, so that all axes have the same weight; axes
+        # that the change does not affect would otherwise get an infinite one
         axis_weights = added_increment[:, DYNAMIC_STATES].square().mean(0)
         axis_weights = (axis_weights + 1e-4 * axis_weights.max()).rsqrt().repeat(len(states))
         sensitivities = sensitivities * axis_weights[:, None]
@@ -253,7 +254,8 @@ class _InformationFilter:
     """An extended information filter for the sizes of changes.
 
     Args:
-        changes: Q of them, causes of the watch.
+        detector: detector with the statistics of clean logs.
+        changes: Q changes whose sizes are estimated.
     """
 
     def __init__(self, detector: ChangeDetector, changes: Sequence[SystemChange]) -> None:
@@ -297,7 +299,7 @@ class _InformationFilter:
             )
         score_distribution = self.detector.score_distribution
         variance = np.diag(covariance) + score_distribution.mean_size_variance[self.cause_indices]
-        # what the model has always got wrong is an estimate too (the jackknife over clean logs)
+        # the bias of the model on clean logs is itself estimated: its variance by the jackknife
         jackknife_variance = (len(sizes_by_fold) - 1) * sizes_by_fold.var(axis=0)
         standard_errors = np.sqrt(
             variance * score_distribution.wishart_inflation + jackknife_variance
@@ -318,7 +320,7 @@ class _InformationFilter:
         *,
         use_initial_sizes: bool,
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-        """Process the logs in sequence: sizes after each, their covariance, sizes by fold.
+        """Process the logs in sequence; return sizes after each, their covariance, sizes by fold.
 
         Free runs use the current sizes, or the initial sizes with `use_initial_sizes`.
         """
@@ -326,6 +328,7 @@ class _InformationFilter:
         weighted_sizes = np.zeros((len(self.detector.bias_by_fold), len(self.sizes)))
         sizes = self.sizes
         sizes_by_log: list[np.ndarray] = []
+        # information form of the Kalman filter: each log adds its information and scores
         for log_index in dict.fromkeys(log_number for log_number, _ in indexed_groups):
             self._set_sizes(self.sizes)
             scores, log_information = self._process_log(
@@ -345,7 +348,7 @@ class _InformationFilter:
     def _process_log(
         self, groups_of_log: Sequence[Sequence[MeasuredWindow]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return scores [1 + F, Q] and information of a log, weighed by how clean logs scatter."""
+        """Return scores [1 + F, Q] and information of a log, weighted by the scatter of logs."""
         score, information = (
             np.stack(arrays)
             for arrays in zip(*map(self._process_group, groups_of_log), strict=True)
@@ -359,11 +362,11 @@ class _InformationFilter:
         return weighted_scores[0] / redundancy.mean(), weighted_information[0] / redundancy.mean()
 
     def _set_sizes(self, sizes: np.ndarray) -> None:
-        """Give the model its parameters for changes of some sizes."""
+        """Set the parameters of the model for changes of the given sizes [Q]."""
         self.baseline.set_free(self.initial_parameters + self.directions @ torch.from_numpy(sizes))
 
     def _process_group(self, windows: Sequence[MeasuredWindow]) -> tuple[np.ndarray, np.ndarray]:
-        """Return scores and information about further changes of the sizes, from a few windows.
+        """Return scores and information about corrections of the sizes from a group of windows.
 
         Scores [1 + F, Q] use the bias of all clean logs first, then the bias without each fold.
         """
@@ -373,12 +376,13 @@ class _InformationFilter:
         ]
         for i, n_parts in enumerate(detector.part_counts):
             _, cause_effects = detector.compute_innovations(windows, n_parts)
-            # windows in which a free run ran away have no effects, and tell nothing
+            # the effects of windows with a diverged free run are set to zero: they are ignored
             is_valid = (cause_effects != 0.0).any(axis=(1, 2))
             window_parts = [item for window in windows for item in split_window(window, n_parts)]
             innovation, nuisance_effects = compute_innovations(
                 self.model, window_parts, detector.nuisance_changes
             )
+            # finite differences in the sizes: the effects at the current sizes, not at zero
             change_effects = []
             for change_index, small_size in enumerate(self.small_sizes):
                 self._set_sizes(
@@ -399,7 +403,7 @@ class _InformationFilter:
             for innovations_of_fold, (model_bias, size_bias) in zip(
                 innovations_by_fold, detector.bias_by_fold, strict=True
             ):
-                # what clean logs ask for too is no change
+                # the part that the bias on clean logs explains is not attributed to a change
                 expected_innovation = detector.expected_innovations(cause_effects, model_bias[i])
                 expected_innovation = expected_innovation + np.einsum(
                     "q,bqn->bn", size_bias, cause_effects[:, : len(detector.hypotheses)]

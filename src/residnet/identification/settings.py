@@ -1,4 +1,4 @@
-"""Settings of an identification: everything but where logs come from and where results go."""
+"""Settings of an identification, without the source of the logs and the output folder."""
 
 from __future__ import annotations
 
@@ -94,12 +94,12 @@ class FitSettings(ModelPartsConfig):
         specified_parts = [key for key in PART_KEYS if key in self.model_fields_set]
         if self.recipe is None:
             if "baseline" not in specified_parts:
-                raise ValueError("baseline: missing; name its kind, or take `recipe: standard`")
+                raise ValueError("baseline: missing; give its kind, or use `recipe: standard`")
             return self
         if specified_parts:
             raise ValueError(
-                f"recipe: standard stands in place of {', '.join(PART_KEYS)}; leave"
-                f" '{specified_parts[0]}' out"
+                f"recipe: standard sets {', '.join(PART_KEYS)}; remove"
+                f" '{specified_parts[0]}' or the recipe"
             )
         return self.with_parts(TrainingDataSummary.from_channel_names(self.signals.build().names))
 
@@ -115,6 +115,7 @@ class FitSettings(ModelPartsConfig):
         self, default_serializer: SerializerFunctionWrapHandler
     ) -> dict[str, Any]:
         """Omit the parts that the recipe sets."""
+        # a written config must be readable again, and with a recipe explicit parts are refused
         content: dict[str, Any] = default_serializer(self)
         if self.recipe is not None:
             content = {key: value for key, value in content.items() if key not in PART_KEYS}
@@ -124,17 +125,16 @@ class FitSettings(ModelPartsConfig):
     def check_combination(self) -> FitSettings:
         if self.current is not None and not self.signals.dof.is_planar:
             raise ValueError(
-                "current: currents are told by u, v and r beside a position; leave `current` out of"
-                f" a model of {', '.join(self.signals.velocities)}"
+                "current: a current is estimated from u, v and r together with a position; remove"
+                f" `current` for a model of {', '.join(self.signals.velocities)}"
             )
         scale_names = tuple(self.evaluation.scales.to_dict())
         required_names = self.signals.dof.active_states
         if scale_names != required_names:
             raise ValueError(
-                f"evaluation.scales: the velocities of the model are {', '.join(required_names)}"
-                f" (signals.velocities), and scales are given of"
-                f" {', '.join(scale_names) or 'none'}; give"
-                " one of each"
+                f"evaluation.scales: the model needs one scale for each of"
+                f" {', '.join(required_names)} (signals.velocities); scales are given for"
+                f" {', '.join(scale_names) or 'none'}"
             )
         baseline_configs = self.all_baselines
         single_names = (*baseline_configs, *self.heads)
@@ -153,7 +153,8 @@ class FitSettings(ModelPartsConfig):
         check_known_names("training", self.training, self.heads, "head")
         check_known_names("base_of", self.base_of, self.heads, "head")
         if "zero" in self.base_of.values() and "zero" not in baseline_configs:
-            raise ValueError("base_of: the model 'zero' is named 'constant_velocity' today")
+            # configs of earlier versions used this name
+            raise ValueError("base_of: the model 'zero' is now named 'constant_velocity'")
         check_known_names(
             "base_of", self.base_of.values(), (CONSTANT_VELOCITY, *baseline_configs), "baseline"
         )
@@ -166,7 +167,7 @@ class FitSettings(ModelPartsConfig):
         return self
 
     def check_parts_fit_together(self) -> None:
-        """Build every part once, so that what does not fit together is refused before any work."""
+        """Build every part once, so that incompatible parts are refused before any log is read."""
         channel_names = self.signals.build().names
         part_configs: dict[str, Any] = {**self.all_baselines, **self.heads}
         for part_name, part_config in part_configs.items():
@@ -245,8 +246,14 @@ def check_known_names(
 ) -> None:
     """Check that every given name is one of the valid ones.
 
+    Args:
+        config_key: setting that contains the names, for the message.
+        names_to_check: names in the config.
+        valid_names: names that may be used.
+        noun: what the names denote, for the message.
+
     Raises:
-        ValueError: where one is not; the message names the nearest.
+        ValueError: if a name is unknown; the message suggests the most similar valid name.
     """
     valid_names = tuple(valid_names)
     for name in names_to_check:

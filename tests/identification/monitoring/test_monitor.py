@@ -177,7 +177,7 @@ def test_a_refit_leaves_errors_of_sensors_and_unchanged_vessels_alone(
     known: tuple[ModelSpec, HybridDynamics], watch: ChangeDetector
 ) -> None:
     gyro = SystemChange("gyro scale", "", "", 0.05, sensor="gyro_scale")
-    for change, words in ((gyro, "mend the sensor"), (NONE, "no cause exceeds")):
+    for change, words in ((gyro, "correct the sensor"), (NONE, "no cause exceeds")):
         found = refit_recursively(watch, [windows(log) for log in logs(known[1], change, 3, 50)])
         assert not found.identified_changes
         assert found.model is watch.model
