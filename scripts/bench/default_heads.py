@@ -6,11 +6,12 @@
 The physics of this file is independent of residnet: a ship with one propeller and one rudder, a
 catamaran with two propellers and a double-ended ferry with two azimuth thrusters, integrated by the
 classical Runge-Kutta method. Parameters, manoeuvres, disturbances and sensor noise are drawn from
-the number in the name of the vessel; odd numbers log measured actuators, even ones commands. Vessels with the numbers 101 to 199 were used to develop the
-default training; results are reported for others.
+the number in the name of the vessel; odd numbers log measured actuators, even ones commands.
+Vessels with the numbers 101 to 199 were used to develop the default training; results are reported
+for others.
 
 Every row of the output is one model: position error at the end of the free runs of the test logs,
-normalised RMSE of the velocities, ratio of the position error to the one of PLSR, and training time.
+normalised RMSE of the velocities, ratio of the position error to the one of PLSR, training time.
 """
 
 from __future__ import annotations
@@ -75,7 +76,9 @@ def draw_ship(random: np.random.Generator) -> Plant:
     vary = lambda value, share=0.2: value * (1.0 + share * random.uniform(-1.0, 1.0))  # noqa: E731
     mass_unit = 0.5 * density * length**2 * draught
     mass = vary(0.2)
-    added_x, added_y, added_n = vary(0.022), vary(0.223), vary(0.011)
+    added_x = vary(0.022)
+    added_y = vary(0.223)
+    added_n = vary(0.011)
     inertia_z = mass * 0.25**2
     centre = random.uniform(-0.01, 0.03)
     inertia = np.array(
@@ -90,11 +93,17 @@ def draw_ship(random: np.random.Generator) -> Plant:
     hull_y = [vary(-0.315), vary(0.083), vary(-1.607), vary(0.379), vary(-0.391), vary(0.008)]
     hull_n = [vary(-0.137), vary(-0.055), vary(-0.03), vary(-0.294), vary(0.055), vary(-0.013)]
     diameter = 0.045 * length
-    k_0, k_1, k_2 = vary(0.293), vary(-0.275, 0.1), vary(-0.139, 0.1)
-    wake, thrust_deduction = vary(0.35), 0.22
+    k_0 = vary(0.293)
+    k_1 = vary(-0.275, 0.1)
+    k_2 = vary(-0.139, 0.1)
+    wake = vary(0.35)
+    thrust_deduction = 0.22
     rudder_area = vary(0.02) * length * draught
-    lift_slope, rudder_x = vary(2.75), -0.5
-    steering_loss, force_increase, lever_increase = vary(0.39), vary(0.31), vary(-0.46, 0.1)
+    lift_slope = vary(2.75)
+    rudder_x = -0.5
+    steering_loss = vary(0.39)
+    force_increase = vary(0.31)
+    lever_increase = vary(-0.46, 0.1)
     flow_straightening = vary(0.5)
     race = vary(0.5)
 
@@ -106,15 +115,15 @@ def draw_ship(random: np.random.Generator) -> Plant:
     n_cruise = next(
         n
         for n in np.linspace(0.1, 60.0, 6000)
-        if propeller_thrust(speed, n)
-        > resistance * 0.5 * density * length * draught * speed**2
+        if propeller_thrust(speed, n) > resistance * 0.5 * density * length * draught * speed**2
     )
 
     def force(nu: Array, actuators: Array) -> Array:
         u, v, r = nu
         n, delta = actuators
         total = math.sqrt(u**2 + v**2) + 1e-6
-        vd, rd = v / total, r * length / total
+        vd = v / total
+        rd = r * length / total
         pressure = 0.5 * density * length * draught * total**2
         x_h = pressure * (
             -resistance * u * abs(u) / total**2
@@ -133,7 +142,8 @@ def draw_ship(random: np.random.Generator) -> Plant:
         x_r = -(1.0 - steering_loss) * normal * math.sin(delta)
         y_r = -(1.0 + force_increase) * normal * math.cos(delta)
         n_r = -(rudder_x + force_increase * lever_increase) * length * normal * math.cos(delta)
-        mass_si, lever = mass * mass_unit, mass * mass_unit * centre * length
+        mass_si = mass * mass_unit
+        lever = mass_si * centre * length
         coriolis = np.array(
             [
                 (mass_si + added_y * mass_unit) * v * r + lever * r**2,
@@ -242,7 +252,8 @@ def draw_ferry(random: np.random.Generator) -> Plant:
         u, v, r = nu
         total = np.zeros(3)
         for k, arm in enumerate(arms):
-            n, angle = actuators[2 * k], actuators[2 * k + 1]
+            n = actuators[2 * k]
+            angle = actuators[2 * k + 1]
             inflow = u * math.cos(angle) + (v + arm * r) * math.sin(angle)
             thrust = thrust_gain * n * abs(n) - inflow_loss * abs(n) * inflow
             side = thrust * math.sin(angle)
@@ -259,7 +270,8 @@ def draw_ferry(random: np.random.Generator) -> Plant:
         )
         return coriolis - damping + total
 
-    angle_limit, angle_rate = math.radians(50.0), math.radians(vary(25.0))
+    angle_limit = math.radians(50.0)
+    angle_rate = math.radians(vary(25.0))
     return Plant(
         ("n_fore", "azimuth_fore", "n_aft", "azimuth_aft"),
         np.array([0.2 * n_cruise, -angle_limit, 0.2 * n_cruise, -angle_limit]),
@@ -350,11 +362,13 @@ def simulate_log(
     )
 
     def derivative(state: Array, command: Array) -> Array:
-        nu, heading, actuators = state[:3], state[5], state[6:]
-        u, v, r = nu
+        u, v, r = nu = state[:3]
+        heading = state[5]
+        actuators = state[6:]
         change = np.clip((command - actuators) / plant.lag, -plant.rate, plant.rate)
         acceleration = inverse_inertia @ plant.force(nu, actuators) + disturbance
-        sine, cosine = math.sin(heading), math.cos(heading)
+        sine = math.sin(heading)
+        cosine = math.cos(heading)
         position_rate = [u * cosine - v * sine, u * sine + v * cosine, r]
         return np.concatenate((acceleration, position_rate, change))
 

@@ -212,27 +212,31 @@ class Peer(nn.Module):
 
 def change(plan: dict[str, Any], part: str) -> None:
     """Let networks alone take part in the plan of the recipe, or leave out a part of training."""
+    recurrent_heads = {
+        name: config for name, config in plan["heads"].items() if config["kind"] == "recurrent"
+    }
     if part == "network":
-        for key in ("heads", "training"):
-            plan[key].setdefault("network", plan[key]["hull_network"])
+        plan["heads"].setdefault("network", plan["heads"]["hull_network"])
         plan["base_of"]["network"] = "constant_velocity"
-        plan["means"] = {"ensemble": ("hull", *plan["heads"])}
-        return
-    key, changed = {"mirror": ("training", False), "members": ("heads", 1)}[part]
-    plan[key] = {name: {**given, part: changed} for name, given in plan[key].items()}
+        plan["means"] = {"ensemble": ("hull", *recurrent_heads, "network")}
+    elif part == "mirror":
+        plan["training"] = {name: {"mirror": False} for name in recurrent_heads}
+    else:
+        for name, config in recurrent_heads.items():
+            plan["heads"][name] = {**config, "members": 1}
 
 
 def fitted(splits: Splits, effort: float, parts: Sequence[str]) -> Any:
     """Fit the recipe with some parts of it changed."""
-    whole = settings.portfolio
+    whole = settings.make_portfolio
 
-    def changed(facts: Any, effort: float) -> dict[str, Any]:
-        plan = whole(facts, effort)
+    def changed(facts: Any) -> dict[str, Any]:
+        plan = whole(facts)
         for part in parts:
             change(plan, part)
         return plan
 
-    with mock.patch.object(settings, "portfolio", changed):
+    with mock.patch.object(settings, "make_portfolio", changed):
         return residnet.fit(splits, effort=effort, bands=None)
 
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         simulate,
         vessel,
     )
+    from residnet.api.training import HeadTrainingRun, head_training
     from residnet.autopilot.api import design_autopilot, train_autopilot
     from residnet.core.errors import ResidnetError
     from residnet.core.log import Log
@@ -47,12 +48,14 @@ _HOME = {
     "api.tasks": (
         "RunResult SimulationResult baseline head list_available manoeuvre run simulate vessel"
     ),
+    "api.training": "HeadTrainingRun head_training",
     "autopilot.api": "design_autopilot train_autopilot",
 }
 
 __all__ = [
     "Dataset",
     "FreeRuns",
+    "HeadTrainingRun",
     "Log",
     "Model",
     "Models",
@@ -69,6 +72,7 @@ __all__ = [
     "fit",
     "free_run",
     "head",
+    "head_training",
     "inspect",
     "list_available",
     "load",

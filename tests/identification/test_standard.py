@@ -19,6 +19,7 @@ from residnet.core.layout import SURGE_SWAY_YAW
 from residnet.core.log import Log
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import InnovationFilter
+from residnet.heads import HeadConfig
 from residnet.identification.fit import fit_models
 from residnet.identification.fitter import FitStore, Fitter, find_harmful_member
 from residnet.identification.identified import IdentifiedModels
@@ -30,9 +31,11 @@ from residnet.identification.recipe import (
     make_portfolio,
 )
 from residnet.identification.settings import FitSettings
+from residnet.identification.training_schedule import resolve_training
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import acts_along_own_velocity
 from residnet.preprocessing.prepare import make_samples
+from residnet.training.config import TrainingConfig
 
 NAMES = ("hull", "hull_network", "ensemble")
 
@@ -103,7 +106,8 @@ def test_the_mean_is_reported_first_and_a_hull_that_does_not_run_away_beside_it(
     assert identified["ensemble"].notes["members"] == ["hull", "hull_network"]
     found = judged["validation"].free_runs[0].predictions
     found["hull"] = [replace(one, has_diverged=True) for one in found["hull"]]
-    assert identified.select_models(judged).selected == "baseline"
+    # without the hull the rule of every fit chooses
+    assert identified.select_models(judged).selected == "plsr"
 
 
 @pytest.mark.long
@@ -112,7 +116,7 @@ def test_bands_of_short_logs_come_from_fits_without_some_of_them(
 ) -> None:
     found = fit_models(logs, settings(effort=0.01))
     banded = {name: entry.bands["T8"] for name, entry in found.items() if entry.bands}
-    assert list(banded) == ["constant_velocity", "baseline", "hull", "ensemble"]
+    assert list(banded) == ["constant_velocity", "baseline", "hull", "plsr", "ensemble"]
     hull = banded["hull"]
     mean = banded["ensemble"]
     assert hull.n_logs == len(logs["train"]) + len(logs["validation"])
@@ -166,7 +170,9 @@ def test_settings_say_the_recipe_and_nothing_of_its_parts() -> None:
     assert written["recipe"] == "standard"
     assert not set(PART_KEYS) & set(written)
     assert validate_config(written, FitSettings, "again") == own
-    assert own.model_names == ("baseline", "hull", "hull_network", "network", "ensemble")
+    networks = ("hull_network", "network")
+    candidates = ("plsr", "mlp", "lstm")
+    assert own.model_names == ("baseline", "hull", *networks, *candidates, "ensemble")
 
 
 @pytest.mark.parametrize(
@@ -229,8 +235,47 @@ def test_networks_stand_alone_and_horizons_are_long_where_logs_are() -> None:
         assert part["bounded"]
         assert part["dissipative"]
     plan = make_portfolio(replace(facts, free_run_length=100.0, median_segment_duration=30.0))
-    horizons = [s["horizon"] for t in plan["training"].values() for s in t["multi_step"]]
-    assert max(*horizons, plan["refit"]["hull"]["horizon"]) <= 18.0
+    assert plan["refit"]["hull"]["horizon"] <= 18.0
+    facts = replace(facts, free_run_length=100.0, median_segment_duration=30.0)
+    for name in ("hull_network", "mlp", "lstm"):
+        stages = derived_training(plan, name, facts).multi_step
+        assert max(stage.horizon for stage in stages) <= 18.0
+
+
+def derived_training(
+    plan: dict[str, Any], name: str, facts: TrainingDataSummary, effort: float = 1.0, **given: Any
+) -> TrainingConfig:
+    """The training of a head of the recipe."""
+    config = validate_config(plan["heads"][name], HeadConfig, "here")
+    training = validate_config(given, TrainingConfig, "here")
+    return resolve_training(training, config.build(facts.channel_names), facts, effort)
+
+
+def test_trainings_follow_from_the_logs_and_given_keys_override_them() -> None:
+    facts = TrainingDataSummary.from_channel_names(NAMES_OF_A_BOAT)
+    plan = make_portfolio(facts)
+    usual = derived_training(plan, "mlp", facts)
+    assert usual.one_step.washout == 0.0
+    assert derived_training(plan, "lstm", facts).one_step.washout > 0.0
+    assert usual.require_improvement
+    longer = derived_training(plan, "mlp", replace(facts, n_samples=28_000))
+    assert longer.steps == pytest.approx(1.4 * usual.steps, rel=0.02)
+    assert derived_training(plan, "mlp", facts, 0.5).steps == pytest.approx(usual.steps / 2, abs=1)
+    own = derived_training(plan, "mlp", facts, steps=7)
+    assert own == usual.model_copy(update={"steps": 7})
+    # a schedule of the user is taken as it is
+    exact = derived_training(plan, "mlp", facts, multi_step=[{"horizon": 2.0, "epochs": 3}])
+    assert (exact.epochs, exact.one_step.epochs, exact.history) == (3, 0, 0.5)
+    # what is stored is derived again
+    stored = TrainingConfig(steps=7).model_dump(mode="json")
+    assert stored == {"steps": 7}
+    assert TrainingConfig(**exact.model_dump(mode="json")) == exact
+
+
+def test_networks_need_logs_of_ten_free_runs() -> None:
+    facts = TrainingDataSummary.from_channel_names(NAMES_OF_A_BOAT)
+    assert set(make_portfolio(facts)["heads"]) >= {"plsr", "mlp", "lstm"}
+    assert set(short(NAMES_OF_A_BOAT)["heads"]) == {"hull_network", "plsr"}
 
 
 def test_short_logs_give_each_axis_the_terms_that_a_symmetric_vessel_has() -> None:
@@ -242,7 +287,8 @@ def test_short_logs_give_each_axis_the_terms_that_a_symmetric_vessel_has() -> No
     rows = short(paired)["baselines"]["hull"]["terms"]
     assert {"left", "right|right|", "|left| u"} <= set(rows["r"])
     assert "u|u|" not in rows["r"]
-    assert short(paired)["training"]["hull_network"]["mirror"]
+    facts = TrainingDataSummary.from_channel_names(paired)
+    assert derived_training(short(paired), "hull_network", facts).mirror
 
 
 def test_a_mirror_symmetric_model_has_no_asymmetry(known: Samples) -> None:

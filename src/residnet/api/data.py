@@ -6,7 +6,9 @@ import glob
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field
 
 from residnet.api.values import (
     PartLike,
@@ -18,7 +20,7 @@ from residnet.api.values import (
     to_builtin,
 )
 from residnet.core.arrays import paged
-from residnet.core.config import validate_config
+from residnet.core.config import Config, Seconds, validate_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.layout import DegreesOfFreedom
 from residnet.core.log import Log
@@ -45,6 +47,8 @@ from residnet.tasks.drafting import ConfigDraft, choose_inputs, draft_fit_config
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from residnet.preprocessing.data_module import WindowsDataModule
 
 LogsLike = PathLikeArg | Log | Sequence[PathLikeArg] | Sequence[Log]
 """Logs that were read, or where to read them."""
@@ -250,6 +254,26 @@ def draft_config(
         return draft_fit_config(paths, Path(folder), name, answer)
 
 
+class WindowSettings(Config):
+    """Arguments of `Dataset.module`.
+
+    Attributes:
+        windows: length of a window.
+        batch_size: number of windows in a batch.
+        batches: number of training batches in an epoch; None for one visit of every sample.
+        history: length of the measured past before a window.
+        seed: seed of the random windows.
+        precision: floating-point precision by its name in Lightning.
+    """
+
+    windows: Seconds = Field(gt=0)
+    batch_size: int = Field(ge=1)
+    batches: int | None = Field(default=None, ge=1)
+    history: Seconds = Field(ge=0)
+    seed: int = Field(ge=0)
+    precision: Literal["32-true", "64-true"]
+
+
 @dataclass(frozen=True)
 class Dataset:
     """Logs prepared for a fit, with the settings of the evaluation.
@@ -285,6 +309,68 @@ class Dataset:
         if split not in self.splits or not self.splits[split]:
             raise UsageError(f"the data have no split '{split}'{suggest_name(split, self.splits)}")
         return self.splits[split]
+
+    def module(
+        self,
+        windows: float | str = 10.0,
+        *,
+        batch_size: int = 64,
+        batches: int | None = None,
+        history: float | str = 0.0,
+        seed: int = 0,
+        precision: Literal["32-true", "64-true"] = "32-true",
+    ) -> WindowsDataModule:
+        """Return the logs as a `LightningDataModule` of windows, for any Lightning module.
+
+        A batch is a tuple with one `WindowBatch` (`y`, `smoothed`, `nu_dot`, `w`, `usable`,
+        `trainable`, ... [batch, samples, channels]). Training windows are drawn at random; the same
+        seed and epoch give the same windows, also after a resume. Validation and test windows
+        follow one another along the logs.
+
+        Args:
+            windows: length of a window in s, as a number or with a unit such as `10 s`.
+            batch_size: number of windows in a batch.
+            batches: number of training batches in an epoch; None for as many as visit every
+                training sample once on average.
+            history: length of the measured past before a window in s (`past_y`, `past_w`).
+            seed: seed of the random windows.
+            precision: floating-point precision by its name in Lightning.
+
+        Raises:
+            ConfigError: if a value is wrong.
+            UsageError: if the data have no training logs.
+            DataError: if no log is as long as a window.
+
+        Example:
+            lightning.Trainer(max_epochs=20).fit(my_module, data.module(windows="10 s"))
+        """
+        # imports Lightning, which data without a training must not wait for
+        import torch
+
+        from residnet.preprocessing.data_module import WindowsDataModule
+        from residnet.preprocessing.windows import WindowStage
+
+        settings = validate_config(
+            {
+                "windows": windows,
+                "batch_size": batch_size,
+                "batches": batches,
+                "history": history,
+                "seed": seed,
+                "precision": precision,
+            },
+            WindowSettings,
+            "module",
+        )
+        training_logs = self.logs("train")
+        step = self.prepare.grid.step
+        n_window_samples = max(round(settings.windows / step), 1)
+        n_samples = sum(len(log) for log in training_logs)
+        n_batches = settings.batches or max(1, n_samples // (n_window_samples * batch_size))
+        stage = WindowStage(n_window_samples, batch_size, round(settings.history / step))
+        dtype = torch.float64 if precision == "64-true" else torch.float32
+        splits = {name: self.splits.get(name, []) for name in SPLITS}
+        return WindowsDataModule.from_splits(splits, stage, n_batches, seed, dtype)
 
 
 def prepare(

@@ -20,6 +20,7 @@ from residnet.api.values import (
     parse_part,
     to_builtin,
 )
+from residnet.baselines import BaselineConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
@@ -31,6 +32,7 @@ from residnet.core.trust import trusting
 from residnet.evaluation.metrics import build_metrics_table, iterate_rollout_columns
 from residnet.evaluation.selection import Selection
 from residnet.evaluation.verdict import VerdictEvidence, order_protocols, write_verdict
+from residnet.heads import HeadConfig
 from residnet.identification.fit import fit_models as identify
 from residnet.identification.identified import (
     IdentifiedModels,
@@ -51,6 +53,8 @@ from residnet.runs.task import torch_threads
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
+
+    from residnet.training.trainer import Callback, Logger
 
 
 @final
@@ -350,6 +354,8 @@ def fit(
     workers: int = 1,
     trust: bool = False,
     progress: ProgressCallback | None = None,
+    callbacks: Sequence[Callback] = (),
+    logger: Logger | None = None,
     **settings: Any,
 ) -> Models:
     """Fit baselines, residual heads on the baselines, and ensembles.
@@ -363,7 +369,10 @@ def fit(
         baseline: baseline model: a kind, a mapping or a config object. `regressors` without
             settings is linear in every channel, and the default if heads are given.
         heads: learned residual models: kinds such as `["plsr", "lstm"]`, or a mapping from names to
-            kinds, mappings or config objects.
+            kinds, mappings, config objects or modules. A `torch.nn.Module` has
+            `forward(z) -> rho`, or `forward(z, s) -> (rho, s)` and the number of memory values as
+            `n_state`. It receives the channels z [B, nz], standardised over the training samples,
+            and returns residual accelerations rho [B, n] in units of their standard deviations.
         baselines: further baselines by name.
         threads: number of PyTorch threads; one is fastest for the small matrix products.
         workers: number of models fitted in parallel processes; the results do not change. With more
@@ -372,6 +381,9 @@ def fit(
         trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
             code, so only for sources that you trust.
         progress: called with the progress of the fit.
+        callbacks: Lightning callbacks for the trainings of all networks, which then run in this
+            process one after another.
+        logger: Lightning logger for these trainings; None for none.
         settings: further keys of a fit, as in YAML: recipe, effort, base_of, forces, ensembles,
             means, training, refit, current, bands, seed, and integrator (default for the recipe:
             as `residnet new` chooses it).
@@ -385,39 +397,63 @@ def fit(
         models = residnet.fit(logs); models.selected, models.metrics
     """
     with trusting(trust):
-        fit_settings = {
-            key: value
-            for key, value in settings.items()
-            if (value or key not in ModelPartsConfig.model_fields)
-            and (key, value) != ("integrator", None)
-        }
-        fit_settings |= {"baselines": parse_named_parts(baselines, "baseline")} if baselines else {}
-        if not (isinstance(heads, list | tuple | Mapping) and not heads):
-            fit_settings["heads"] = parse_named_parts(heads, "head")
-        if baseline is not None:
-            fit_settings["baseline"] = parse_part(baseline, "baseline")
-        if fit_settings.get("recipe") is None and not set(fit_settings) & set(
-            ModelPartsConfig.model_fields
-        ):
-            fit_settings["recipe"] = "standard"
-        if fit_settings.get("recipe") is None:
-            fit_settings.setdefault("baseline", parse_part("regressors", "baseline"))
         if not isinstance(data, Dataset):
             logs = (str, PathLike, Log, list, tuple, Mapping)
             require_instance(data, logs, "fit: expected logs, or data from residnet.prepare")
             data = prepare(data)
-        if fit_settings.get("recipe") is not None:
-            fit_settings.setdefault("integrator", choose_integrator(data.signals.dof))
-        sections = {"prepare": data.prepare, "signals": data.signals, "evaluation": data.evaluation}
-        config: FitSettings = validate_config(
-            to_builtin({**sections, **fit_settings}), FitSettings, "fit"
-        )
+        if baselines:
+            settings["baselines"] = parse_named_parts(baselines, "baseline", BaselineConfig)
+        config = make_fit_settings(data, baseline, heads, settings)
+        extensions = None
+        if callbacks or logger is not None:
+            # imports Lightning, which a fit without networks must not wait for
+            from residnet.training.trainer import make_extensions
+
+            extensions = make_extensions(callbacks, logger)
         with torch_threads(threads), forward_progress(progress), worker_limit(workers):
             for split in ("validation", "test"):
                 for log in data.logs(split):
                     check_window_fits(log, config)
             splits, _ = convert_to_motion_through_water(data.splits, config)
-            return Models(identify(splits, config), replace(data, splits=splits))
+            identified = identify(splits, config, extensions=extensions)
+            return Models(identified, replace(data, splits=splits))
+
+
+def make_fit_settings(
+    data: Dataset,
+    baseline: PartLike | None,
+    heads: PartLike | Sequence[str] | Mapping[str, PartLike],
+    settings: Mapping[str, Any],
+) -> FitSettings:
+    """Return the settings of a fit for the arguments of `fit`.
+
+    Raises:
+        ConfigError: if a setting is wrong.
+        UsageError: if a part has the wrong type.
+    """
+    fit_settings = {
+        key: value
+        for key, value in settings.items()
+        if (value or key not in ModelPartsConfig.model_fields)
+        and (key, value) != ("integrator", None)
+    }
+    if not (isinstance(heads, list | tuple | Mapping) and not heads):
+        fit_settings["heads"] = parse_named_parts(heads, "head", HeadConfig)
+    if baseline is not None:
+        fit_settings["baseline"] = parse_part(baseline, "baseline", BaselineConfig)
+    if fit_settings.get("recipe") is None and not set(fit_settings) & set(
+        ModelPartsConfig.model_fields
+    ):
+        fit_settings["recipe"] = "standard"
+    if fit_settings.get("recipe") is None:
+        fit_settings.setdefault("baseline", parse_part("regressors", "baseline"))
+    else:
+        fit_settings.setdefault("integrator", choose_integrator(data.signals.dof))
+    sections = {"prepare": data.prepare, "signals": data.signals, "evaluation": data.evaluation}
+    config: FitSettings = validate_config(
+        to_builtin({**sections, **fit_settings}), FitSettings, "fit"
+    )
+    return config
 
 
 def metrics(

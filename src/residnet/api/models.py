@@ -9,14 +9,17 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 import torch
-from torch import Tensor
+from pydantic import BaseModel
+from torch import Tensor, nn
 
 from residnet.api.data import Dataset
 from residnet.api.values import PathLikeArg, describe_type, parse_path
+from residnet.baselines import BaselineConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json, stage_files
 from residnet.core.ownership import Manifest, record_folder
+from residnet.core.registry import register_kind
 from residnet.core.run_loader import accept_run, name_damaged_key
 from residnet.core.trust import trusting
 from residnet.dynamics.hybrid import HybridDynamics
@@ -28,6 +31,9 @@ from residnet.evaluation.verdict import UNSEEN_SPLITS, VerdictEvidence, list_mod
 from residnet.export import get_exporter
 from residnet.export.base import require_releasable
 from residnet.export.vessel import ExportedVessel
+from residnet.heads import HeadConfig
+from residnet.heads.base import BaseHeadConfig
+from residnet.heads.module import register_stored_modules
 from residnet.identification.fitter import FittedModel
 from residnet.identification.monitoring import (
     ChangeDetector,
@@ -250,7 +256,13 @@ def save(model: Model, folder: PathLikeArg, *, overwrite: bool = False) -> Path:
     return model_folder
 
 
-def load(folder: PathLikeArg, name: str | None = None, *, trust: bool = False) -> Model:
+def load(
+    folder: PathLikeArg,
+    name: str | None = None,
+    *,
+    trust: bool = False,
+    parts: Sequence[nn.Module | BaseModel] = (),
+) -> Model:
     """Load a model from its folder, or by its name from the folder of a run.
 
     Args:
@@ -259,9 +271,12 @@ def load(folder: PathLikeArg, name: str | None = None, *, trust: bool = False) -
             data; None for the model reported first.
         trust: allow classes of scikit-learn whose fitted state is not stored as data; they can run
             code, so only for sources that you trust.
+        parts: modules and config objects of your own that were passed to the fit as heads or
+            baselines. A stored model has their weights and settings, but no code.
 
     Raises:
         UsageError: if there is no such model.
+        ConfigError: if the model contains a module that `parts` lacks.
 
     Example:
         model = residnet.load("runs/quickstart", "selected")
@@ -274,6 +289,14 @@ def load(folder: PathLikeArg, name: str | None = None, *, trust: bool = False) -
                 model_folder / "models" / resolve_model_name(model_folder, name or "predictor")
             )
         verify_checksums(model_folder)
+        for part in parts:
+            if isinstance(part, BaseHeadConfig):
+                register_kind(HeadConfig, type(part))
+            elif isinstance(part, BaseModel):
+                register_kind(BaselineConfig, type(part))
+        modules = [part for part in parts if isinstance(part, nn.Module)]
+        if modules:
+            register_stored_modules(read_json(model_folder / "model.json"), modules)
         spec, module = load_model(model_folder)
         # a model saved outside of a run has neither notes nor bands
         notes = model_folder / "fit.json"

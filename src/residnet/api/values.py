@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
 
 import numpy as np
 from pydantic import BaseModel
 
 from residnet.core.errors import UsageError
 from residnet.core.progress import ProgressCallback, on_progress
+from residnet.core.registry import register_kind
+
+if TYPE_CHECKING:
+    from torch import nn
 
 PathLikeArg = str | PathLike[str]
 """A path, as text or as an object."""
 
-PartLike = str | Mapping[str, Any] | BaseModel
-"""A part, given as its kind, as a mapping like in YAML, or as a config object."""
+PartLike: TypeAlias = "str | Mapping[str, Any] | BaseModel | nn.Module"
+"""A part, given as its kind, as a mapping like in YAML, as a config object, or as a module."""
 
 
 def to_builtin(value: Any) -> Any:
@@ -34,12 +39,16 @@ def to_builtin(value: Any) -> Any:
     return str(value) if isinstance(value, PathLike) else value
 
 
-def parse_part(value: PartLike, description: str, **settings: Any) -> dict[str, Any]:
+def parse_part(
+    value: PartLike, description: str, union: Any = None, **settings: Any
+) -> dict[str, Any]:
     """Return the config of a part as a mapping with its kind.
 
     Args:
-        value: a kind, a mapping, or a config object.
+        value: a kind, a mapping, a config object, or a `torch.nn.Module` for a head.
         description: name of the argument for the error message.
+        union: annotated type of the kinds, such as `residnet.heads.HeadConfig`, to which the class
+            of a config object is added for this process; None to accept listed kinds only.
         settings: further keys.
 
     Raises:
@@ -47,6 +56,13 @@ def parse_part(value: PartLike, description: str, **settings: Any) -> dict[str, 
     """
     if isinstance(value, str):
         return {"kind": value, **to_builtin(settings)}
+    if isinstance(value, BaseModel) and union is not None:
+        register_kind(union, type(value))
+    if description.startswith("head") and _is_torch_module(value):
+        # imports torch, which the user's module has imported already
+        from residnet.heads.module import register_module
+
+        return {**register_module(value), **to_builtin(settings)}
     if isinstance(value, Mapping | BaseModel):
         return {**to_builtin(value), **to_builtin(settings)}
     raise UsageError(
@@ -55,8 +71,18 @@ def parse_part(value: PartLike, description: str, **settings: Any) -> dict[str, 
     )
 
 
-def parse_named_parts(value: Any, description: str) -> dict[str, Any]:
+def _is_torch_module(value: Any) -> TypeGuard[nn.Module]:
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, torch.nn.Module)
+
+
+def parse_named_parts(value: Any, description: str, union: Any = None) -> dict[str, Any]:
     """Return parts by name, from a list of kinds or a mapping from names to parts.
+
+    Args:
+        value: the argument.
+        description: name of the kind of part.
+        union: see `parse_part`.
 
     Raises:
         UsageError: if the value has another type.
@@ -65,7 +91,8 @@ def parse_named_parts(value: Any, description: str) -> dict[str, Any]:
         return {value: parse_part(value, description)}
     if isinstance(value, Mapping) and "kind" not in value:
         return {
-            str(name): parse_part(entry, f"{description} '{name}'") for name, entry in value.items()
+            str(name): parse_part(entry, f"{description} '{name}'", union)
+            for name, entry in value.items()
         }
     if isinstance(value, list | tuple) and all(isinstance(part_kind, str) for part_kind in value):
         return {part_kind: parse_part(part_kind, description) for part_kind in value}

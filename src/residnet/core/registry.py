@@ -22,7 +22,7 @@ import importlib
 import importlib.metadata
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -149,14 +149,17 @@ class PluginUnion:
     Attributes:
         group: entry-point group of the kinds of other packages.
         base: `module:Class` that the kinds of other packages must extend.
-        builtin: built-in kinds, name -> `module:Class`.
+        core_kinds: built-in kinds, name -> `module:Class`.
         key: discriminator field.
+        python_kinds: kinds that only Python arguments create, and that no list shows, name ->
+            `module:Class`.
     """
 
     group: str
     base: str
     core_kinds: Mapping[str, str]
     key: str = "kind"
+    python_kinds: Mapping[str, str] = field(default_factory=dict)
 
     @functools.cached_property
     def builtin(self) -> Mapping[str, str]:
@@ -208,7 +211,7 @@ class PluginUnion:
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         """Return the schema of a tagged union that imports a kind when it is named."""
-        return core_schema.tagged_union_schema(
+        listed_kinds = core_schema.tagged_union_schema(
             {
                 name: core_schema.with_info_plain_validator_function(
                     functools.partial(self._validate_kind, name)
@@ -218,17 +221,83 @@ class PluginUnion:
             discriminator=self.key,
             from_attributes=True,
         )
+        return core_schema.with_info_wrap_validator_function(
+            self._validate_python_kind,
+            listed_kinds,
+            # by the class of the value, which the listed kinds may lack
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                _return_unchanged, return_schema=core_schema.any_schema()
+            ),
+        )
+
+    def _validate_python_kind(
+        self, value: Any, handler: Callable[[Any], Any], info: ValidationInfo
+    ) -> Any:
+        """Validate a kind that was registered in this process, any other kind by `handler`."""
+        name = value.get(self.key) if isinstance(value, Mapping) else None
+        kind_class = _registered_kinds.get((self.group, str(name)))
+        if kind_class is None and str(name) in self.python_kinds:
+            kind_class = import_object(self.python_kinds[str(name)])
+        if kind_class is None:
+            return handler(value)
+        return self._validate_class(kind_class, value, info)
 
     def _validate_kind(self, name: str, value: Any, info: ValidationInfo) -> Any:
         kind_class = self.find_kind(name)
         if isinstance(kind_class, EntryPointPart):
             raise ValueError(kind_class.error_message)
+        return self._validate_class(kind_class, value, info)
+
+    def _validate_class(self, kind_class: type[Any], value: Any, info: ValidationInfo) -> Any:
         if isinstance(value, kind_class):
             return value
         if info.mode == "json":
             # the Python mode of pydantic does not accept lists for tuples, the JSON mode does
             return kind_class.model_validate_json(to_json(value), strict=True, context=info.context)
         return kind_class.model_validate(value, context=info.context)
+
+
+def is_python_part(config: BaseModel) -> bool:
+    """Return whether only this process knows a config, because a Python argument brought it."""
+    return type(config) in _registered_kinds.values() or bool(
+        getattr(config, "is_process_local", False)
+    )
+
+
+def _return_unchanged(value: Any) -> Any:
+    return value
+
+
+_registered_kinds: dict[tuple[str, str], type[BaseModel]] = {}
+"""Config classes of Python arguments by entry-point group and kind, in this process."""
+
+
+def register_kind(union: Any, config_class: type[BaseModel]) -> None:
+    """Register a config class for this process, as an entry point would for every process.
+
+    A class with the kind of a part that is listed, or the same class again, changes nothing.
+
+    Args:
+        union: for example `residnet.heads.HeadConfig`.
+        config_class: class with a field `kind: Literal["name"] = "name"`.
+
+    Raises:
+        UsageError: if the class does not extend the base class of the union, or has no kind.
+    """
+    plugin_union = get_plugin_union(union)
+    name = get_kind(config_class, plugin_union.key)
+    if name is not None and (
+        name in plugin_union.kind_names() or name in plugin_union.python_kinds
+    ):
+        return
+    fault = _subclass_fault(config_class, import_object(plugin_union.base)).replace(
+        "its entry point", config_class.__name__
+    )
+    if not fault and name is None:
+        fault = f"it has no field `{plugin_union.key}: Literal['name'] = 'name'`"
+    if fault or name is None:
+        raise UsageError(f"the config class {config_class.__name__} cannot be used: {fault}")
+    _registered_kinds[plugin_union.group, name] = config_class
 
 
 def import_object(object_path: str) -> Any:

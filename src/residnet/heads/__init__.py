@@ -27,6 +27,7 @@ else:
                 "sklearn": "residnet.heads.scikit:SklearnConfig",
                 "recurrent": "residnet.heads.recurrent:GRUEnsembleConfig",
             },
+            python_kinds={"module": "residnet.heads.module:ModuleHeadConfig"},
         ),
     ]
 """Configuration of any head, including heads of other packages, selected by `kind`."""

@@ -158,6 +158,15 @@ class ResidualHead(nn.Module, ABC):
                 return module.std
         return torch.ones(self.n_dof, dtype=torch.float64)
 
+    def zero_residual(self) -> None:
+        """Set the residual to zero for all channels, so that the model is its baseline.
+
+        The default sets the scales of all `ResidualScale` submodules to zero.
+        """
+        for module in self.modules():
+            if isinstance(module, ResidualScale):
+                module.std.zero_()
+
     def parameter_counts(self) -> list[float]:
         """Return the number of fitted parameters per axis.
 

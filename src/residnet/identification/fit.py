@@ -7,7 +7,7 @@ from contextlib import contextmanager, nullcontext
 from multiprocessing import get_context
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -24,17 +24,19 @@ from residnet.core.progress import (
     on_progress,
     report_progress,
 )
+from residnet.core.registry import is_python_part
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, restore_module
-from residnet.heads.base import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig
 from residnet.identification.bands import calibrate_bands
 from residnet.identification.fitter import FitStore, FittedModel, Fitter
 from residnet.identification.identified import IdentifiedModels
-from residnet.identification.recipe import LONG_TRAINING_DURATION
+from residnet.identification.recipe import CANDIDATE_HEADS, LONG_TRAINING_DURATION
 from residnet.identification.settings import FitSettings
 from residnet.preprocessing.prepare import PreparedLog
-from residnet.training.config import TrainingConfig
+
+if TYPE_CHECKING:
+    from residnet.training.trainer import TrainerExtensions
 
 Logs = Mapping[str, Sequence[PreparedLog]]
 _MIN_PARALLEL_STEPS = 100_000
@@ -45,7 +47,11 @@ So many steps take 13 s, and the start of a process with its imports takes 4.5 s
 
 
 def fit_models(
-    logs: Logs, settings: FitSettings, *, store: FitStore | None = None
+    logs: Logs,
+    settings: FitSettings,
+    *,
+    store: FitStore | None = None,
+    extensions: TrainerExtensions | None = None,
 ) -> IdentifiedModels:
     """Fit the baselines, then heads on their residuals, then ensembles.
 
@@ -54,13 +60,14 @@ def fit_models(
         settings: settings of the identification.
         store: saves every finished model and returns finished heads of an interrupted fit; None to
             save nothing.
+        extensions: callbacks and logger of the user for trainings; None for none.
 
     Raises:
         FitError: if the data do not determine a part, or no training gave a finite free run.
         DataError: if a split has no sample or no window.
     """
     store = store or FitStore()
-    fitter = Fitter(logs, settings, store)
+    fitter = Fitter(logs, settings, store, extensions=extensions)
     if not should_include_validation(fitter.settings, logs["train"]):
         return _fit_all_parts(fitter, logs)
     log_message(
@@ -74,6 +81,7 @@ def fit_models(
             store,
             resolve_recipe=False,
             validation_in_training=True,
+            extensions=extensions,
         ),
         logs_with_validation,
     )
@@ -105,8 +113,11 @@ def _fit_all_parts(fitter: Fitter, logs: Logs) -> IdentifiedModels:
         log_message(f"  {name}: {_describe_validation(models[name])}")
     for name, members in settings.means.items():
         with _skip_if_optional(settings, name):
+            candidate_names = CANDIDATE_HEADS if settings.recipe is not None else ()
             models[name] = fitter.build_trajectory_ensemble(
-                name, [models[member_name] for member_name in members if member_name in models]
+                name,
+                [models[member] for member in members if member in models],
+                [models[candidate] for candidate in candidate_names if candidate in models],
             )
             log_message(f"  {name}: {_describe_validation(models[name])}")
     identified = IdentifiedModels(
@@ -203,14 +214,16 @@ def count_parallel_heads(fitter: Fitter) -> int:
     Only trainings that take longer than the start of a process run in parallel. Heads are fitted
     one after another if the samples are kept in memory-mapped files, which worker processes would
     have to copy, or if a training already uses a GPU or several processes.
+    Callbacks and loggers of the user belong to this process.
     """
     settings = fitter.settings
-    trainings = [settings.training.get(name, TrainingConfig()) for name in settings.heads]
     is_distributed = any(
         training_config.processes > 1 or training_config.device != "cpu"
-        for training_config in trainings
+        for training_config in settings.training.values()
     )
-    if is_distributed or len(fitter.training_samples) > paged.MAX_SAMPLES_IN_MEMORY:
+    if fitter.extensions is not None or is_distributed:
+        return 1
+    if len(fitter.training_samples) > paged.MAX_SAMPLES_IN_MEMORY:
         return 1
     n_long_trainings = sum(is_long_training(fitter, name) for name in settings.heads)
     return max(min(available_cores() // torch.get_num_threads(), n_long_trainings), 1)
@@ -219,9 +232,10 @@ def count_parallel_heads(fitter: Fitter) -> int:
 def is_long_training(fitter: Fitter, name: str) -> bool:
     """Return whether the training of a head takes long enough for a separate process."""
     settings = fitter.settings
-    if isinstance(settings.heads[name].build(fitter.signals.names), ClosedFormHead):
+    training_config = settings.training.get(name)
+    # heads in closed form have no training, and another process cannot build a part of this one
+    if training_config is None or is_python_part(settings.heads[name]):
         return False
-    training_config = settings.training.get(name, TrainingConfig())
     one_step_config = training_config.one_step
     epochs_and_lengths = [
         (one_step_config.epochs, one_step_config.window),

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -33,8 +33,9 @@ from residnet.evaluation.freerun import Candidate, FreeRunErrors, run_free_runs
 from residnet.evaluation.protocol import EvaluationConfig, make_windows
 from residnet.heads.base import ClosedFormHead
 from residnet.identification.prepared import PreparedSplits, compute_velocity_limits
-from residnet.identification.recipe import TrainingDataSummary
+from residnet.identification.recipe import TrainingDataSummary, has_enough_logs_for_networks
 from residnet.identification.settings import FitSettings
+from residnet.identification.training_schedule import resolve_training
 from residnet.preprocessing.prepare import PreparedLog, compute_training_ranges, make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import Coefficient, Solution
@@ -42,6 +43,9 @@ from residnet.regression.sparse import coefficient_to_dict
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import find_free_run_starts, refit, require_parametric_baseline
 from residnet.training.score import ExampleRun, Score
+
+if TYPE_CHECKING:
+    from residnet.training.trainer import TrainerExtensions
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,8 @@ class FitStore:
 
 
 _FIRST_BASELINE = "baseline"
+_MIN_GAIN_OF_CANDIDATE = 0.02
+"""Smallest relative decrease of the validation error for which a candidate joins an ensemble."""
 
 
 def find_reference_names(models: Iterable[FittedModel]) -> dict[str, str]:
@@ -294,6 +300,27 @@ def _find_best_with_neighbours(
     )
 
 
+@dataclass(frozen=True)
+class HeadFit:
+    """A head in the course of its fit.
+
+    Attributes:
+        spec: description of the model.
+        model: model with the fitted baseline and the head, whose parameters are fitted.
+        baseline: the fitted baseline.
+        residuals: training samples with the residual of the baseline as target.
+        seed: seed of the initial weights and of the batches.
+        start_time: time of the start, s.
+    """
+
+    spec: ModelSpec
+    model: HybridDynamics
+    baseline: FittedModel
+    residuals: Samples
+    seed: int
+    start_time: float
+
+
 class Fitter:
     """The single steps of a fit on one set of logs.
 
@@ -301,9 +328,11 @@ class Fitter:
         logs: prepared logs by split; `train` and `validation` are used.
         settings: settings of the identification.
         store: storage of finished models.
-        resolve_recipe: whether the recipe's parts are still to be derived from the logs.
+        resolve_recipe: whether the recipe's parts and the trainings are still to be derived from
+            the logs.
         validation_in_training: whether training uses the validation logs, which then select
             nothing.
+        extensions: callbacks and logger of the user for trainings; None for none.
     """
 
     def __init__(
@@ -314,8 +343,10 @@ class Fitter:
         *,
         resolve_recipe: bool = True,
         validation_in_training: bool = False,
+        extensions: TrainerExtensions | None = None,
     ) -> None:
         self.store = store
+        self.extensions = extensions
         self.validation_in_training = validation_in_training
         self.training_logs = logs["train"]
         self.signals = settings.signals.build()
@@ -328,13 +359,8 @@ class Fitter:
         )
         self.training_samples = make_samples(self.training_logs, self.signals)
         self.validation_samples = make_samples(logs["validation"], self.signals)
-        if resolve_recipe and settings.recipe is not None:
-            dt = settings.prepare.grid.step
-            data_summary = TrainingDataSummary.from_logs(
-                self.training_samples, self.training_logs, settings.evaluation, dt
-            )
-            settings = settings.with_parts(data_summary)
-        self.settings = settings
+        self.settings = self._resolve_settings(settings) if resolve_recipe else settings
+        settings = self.settings
         self.state_scales = torch.from_numpy(settings.evaluation.scales.to_array())
         self.score_on_validation = ValidationScorer(
             logs["validation"],
@@ -343,6 +369,35 @@ class Fitter:
             self.velocity_limits,
             use_overlapping_windows=settings.recipe is not None,
         )
+
+    def _resolve_settings(self, settings: FitSettings) -> FitSettings:
+        """Return the settings with the recipe's parts and the trainings that follow from the logs.
+
+        The trainings of all networks are listed, also those that the user has set.
+        """
+        summary = TrainingDataSummary.from_logs(
+            self.training_samples,
+            self.training_logs,
+            settings.evaluation,
+            settings.prepare.grid.step,
+        )
+        if settings.recipe is not None:
+            settings = settings.with_parts(summary)
+            if not has_enough_logs_for_networks(summary):
+                log_message(
+                    f"  mlp and lstm are left out: the training logs of"
+                    f" {summary.n_samples * summary.dt:.0f} s are shorter than ten free runs of"
+                    f" {summary.free_run_length:g} s"
+                )
+        training_configs = {}
+        for name, head_config in settings.heads.items():
+            head = head_config.build(self.signals.names)
+            if not isinstance(head, ClosedFormHead):
+                training_config = settings.training.get(name, TrainingConfig())
+                training_configs[name] = resolve_training(
+                    training_config, head, summary, settings.effort
+                )
+        return settings.model_copy(update={"training": training_configs})
 
     def build_spec(self, name: str, role: str, baseline: BaselineConfig) -> ModelSpec:
         """Return the description of a model of this fit.
@@ -439,18 +494,12 @@ class Fitter:
         finished_model = self.store.load_finished(name)
         if finished_model is not None:
             return finished_model
-        spec = self.build_spec(name, "head", self.settings.get_baseline_config(name))
-        # the seed depends on the head's name only, so that another head does not change this one
-        seed = self.settings.seed * 1_000 + sum(map(ord, name))
-        torch.manual_seed(seed)
-        model = spec.build_single_model()
-        model.baseline.load_state_dict(copy.deepcopy(baseline.model.baseline.state_dict()))
-        residuals = compute_residual_samples(model, self.training_samples)
-        start_time = time.perf_counter()
+        head_fit = self.start_head(name, baseline)
+        model = head_fit.model
         if isinstance(model.head, ClosedFormHead):
-            model.head.calibrate(residuals)
+            model.head.calibrate(head_fit.residuals)
             try:
-                solutions = model.head.fit_solutions(residuals)
+                solutions = model.head.fit_solutions(head_fit.residuals)
                 solution, choice_notes = select_by_free_run(
                     model, model.head, solutions, self.score_on_validation
                 )
@@ -461,42 +510,105 @@ class Fitter:
             # imported here because it imports Lightning, which takes seconds to load
             from residnet.training.heads import train
 
-            training_config = self.settings.training.get(name, TrainingConfig())
-            dtype = torch.float64 if training_config.is_double_precision else torch.float32
-            windows = WindowStore.from_logs(self.training_logs, dtype)
-            folder = self.store.training_folder
-
-            def validate(trained_model: HybridDynamics) -> Score:
-                return self.score_on_validation(spec.average_networks(trained_model))
-
             notes = train(
                 name,
-                model,
-                residuals,
-                windows,
-                training_config,
-                self.state_scales,
-                validate,
-                seed,
-                folder,
+                *self.training_arguments(head_fit),
+                self.store.training_folder,
+                self.extensions,
             )
+        return self.finish_head(head_fit, notes)
+
+    def start_head(self, name: str, baseline: FittedModel) -> HeadFit:
+        """Build the model of a head on a fitted baseline, with the residuals that it learns."""
+        spec = self.build_spec(name, "head", self.settings.get_baseline_config(name))
+        # the seed depends on the head's name only, so that another head does not change this one
+        seed = self.settings.seed * 1_000 + sum(map(ord, name))
+        torch.manual_seed(seed)
+        model = spec.build_single_model()
+        model.baseline.load_state_dict(copy.deepcopy(baseline.model.baseline.state_dict()))
+        residuals = compute_residual_samples(model, self.training_samples)
+        return HeadFit(spec, model, baseline, residuals, seed, time.perf_counter())
+
+    def training_arguments(
+        self, head_fit: HeadFit
+    ) -> tuple[
+        HybridDynamics,
+        Samples,
+        WindowStore,
+        TrainingConfig,
+        Tensor,
+        Callable[[HybridDynamics], Score],
+        int,
+    ]:
+        """Return the arguments of `training.heads.make_training` for a network."""
+        training_config = self.settings.training[head_fit.spec.name]
+        dtype = torch.float64 if training_config.is_double_precision else torch.float32
+
+        def validate(trained_model: HybridDynamics) -> Score:
+            return self.score_on_validation(head_fit.spec.average_networks(trained_model))
+
+        return (
+            head_fit.model,
+            head_fit.residuals,
+            WindowStore.from_logs(self.training_logs, dtype),
+            training_config,
+            self.state_scales,
+            validate,
+            head_fit.seed,
+        )
+
+    def finish_head(self, head_fit: HeadFit, notes: dict[str, Any]) -> FittedModel:
+        """Validate a fitted head and store it.
+
+        Args:
+            notes: notes of the fit or of the training.
+        """
+        name = head_fit.spec.name
+        model = head_fit.spec.average_networks(head_fit.model)
+        training_config = self.settings.training.get(name)
+        if training_config is not None:
+            notes["training"] = training_config.model_dump(mode="json")
+            if training_config.require_improvement and self._is_worse_than_baseline(
+                model, head_fit.baseline
+            ):
+                log_message(
+                    f"  {name}: no epoch has a smaller validation error than the baseline; the"
+                    " residual is set to zero"
+                )
+                head_fit.model.head.zero_residual()
+                notes["zero_residual"] = True
         notes |= {
             "baseline": self.settings.get_baseline_name(name),
-            "seconds": round(time.perf_counter() - start_time, 1),
-            **self._validation_notes(spec.average_networks(model)),
+            "seconds": round(time.perf_counter() - head_fit.start_time, 1),
+            **self._validation_notes(model),
         }
-        return self._save_and_reload(FittedModel(spec, spec.average_networks(model), notes))
+        return self._save_and_reload(FittedModel(head_fit.spec, model, notes))
+
+    def _is_worse_than_baseline(self, model: HybridDynamics, baseline: FittedModel) -> bool:
+        """Return whether a model has a larger validation error than its baseline."""
+        if "validation" not in baseline.notes:
+            # the constant-velocity model
+            return False
+        score = self.score_on_validation(model)
+        baseline_score = (
+            baseline.notes["validation_diverged"],
+            baseline.notes["validation"],
+        )
+        return (score.diverged, score.error) > baseline_score
 
     def build_acceleration_ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
         """Return the mean acceleration of fitted models as one model."""
         return self._save_and_reload(self._build_ensemble(name, members, "accelerations"))
 
-    def build_trajectory_ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
+    def build_trajectory_ensemble(
+        self, name: str, members: Sequence[FittedModel], candidates: Sequence[FittedModel] = ()
+    ) -> FittedModel:
         """Return the ensemble of fitted models: the mean of their trajectories.
 
         Members that diverge on a validation window are removed. A member with so large an error
         that it degrades the mean even of independent errors is removed if the mean of the others
-        has a smaller validation error. Logs used in training do not count as evidence.
+        has a smaller validation error. Candidates join if the validation error then decreases, in
+        the order of their own errors. Logs used in training do not count as evidence.
 
         Raises:
             FitError: if fewer than two members remain.
@@ -535,8 +647,33 @@ class Fitter:
             ensemble = reduced_ensemble if len(retained_members) > 1 else None
         if ensemble is None:
             raise FitError("no mean has a smaller error on validation logs than one of its members")
+        if not self.validation_in_training:
+            ensemble = self._extend_ensemble(name, ensemble, retained_members, candidates)
         ensemble.notes["left_out"] = excluded_names
         return self._save_and_reload(ensemble)
+
+    def _extend_ensemble(
+        self,
+        name: str,
+        ensemble: FittedModel,
+        members: Sequence[FittedModel],
+        candidates: Sequence[FittedModel],
+    ) -> FittedModel:
+        """Return the ensemble with the candidates that reduce its validation error."""
+        sound_candidates = [
+            candidate for candidate in candidates if not candidate.notes["validation_diverged"]
+        ]
+        for candidate in sorted(sound_candidates, key=lambda one: one.notes["validation"]):
+            extended_ensemble = self._build_ensemble(name, [*members, candidate])
+            error = extended_ensemble.notes["validation"]
+            if error < (1.0 - _MIN_GAIN_OF_CANDIDATE) * ensemble.notes["validation"]:
+                log_message(
+                    f"  {name}: with {candidate.name} the validation error is {error:.4f} instead"
+                    f" of {ensemble.notes['validation']:.4f}"
+                )
+                members = [*members, candidate]
+                ensemble = extended_ensemble
+        return ensemble
 
     def _build_ensemble(
         self, name: str, members: Sequence[FittedModel], averaged_quantity: str = "trajectories"
@@ -607,7 +744,7 @@ def check_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
             except FitError as error:
                 raise FitError(f"head {name}: {error}") from None
         else:
-            training_config = settings.training.get(name, TrainingConfig())
+            training_config = settings.training[name]
             for window_config in training_config.windows(dt):
                 if window_config is not None:
                     window_config.make_samplers(window_store, training_config.steps)

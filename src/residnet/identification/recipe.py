@@ -25,7 +25,7 @@ from residnet.core.stretches import find_runs
 from residnet.dynamics.base import Integrator
 from residnet.evaluation.protocol import EvaluationConfig, WindowProtocol, longest_segment_length
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
-from residnet.physics.symmetry import get_dof, mirror_channels, violates_symmetry
+from residnet.physics.symmetry import get_dof, violates_symmetry
 from residnet.preprocessing.channel_values import bridge_spikes
 from residnet.preprocessing.masks import MaskRule, apply_masks, find_scored_samples
 from residnet.preprocessing.motion import remove_pauses
@@ -331,11 +331,6 @@ _STEP_PER_ROLL_RADIAN = 0.5
 """Largest step of the networks in radians of a roll oscillation."""
 _REFIT_STEPS = 200
 """Smallest number of steps of the free runs of a refit."""
-_BATCH_PER_NETWORK = 32
-"""Windows in a batch for each network."""
-_BATCHES_PER_EPOCH = 15
-_BATCHES_PER_EPOCH_LONG = 40
-"""Batches per epoch, for short and for long logs."""
 
 
 def make_refit_settings(data_summary: TrainingDataSummary) -> dict[str, Any]:
@@ -351,48 +346,6 @@ def make_refit_settings(data_summary: TrainingDataSummary) -> dict[str, Any]:
         if has_long_logs(data_summary) or get_dof(data_summary.channel_names).is_six_dof
         else 1.0,
         "asymmetric": 0.05,
-    }
-
-
-def make_training_settings(data_summary: TrainingDataSummary, effort: float) -> dict[str, Any]:
-    """Return the training settings of networks: free runs with growing horizons, no early stop."""
-    stages = [
-        {
-            "horizon": round_to_three_digits(
-                max(
-                    horizon_share * data_summary.max_free_run_length,
-                    2.0 * compute_network_step(data_summary),
-                )
-            ),
-            "epochs": epochs,
-            "batch": _BATCH_PER_NETWORK * count_networks(data_summary),
-            "learning_rate": learning_rate,
-            "final": final_rate_share,
-        }
-        # the learning rates and their final shares form one cosine over all stages
-        for horizon_share, epochs, learning_rate, final_rate_share in (
-            (0.3, 5, 3.0e-3, 0.854),
-            (0.6, 5, 2.56e-3, 0.586),
-            (1.0, 10, 1.5e-3, 0.04),
-        )
-    ]
-    return {
-        "history": round_to_three_digits(data_summary.history),
-        "one_step": {"epochs": 0},
-        "multi_step": stages,
-        "steps": max(
-            1,
-            round(
-                (_BATCHES_PER_EPOCH_LONG if has_long_logs(data_summary) else _BATCHES_PER_EPOCH)
-                * effort
-            ),
-        ),
-        "start_noise": 0.03,
-        "weight_decay": 0.001,
-        "robust": 0.05,
-        "mirror": mirror_channels(data_summary.channel_names) is not None,
-        # validation at the end only: the schedule is fixed and the last weights are used
-        "validate_every": 20,
     }
 
 
@@ -427,21 +380,34 @@ PART_KEYS = (
 """Config keys of a fit that the recipe sets."""
 SINGLE_MODEL_NAME = "hull"
 """Name of the model that is used where a single model is required."""
+CANDIDATE_HEADS = ("plsr", "mlp", "lstm")
+"""Heads on the linear baseline, which join the ensemble if its validation error decreases."""
+_MIN_FREE_RUNS_FOR_NETWORKS = 10
+"""Length of the training logs, as a multiple of a free run, from which `mlp` and `lstm` are fitted.
+Chosen by hand."""
 _HEAD_BASELINES = {"hull_network": SINGLE_MODEL_NAME, "network": CONSTANT_VELOCITY}
 """Baselines of the networks."""
 
 
-def make_portfolio(data_summary: TrainingDataSummary, effort: float = 1.0) -> dict[str, Any]:
-    """Return baselines, refits, heads and trainings of the recipe by name.
+def has_enough_logs_for_networks(data_summary: TrainingDataSummary) -> bool:
+    """Return whether the training logs are long enough for `mlp` and `lstm`."""
+    return (
+        data_summary.n_samples * data_summary.dt
+        >= _MIN_FREE_RUNS_FOR_NETWORKS * data_summary.free_run_length
+    )
+
+
+def make_portfolio(data_summary: TrainingDataSummary) -> dict[str, Any]:
+    """Return baselines, refits, heads and ensembles of the recipe by name.
 
     `baseline` is linear and `hull` nonlinear in velocities and inputs, both refitted; long logs
     allow more terms of the hull. `hull_network` holds recurrent networks on the hull, and for long
     logs `network` the same number of black-box networks. The ensemble of hull and networks is the
-    predictor.
+    predictor. `plsr`, `mlp` and `lstm` are heads on the linear baseline and candidates for the
+    ensemble.
 
     Args:
         data_summary: properties of the logs; assumed values before they are read.
-        effort: training duration, 1 for the usual one.
     """
     network_config = {
         "kind": "recurrent",
@@ -451,9 +417,16 @@ def make_portfolio(data_summary: TrainingDataSummary, effort: float = 1.0) -> di
         "restoring": True,
         "margin": 0.0,
     }
-    heads = {"hull_network": network_config} | (
+    heads: dict[str, dict[str, Any]] = {"hull_network": network_config} | (
         {"network": network_config} if has_long_logs(data_summary) else {}
     )
+    recurrent_heads = tuple(heads)
+    heads |= {"plsr": {"kind": "plsr"}}
+    if has_enough_logs_for_networks(data_summary):
+        heads |= {
+            "mlp": {"kind": "mlp", "hidden": [32, 32]},
+            "lstm": {"kind": "lstm", "hidden_size": 24, "readout": 32},
+        }
     regressors = (
         make_full_hull_terms(data_summary)
         if has_long_logs(data_summary)
@@ -475,8 +448,9 @@ def make_portfolio(data_summary: TrainingDataSummary, effort: float = 1.0) -> di
             name: baseline_name for name, baseline_name in _HEAD_BASELINES.items() if name in heads
         },
         "ensembles": {},
-        "means": {ENSEMBLE: (SINGLE_MODEL_NAME, *heads)},
-        "training": dict.fromkeys(heads, make_training_settings(data_summary, effort)),
+        "means": {ENSEMBLE: (SINGLE_MODEL_NAME, *recurrent_heads)},
+        # the schedule of every network follows from the logs
+        "training": {},
     }
 
 

@@ -43,7 +43,7 @@ class ModelPartsConfig(Config):
         ensembles: models by name that average the accelerations of their members.
         means: models by name that average the trajectories of their members; members that diverge
             on a validation window are removed.
-        training: training settings by head; defaults otherwise.
+        training: training settings by head; what is not set follows from the logs.
     """
 
     baseline: BaselineConfig = ZeroBaselineConfig()
@@ -74,8 +74,8 @@ class FitSettings(ModelPartsConfig):
             logs also black-box networks, and `ensemble`, the mean of the trajectories of hull and
             networks, which is reported first and exported by default. Terms, sizes and trainings
             follow from the logs. Null for explicit parts.
-        effort: training duration of the recipe's networks: 1 for the usual one, less for a quick
-            look.
+        effort: factor of the duration of trainings that follow from the logs: 1 for the usual one,
+            less for a quick look.
     """
 
     seed: int = Field(default=0, ge=0)
@@ -105,9 +105,7 @@ class FitSettings(ModelPartsConfig):
 
     def with_parts(self, data_summary: TrainingDataSummary) -> Self:
         """Return the settings with the parts of the recipe for the given logs."""
-        parts = validate_config(
-            make_portfolio(data_summary, self.effort), ModelPartsConfig, "recipe"
-        )
+        parts = validate_config(make_portfolio(data_summary), ModelPartsConfig, "recipe")
         return self.model_copy(update={key: getattr(parts, key) for key in PART_KEYS})
 
     @model_serializer(mode="wrap")

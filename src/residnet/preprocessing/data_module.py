@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, final
 
 import lightning as L
@@ -68,7 +68,8 @@ class EpochBatches:
         return self.module.n_batches
 
     def __iter__(self) -> Iterator[Any]:
-        return self.module.iterate_batches(self.module.current_epoch)
+        # a generator, because a resumed trainer makes the iterator before it restores the epoch
+        yield from self.module.iterate_batches(self.module.current_epoch)
 
 
 class WindowBatch(NamedTuple):
@@ -101,13 +102,13 @@ class WindowBatch(NamedTuple):
 class WindowsDataModule(EpochDataModule):
     """Training windows of measured logs for any Lightning module.
 
-    A batch is a tuple of `WindowBatch`: windows at any row, then, if the stage has them, windows
-    near segment starts. For example, with `prepared` logs and a module whose
+    A training batch is a tuple of `WindowBatch`: windows at any row, then, if the stage has them,
+    windows near segment starts. Validation and test batches hold consecutive windows of these logs,
+    each once. For example, with `data` from `residnet.prepare` and a module whose
     `training_step(self, batch, batch_index)` accepts such a tuple:
 
-        stage = WindowStage(n_window_samples=100, batch_size=256)
-        data = WindowsDataModule.from_logs(prepared, stage, n_batches=50)
-        lightning.Trainer(max_epochs=20).fit(module, data)
+        windows = data.module(windows="10 s")
+        lightning.Trainer(max_epochs=20).fit(module, windows)
 
     Args:
         store: samples of all logs.
@@ -116,6 +117,8 @@ class WindowsDataModule(EpochDataModule):
         seed: seed of the random batches.
         get_stage: returns the stage index of an epoch; None for a single stage.
         get_epoch: see `EpochDataModule`.
+        held_out: samples of the `validation` and `test` logs; a split that is missing has no
+            batches.
 
     Raises:
         DataError: if no log is long enough for a stage.
@@ -129,23 +132,56 @@ class WindowsDataModule(EpochDataModule):
         seed: int = 0,
         get_stage: Callable[[int], int] | None = None,
         get_epoch: Callable[[], int] | None = None,
+        held_out: Mapping[str, WindowStore] | None = None,
     ) -> None:
         super().__init__(seed, get_epoch)
+        self.held_out = dict(held_out or {})
         self.store = store
         self.stages = list(stages)
         self._n_batches = n_batches
-        self._get_stage = get_stage or (lambda epoch: 0)
+        # a method, because spawned processes receive it pickled
+        self._get_stage = get_stage or self._single_stage
         self._samplers = [
             stage_settings.make_samplers(store, n_batches) if stage_settings else []
             for stage_settings in self.stages
         ]
 
+    def _single_stage(self, epoch: int) -> int:
+        return 0
+
     @classmethod
-    def from_logs(
-        cls, logs: Sequence[Any], stage: WindowStage, n_batches: int, seed: int = 0
+    def from_splits(
+        cls,
+        splits: Mapping[str, Sequence[Any]],
+        stage: WindowStage,
+        n_batches: int,
+        seed: int = 0,
+        dtype: torch.dtype = torch.float32,
     ) -> WindowsDataModule:
-        """Create a data module with one stage from prepared logs, in single precision."""
-        return cls(WindowStore.from_logs(logs), [stage], n_batches, seed)
+        """Create a data module with one stage from prepared logs by split.
+
+        Args:
+            splits: prepared logs of `train`, and of `validation` and `test` if there are any.
+            stage: settings of the windows.
+            n_batches: number of training batches per epoch.
+            seed: seed of the random batches.
+            dtype: floating-point type of the windows.
+        """
+        stores = {
+            name: WindowStore.from_logs(logs, dtype) for name, logs in splits.items() if len(logs)
+        }
+        return cls(stores.pop("train"), [stage], n_batches, seed, held_out=stores)
+
+    def val_dataloader(self) -> HeldOutBatches | list[Any]:
+        """Return the consecutive windows of the validation logs; an empty list without any."""
+        return self._held_out_batches("validation")
+
+    def test_dataloader(self) -> HeldOutBatches | list[Any]:
+        """Return the consecutive windows of the test logs; an empty list without any."""
+        return self._held_out_batches("test")
+
+    def _held_out_batches(self, split: str) -> HeldOutBatches | list[Any]:
+        return HeldOutBatches(self, split) if split in self.held_out else []
 
     @property
     def n_batches(self) -> int:
@@ -169,7 +205,12 @@ class WindowsDataModule(EpochDataModule):
             )
 
     def make_window_batch(
-        self, starts: Tensor, length: int, history: int, columns: Sequence[str] = WINDOW_COLUMNS
+        self,
+        starts: Tensor,
+        length: int,
+        history: int,
+        columns: Sequence[str] = WINDOW_COLUMNS,
+        store: WindowStore | None = None,
     ) -> WindowBatch:
         """Return the windows that begin at given rows of the store.
 
@@ -178,8 +219,9 @@ class WindowsDataModule(EpochDataModule):
             length: samples in a window.
             history: samples before a window.
             columns: attributes of the store to include; others are empty.
+            store: samples of the logs; None for the training logs.
         """
-        store = self.store
+        store = self.store if store is None else store
         window_columns = dict.fromkeys((*WINDOW_COLUMNS, "precomputed"), store.y[:0]) | {
             name: store.take_windows(getattr(store, name), starts, length) for name in columns
         }
@@ -187,6 +229,56 @@ class WindowsDataModule(EpochDataModule):
         return WindowBatch(
             **window_columns, past_y=past_y, past_w=past_w, n_elapsed=store.n_elapsed[starts]
         )
+
+
+@final
+class HeldOutBatches:
+    """Iterable over batches of consecutive windows of the validation or test logs.
+
+    Windows do not overlap. In a distributed run each process receives a part of every batch; the
+    last windows are repeated until all parts have the same size, as in `DistributedSampler`.
+
+    Args:
+        module: data module whose last stage determines length and number of windows of a batch.
+        split: `validation` or `test`.
+
+    Raises:
+        DataError: if no log of the split holds a window.
+    """
+
+    def __init__(self, module: WindowsDataModule, split: str) -> None:
+        stage = module.stages[-1]
+        assert stage is not None, "the last stage of a training has epochs"
+        self.module = module
+        self.stage = stage
+        self.store = module.held_out[split]
+        possible_starts = self.store.find_starts(stage.n_window_samples)
+        has_history = self.store.n_elapsed[possible_starts] >= stage.n_history
+        if bool(has_history.any()):
+            possible_starts = possible_starts[has_history]
+        starts = []
+        index = 0
+        while index < len(possible_starts):
+            starts.append(int(possible_starts[index]))
+            index = int(torch.searchsorted(possible_starts, starts[-1] + stage.n_window_samples))
+        self.starts = torch.tensor(starts)
+
+    def __len__(self) -> int:
+        return -(-len(self.starts) // self.stage.batch_size)
+
+    def __iter__(self) -> Iterator[tuple[WindowBatch, ...]]:
+        rank, world_size = self.module.rank_and_world_size
+        for starts in self.starts.split(self.stage.batch_size):
+            n_missing = -len(starts) % world_size
+            padded = torch.cat((starts, starts[-1:].expand(n_missing)))
+            batch = self.module.make_window_batch(
+                padded[rank::world_size],
+                self.stage.n_window_samples,
+                self.stage.n_history,
+                self.stage.columns,
+                self.store,
+            )
+            yield (batch,)
 
 
 @final

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import UsageError
@@ -179,6 +179,11 @@ class Beginnings(Config):
 class TrainingConfig(MachineConfig):
     """Settings of a training: a teacher-forced stage, then free-run stages of growing horizon.
 
+    Without `one_step` and `multi_step`, `identification.training_schedule` derives both, and every
+    other key that is not set, from the training logs and the protocol that selects models. With one
+    of them, the training is exactly as set, and the other stage is omitted. The default values
+    of the other keys apply to this case only.
+
     Attributes:
         one_step: settings of the teacher-forced stage.
         multi_step: settings of the free-run stages (a curriculum of horizons).
@@ -196,9 +201,11 @@ class TrainingConfig(MachineConfig):
         patience: number of successive validations without a better free run, in the last stage,
             after which training stops.
         validate_every: number of epochs between validations.
+        require_improvement: whether the residual is set to zero if no epoch has a smaller
+            validation error than the baseline.
     """
 
-    one_step: OneStep = OneStep()
+    one_step: OneStep = OneStep(epochs=0)
     multi_step: tuple[MultiStep, ...] = ()
     steps: int = Field(default=25, ge=1, le=100_000)
     history: Seconds = Field(default=0.5, ge=0)
@@ -210,10 +217,11 @@ class TrainingConfig(MachineConfig):
     mirror: bool = False
     patience: int = Field(default=20, ge=1)
     validate_every: int = Field(default=1, ge=1)
+    require_improvement: bool = False
 
     @model_validator(mode="after")
-    def _work(self) -> TrainingConfig:
-        if self.epochs == 0:
+    def _check_stages(self) -> TrainingConfig:
+        if self.epochs == 0 and not self.is_derived:
             raise ValueError("nothing to train: one_step.epochs is 0 and multi_step is empty")
         if self.beginnings is not None and 1 in (
             self.one_step.batch,
@@ -232,9 +240,22 @@ class TrainingConfig(MachineConfig):
             )
         return self
 
+    @model_serializer(mode="wrap")
+    def _serialize_set_keys(self, default_serializer: SerializerFunctionWrapHandler) -> Any:
+        """Omit the keys that are derived from the logs, so that a stored config derives them."""
+        content: dict[str, Any] = default_serializer(self)
+        if self.is_derived:
+            content = {key: value for key, value in content.items() if key in self.model_fields_set}
+        return content
+
+    @property
+    def is_derived(self) -> bool:
+        """Whether the stages, and the keys that are not set, follow from logs and protocol."""
+        return not {"one_step", "multi_step"} & self.model_fields_set
+
     @property
     def epochs(self) -> int:
-        """Number of epochs of all stages."""
+        """Number of epochs of all stages; 0 for stages that are still to be derived."""
         return self.one_step.epochs + sum(stage.epochs for stage in self.multi_step)
 
     @property

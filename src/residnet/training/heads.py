@@ -25,7 +25,7 @@ from residnet.preprocessing.data_module import WindowBatch, WindowsDataModule
 from residnet.preprocessing.windows import WindowStore
 from residnet.training.config import TrainingConfig
 from residnet.training.score import Score
-from residnet.training.trainer import EpochTraining, run_epochs
+from residnet.training.trainer import EpochTraining, TrainerExtensions, run_epochs
 
 ProcessMean = Callable[[Tensor], Tensor]
 """Function from a sum over the windows of this process to the mean over all processes."""
@@ -186,6 +186,7 @@ class HeadTraining(EpochTraining):
     ) -> None:
         super().__init__(config, seed)
         self.model = model
+        self._validated_models = (model,)
         self.rollout = Rollout(model)
         self._compiled: FreeRun | None = None
         self.scales = scales
@@ -350,6 +351,66 @@ class HeadTraining(EpochTraining):
         return self.model, score.error
 
 
+def make_training(
+    model: HybridDynamics,
+    samples: Samples,
+    store: WindowStore,
+    config: TrainingConfig,
+    scales: torch.Tensor,
+    validate: Validate,
+    seed: int,
+) -> tuple[HeadTraining, WindowsDataModule]:
+    """Calibrate the head, and return the Lightning module and the data module of its training.
+
+    An ensemble of recurrent networks is trained at the coarse step of its gates. Each of its
+    networks has its own windows, and a batch holds the same number of windows for each.
+
+    Args:
+        model: the model with a fitted baseline; its head is trained.
+        samples: training samples whose target is the residual; they determine the scales of the
+            head.
+        store: training windows, in the precision of the training.
+        config: settings of the training.
+        scales: scales of the velocities, SI [n].
+        validate: returns the validation score of a model.
+        seed: seed of noise and batches.
+
+    Raises:
+        DataError: if no log is long enough for a stage.
+    """
+    model.head.calibrate(samples)
+    dtype = torch.float64 if config.is_double_precision else torch.float32
+    if isinstance(model.head, GRUEnsembleHead):
+        coarse, stride = _with_coarse_step(model, model.head)
+        angle_columns = [model.signals.direction_column] if model.signals.has_wind else []
+        store = store.coarsen(stride, angle_columns)
+
+        def validate_fine(trained: HybridDynamics) -> Score:
+            fine = HybridDynamics(
+                trained.signals, trained.baseline, trained.head, model.dt, model.integrator
+            )
+            try:
+                return validate(fine)
+            finally:
+                trained.head.set_step(coarse.dt)
+
+        module = HeadTraining(coarse, config, scales.to(dtype), validate_fine, seed)
+    else:
+        module = HeadTraining(model, config, scales.to(dtype), validate, seed)
+    # losses and scores use velocities only
+    module.model.has_position = False
+    module.model.to(dtype)
+    return module, module.data(store)
+
+
+def finish_training(model: HybridDynamics) -> None:
+    """Return a model to the state before `make_training`, with the trained weights."""
+    model.head.set_step(model.dt)
+    model.to(torch.float32)
+    model.has_position = True
+    model.eval().requires_grad_(False)
+
+
 def train(
     name: str,
     model: HybridDynamics,
@@ -360,21 +421,16 @@ def train(
     validate: Validate,
     seed: int,
     folder: Path | None,
+    extensions: TrainerExtensions | None = None,
 ) -> dict[str, Any]:
-    """Train the head of a model and load the weights of the best validation into it (float32).
+    """Train the head of a model and load its best weights.
 
     Args:
         name: name of the head.
-        model: model with a fitted baseline.
-        samples: training samples whose target is the residual; they determine the scales of the
-            head.
-        store: training windows, in the precision of the training.
-        config: settings of the training.
-        scales: scales of the velocities, SI [n].
-        validate: returns the validation score of a model.
-        seed: seed of noise and batches.
+        model: see `make_training`, as the other arguments.
         folder: folder of checkpoints and TensorBoard log; None to write neither. The checkpoint
             `checkpoints/<name>/last.ckpt` of an interrupted training is resumed.
+        extensions: callbacks and logger of the user; None for none.
 
     Returns:
         Notes about the training: learning curve, best score, number of parameters.
@@ -382,65 +438,21 @@ def train(
     Raises:
         FitError: if no validation gave a finite free run.
     """
-    model.head.calibrate(samples)
-    if isinstance(model.head, GRUEnsembleHead):
-        return _train_coarse(name, model, store, config, scales, validate, seed, folder)
-    dtype = torch.float64 if config.is_double_precision else torch.float32
-    # losses and scores use velocities only
-    model.has_position = False
     try:
-        module = HeadTraining(model.to(dtype), config, scales.to(dtype), validate, seed)
-        return run_epochs(name, module, module.data(store), model, model.head, folder, config)
+        module, data = make_training(model, samples, store, config, scales, validate, seed)
+        return run_epochs(name, module, data, module.model, model.head, folder, config, extensions)
     finally:
-        model.to(torch.float32)
-        model.has_position = True
+        finish_training(model)
 
 
-def _train_coarse(
-    name: str,
-    model: HybridDynamics,
-    store: WindowStore,
-    config: TrainingConfig,
-    scales: torch.Tensor,
-    validate: Validate,
-    seed: int,
-    folder: Path | None,
-) -> dict[str, Any]:
-    """Train an ensemble of recurrent networks at the coarse step of their gates; see `train`.
-
-    Each network has its own windows, and a batch holds the same number of windows for each.
-    """
-    head = model.head
-    assert isinstance(head, GRUEnsembleHead)
-    steps = max(round(head.training_step / model.dt), 1)
-    signals = model.signals
-    angle_columns = [signals.direction_column] if signals.has_wind else []
+def _with_coarse_step(model: HybridDynamics, head: GRUEnsembleHead) -> tuple[HybridDynamics, int]:
+    """Return the model at the step of the head's gates, and the ratio of the two steps."""
+    stride = max(round(head.training_step / model.dt), 1)
     # a baseline at a step of this length needs a second-order scheme; a residual is constant
     has_no_baseline = (
         isinstance(model.baseline, FixedBaseline) and not model.baseline.library.n_terms
     )
     # an explicit Euler scheme amplifies the roll oscillation
-    first: Integrator = "semi_implicit_euler" if model.has_roll else "euler"
-    scheme: Integrator = first if has_no_baseline else "heun"
-    coarse = HybridDynamics(signals, model.baseline, head, steps * model.dt, scheme)
-    coarse.has_position = False
-
-    def with_fine_step(trained: HybridDynamics) -> HybridDynamics:
-        return HybridDynamics(
-            trained.signals, trained.baseline, trained.head, model.dt, model.integrator
-        )
-
-    def validate_fine(trained: HybridDynamics) -> Score:
-        try:
-            return validate(with_fine_step(trained))
-        finally:
-            trained.head.set_step(coarse.dt)
-
-    dtype = torch.float64 if config.is_double_precision else torch.float32
-    try:
-        module = HeadTraining(coarse.to(dtype), config, scales.to(dtype), validate_fine, seed)
-        data = module.data(store.coarsen(steps, angle_columns))
-        return run_epochs(name, module, data, coarse, head, folder, config)
-    finally:
-        head.set_step(model.dt)
-        model.to(torch.float32)
+    first_order: Integrator = "semi_implicit_euler" if model.has_roll else "euler"
+    scheme: Integrator = first_order if has_no_baseline else "heun"
+    return HybridDynamics(model.signals, model.baseline, head, stride * model.dt, scheme), stride

@@ -11,13 +11,16 @@ import logging
 import math
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from torch import Tensor, nn
 
 from residnet.core.errors import FitError, UsageError
@@ -28,6 +31,7 @@ from residnet.preprocessing.data_module import EpochDataModule, compute_epoch_se
 from residnet.training.config import MachineConfig, OneStage, TrainingConfig
 from residnet.training.score import ExampleRun
 
+Callback = L.Callback
 Epochs = OneStage | TrainingConfig
 """Settings of a training."""
 _CHECKPOINT_FIELDS = (
@@ -37,8 +41,48 @@ _CHECKPOINT_FIELDS = (
 """Attributes of `EpochTraining` in a checkpoint, in addition to the state of Lightning."""
 
 
+@dataclass(frozen=True)
+class TrainerExtensions:
+    """Callbacks and logger of the user for all trainings of a fit.
+
+    Attributes:
+        callbacks: Lightning callbacks, called in addition to those of residnet.
+        logger: Lightning logger in place of the TensorBoard log of the run folder; None for the
+            latter.
+    """
+
+    callbacks: Sequence[Callback] = ()
+    logger: Logger | None = None
+
+
+def make_extensions(callbacks: Sequence[Callback], logger: Logger | None) -> TrainerExtensions:
+    """Check the callbacks and the logger of the user.
+
+    Raises:
+        UsageError: if one of them is not of Lightning.
+    """
+    if not isinstance(callbacks, list | tuple):
+        raise UsageError(f"callbacks: expected a list, given a {type(callbacks).__name__}")
+    for callback in callbacks:
+        if not isinstance(callback, L.Callback):
+            raise UsageError(
+                "callbacks: expected objects of lightning.Callback, given a"
+                f" {type(callback).__name__}"
+            )
+    if logger is not None and not isinstance(logger, Logger):
+        raise UsageError(
+            f"logger: expected a logger of lightning.pytorch.loggers, given a"
+            f" {type(logger).__name__}"
+        )
+    return TrainerExtensions(tuple(callbacks), logger)
+
+
 class EpochTraining(L.LightningModule, ABC):
-    """Base class of the Lightning modules that `run_epochs` trains.
+    """Base class of the Lightning modules of residnet's own trainings.
+
+    An ordinary `lightning.Trainer` gives the same result as `run_epochs`: the module clips its
+    gradients, validates at the end of each epoch, logs the score as `validation`, stops early, and
+    has the best weights after the fit. `max_epochs` of the trainer only needs to be large enough.
 
     The seed of an epoch depends on (seed, epoch) only, so that a run resumed after an epoch gives
     the same result as an uninterrupted run.
@@ -64,6 +108,8 @@ class EpochTraining(L.LightningModule, ABC):
         self.history: list[dict[str, float]] = []
         self.axes: dict[str, float] = {}
         self.example: ExampleRun | None = None
+        # in a tuple, because an attribute would become a second submodule
+        self._validated_models: tuple[nn.Module, ...] = ()
 
     @abstractmethod
     def compute_validation_score(self) -> tuple[nn.Module, float]:
@@ -97,11 +143,31 @@ class EpochTraining(L.LightningModule, ABC):
         """Seed the random numbers of the current epoch."""
         torch.manual_seed(compute_epoch_seed(self.seed, self.epoch))
 
-    def finish_epoch(self) -> None:
-        """Validate, save the best weights, and stop early in the last stage.
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip gradients by the norm of the settings unless the trainer has a value of its own."""
+        self.clip_gradients(
+            optimizer,
+            gradient_clip_val=gradient_clip_val or self.settings.gradient_clip,
+            gradient_clip_algorithm=gradient_clip_algorithm or "norm",
+        )
 
-        `EpochEnd` calls this before it writes the checkpoint.
-        """
+    def on_train_epoch_end(self) -> None:
+        """Finish the epoch before Lightning's checkpoint callbacks save it."""
+        self.finish_epoch()
+
+    def on_fit_end(self) -> None:
+        """Load the weights of the best validation."""
+        if self.best_state:
+            for model in self._validated_models:
+                model.load_state_dict(self.best_state)
+
+    def finish_epoch(self) -> None:
+        """Validate, save the best weights, and stop after the last epoch or early."""
         stage, _ = self.settings.stage(self.epoch)
         last = self.epoch + 1 == self.settings.epochs
         entry = {
@@ -115,12 +181,15 @@ class EpochTraining(L.LightningModule, ABC):
         if last or (self.epoch + 1) % self.settings.validate_every == 0:
             model, score = self.compute_validation_score()
             entry["validation"] = score
+            # for callbacks that monitor a value, such as `ModelCheckpoint`
+            self.log("validation", score, logger=False)
             entry["diverged"] = float(self.diverged)
             if self._is_improvement(score):
                 self.best_score = score
                 self.best_diverged = self.diverged
                 self.without_gain = 0
                 self.best_state = _copy_state(model)
+                self._validated_models = (model,)
             else:
                 self.without_gain += 1
         self.history.append(entry)
@@ -133,7 +202,7 @@ class EpochTraining(L.LightningModule, ABC):
         self.stopped = (
             stage == self.settings.last_stage and self.without_gain >= self.settings.patience
         )
-        self.trainer.should_stop = self.stopped
+        self.trainer.should_stop = self.is_finished
 
     def _is_improvement(self, score: float) -> bool:
         if not self.best_state:
@@ -169,11 +238,11 @@ def _copy_state(model: nn.Module) -> dict[str, Tensor]:
     return {name: value.detach().to("cpu", copy=True) for name, value in model.state_dict().items()}
 
 
-class EpochEnd(L.Callback):
-    """Validate, write `last.ckpt` and report progress at the end of each epoch.
+class EpochEnd(Checkpoint):
+    """Write `last.ckpt` and report progress at the end of each epoch.
 
-    A callback does this because Lightning calls callbacks before the hooks of the module, and the
-    checkpoint must contain the result of the validation.
+    Lightning calls checkpoint callbacks after the hooks of the module, so that the checkpoint
+    contains the result of the validation.
 
     Args:
         name: name of the trained module in progress messages.
@@ -187,9 +256,8 @@ class EpochEnd(L.Callback):
         self.checkpoint = checkpoint
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Finish the epoch, write the checkpoint, and report the loss and the best score."""
+        """Write the checkpoint, and report the loss and the best score."""
         assert isinstance(pl_module, EpochTraining)
-        pl_module.finish_epoch()
         if self.checkpoint is not None and trainer.is_global_zero:
             with atomic_write(self.checkpoint) as file:
                 trainer.save_checkpoint(file)
@@ -217,6 +285,7 @@ def run_epochs(
     trained: nn.Module,
     folder: Path | None,
     machine: MachineConfig | None = None,
+    extensions: TrainerExtensions | None = None,
 ) -> dict[str, Any]:
     """Train to the last epoch and load the best weights into the model.
 
@@ -231,6 +300,7 @@ def run_epochs(
         trained: submodule of `model` whose parameters are counted.
         folder: folder of checkpoints and TensorBoard log; None to write neither.
         machine: hardware and precision; None for one process on the CPU.
+        extensions: callbacks and logger of the user; None for none.
 
     Returns:
         Notes about the training: learning curve, best score, score before the first epoch (if
@@ -244,7 +314,10 @@ def run_epochs(
     machine = machine or MachineConfig()
     if machine.processes > 1 and folder is None:
         with TemporaryDirectory() as temporary:
-            return run_epochs(name, module, data, model, trained, Path(temporary), machine)
+            return run_epochs(
+                name, module, data, model, trained, Path(temporary), machine, extensions
+            )
+    extensions = extensions or TrainerExtensions()
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     settings: Epochs = module.settings
     logger = None
@@ -255,8 +328,9 @@ def run_epochs(
         for path in (last, tensorboard):
             require_inside(folder, path)
         last.parent.mkdir(parents=True, exist_ok=True)
-        logger = TensorBoardLogger(folder / "tensorboard", name=name, version="")
-        if machine.processes == 1:
+        if extensions.logger is None:
+            logger = TensorBoardLogger(folder / "tensorboard", name=name, version="")
+        if logger is not None and machine.processes == 1:
             # create the event file now, so that the manifest lists it even after a crash
             logger.experiment  # noqa: B018
             _record_events(logger)
@@ -264,11 +338,9 @@ def run_epochs(
     trainer = L.Trainer(
         **machine.for_lightning(),
         max_epochs=settings.epochs,
-        gradient_clip_val=settings.gradient_clip,
-        logger=logger if logger is not None else False,
-        callbacks=[EpochEnd(name, settings.epochs, last)],
+        logger=extensions.logger or logger or False,
         # `EpochEnd` reports progress and writes checkpoints
-        enable_checkpointing=False,
+        callbacks=[EpochEnd(name, settings.epochs, last), *extensions.callbacks],
         enable_progress_bar=False,
         enable_model_summary=False,
         num_sanity_val_steps=0,
@@ -283,16 +355,26 @@ def run_epochs(
             # the spawned processes return their result in the checkpoint
             module.restore(_read_checkpoint(last, module.settings_digest))
     module.cpu()
-    if not module.best_state:
-        raise FitError(
-            f"{name}: no epoch gave a finite free run on the validation data; lower the learning"
-            " rate or the horizon"
-        )
+    notes = make_training_notes(name, module, trained)
     if logger is not None:
         _log_result(logger, module)
         _record_events(logger)
     model.load_state_dict(module.best_state)
     model.eval().requires_grad_(False)
+    return notes
+
+
+def make_training_notes(name: str, module: EpochTraining, trained: nn.Module) -> dict[str, Any]:
+    """Return the notes about a finished training, see `run_epochs`.
+
+    Raises:
+        FitError: if no validation gave a finite score.
+    """
+    if not module.best_state:
+        raise FitError(
+            f"{name}: no epoch gave a finite free run on the validation data; lower the learning"
+            " rate or the horizon"
+        )
     return {
         "parameters": sum(p.numel() for p in trained.parameters()),
         "best_validation": module.best_score,
