@@ -20,7 +20,8 @@ from typing import Any
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Checkpoint
-from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.loggers import Logger as LightningLogger
+from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor, nn
 
 from residnet.core.errors import FitError, UsageError
@@ -32,6 +33,7 @@ from residnet.training.config import MachineConfig, OneStage, TrainingConfig
 from residnet.training.score import ExampleRun
 
 Callback = L.Callback
+Logger = LightningLogger
 Epochs = OneStage | TrainingConfig
 """Settings of a training."""
 _CHECKPOINT_FIELDS = (
