@@ -145,7 +145,7 @@ def test_members_that_run_away_or_harm_the_mean_are_left_out(
         ["constant_velocity"],
     )
     for one in (lost, zero):
-        with pytest.raises(FitError, match="no mean errs less"):
+        with pytest.raises(FitError, match="no mean has a smaller error"):
             fitter.build_trajectory_ensemble("ensemble", [hull, one])
     fitter.validation_in_training = True
     assert fitter.build_trajectory_ensemble("ensemble", [hull, zero]).notes["left_out"] == []
