@@ -66,7 +66,7 @@ class Plant:
     cruise: Array
 
 
-def draw_ship(random: np.random.Generator) -> Plant:
+def draw_ship(random: np.random.Generator) -> Plant:  # noqa: PLR0915 (one draw per parameter)
     """Draw a ship with one propeller and one rudder after the MMG model (Yasukawa 2015)."""
     length = float(random.uniform(6.0, 25.0))
     # Froude numbers of 0.25 to 0.35
