@@ -737,6 +737,70 @@ def ardupilot(
 
 
 @app.command()
+def derivatives(
+    folder: RunArgument,
+    length: Annotated[str, typer.Option(help="Length between perpendiculars, such as '7 m'.")],
+    speed: Annotated[
+        str, typer.Option(help="Service speed of the vessel in the logs, such as '1.2 m/s'.")
+    ],
+    model: Annotated[
+        str, typer.Option("--model", metavar="NAME", help="Model whose baseline is expanded.")
+    ] = "baseline",
+    draught: Annotated[str | None, typer.Option(help="Draught, such as '0.46 m'.")] = None,
+    beam: Annotated[str | None, typer.Option(help="Beam, such as '1.27 m'.")] = None,
+    mass: Annotated[str | None, typer.Option(help="Displacement, such as '3270 kg'.")] = None,
+    centre_of_gravity: Annotated[
+        str, typer.Option("--xg", help="Centre of gravity ahead of the origin.")
+    ] = "0 m",
+    gyradius: Annotated[
+        float, typer.Option(help="Radius of gyration in yaw in units of the length.")
+    ] = 0.25,
+    density: Annotated[str, typer.Option(help="Density of the water.")] = "1000 kg/m^3",
+    scale: Annotated[
+        float, typer.Option(help="Length of the full-scale vessel in units of that of the logs.")
+    ] = 1.0,
+    density_ratio: Annotated[
+        float, typer.Option(help="Density at full scale in units of that of the logs.")
+    ] = 1.0,
+    order: Annotated[int, typer.Option(help="Highest order of the Taylor series, 1 to 3.")] = 1,
+    output_file: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="File to write: .json, .csv or .m (MATLAB)."),
+    ] = None,
+    trust: Trust = False,
+) -> None:
+    """Print hydrodynamic derivatives with standard errors, in SI, prime and bis systems.
+
+    Masses from beam, draught and mass turn derivatives of accelerations into those of forces.
+    """
+    from residnet.api.models import load
+    from residnet.core.files import write_owned
+
+    particulars = {
+        "length": length,
+        "speed": speed,
+        "draught": draught,
+        "beam": beam,
+        "mass": mass,
+        "centre_of_gravity": centre_of_gravity,
+        "gyradius": gyradius,
+        "density": density,
+    }
+    table = load(folder, model, trust=trust).derivatives(
+        order=order,
+        scale=scale,
+        density_ratio=density_ratio,
+        **{name: value for name, value in particulars.items() if value is not None},
+    )
+    print(table.to_text())
+    if output_file is not None:
+        text = table.to_text_of(output_file.suffix)
+        with write_owned(output_file) as temporary_file:
+            temporary_file.write_text(text)
+        print(f"written: {output_file}")
+
+
+@app.command()
 def report(folder: RunArgument, quiet: QuietOption = False) -> None:
     """Rewrite the figures and the report of a finished run."""
     from residnet.tasks.registry import report_run

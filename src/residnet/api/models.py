@@ -27,6 +27,11 @@ from residnet.dynamics.store import ModelSpec, load_model, resolve_model_name, s
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
 from residnet.evaluation.band import read_bands
+from residnet.evaluation.derivatives import (
+    DerivativesFile,
+    compute_derivatives,
+    read_covariance,
+)
 from residnet.evaluation.verdict import UNSEEN_SPLITS, VerdictEvidence, list_model_objections
 from residnet.export import get_exporter
 from residnet.export.base import require_releasable
@@ -46,6 +51,7 @@ from residnet.identification.recursive_refit import (
     make_refitted_model,
     refit_recursively,
 )
+from residnet.physics.similarity import Particulars
 from residnet.runs.folder import verify_checksums
 
 if TYPE_CHECKING:
@@ -98,6 +104,47 @@ class Model:
 
         columns = ["axis", "term", "value", "standard_error"]
         return pd.DataFrame(self.notes.get("coefficients", []), columns=columns)
+
+    def derivatives(
+        self,
+        *,
+        order: int = 1,
+        scale: float = 1.0,
+        density_ratio: float = 1.0,
+        **particulars: Any,
+    ) -> DerivativesFile:
+        """Return the hydrodynamic derivatives of the baseline, in SI and the prime systems.
+
+        Args:
+            order: highest order of the Taylor series about straight-ahead motion, 1 to 3.
+            scale: length of the vessel that the figures are for, in units of that of the logs
+                (Froude's law of similarity).
+            density_ratio: ratio of the densities of the water.
+            **particulars: `length` and `speed`, and as known `draught`, `beam`, `mass`,
+                `centre_of_gravity`, `gyradius`, `density`; texts such as "3.22 m" or SI numbers.
+
+        Raises:
+            ConfigError: if a particular is missing or not plausible.
+            UsageError: if the model has no baseline with free parameters in u, v and r.
+
+        Example:
+            model.derivatives(length="7 m", speed="1.18 m/s").to_text()
+        """
+        if not isinstance(self.module, HybridDynamics):
+            raise UsageError(
+                f"model {self.name}: an ensemble has no derivatives; take one of its members"
+            )
+        covariance, has_correlations = read_covariance(self.notes, self.module.baseline)
+        return compute_derivatives(
+            self.spec,
+            self.module,
+            validate_config(particulars, Particulars, "particulars"),
+            covariance=covariance,
+            has_correlations=has_correlations,
+            order=order,
+            scale=scale,
+            density_ratio=density_ratio,
+        )
 
     def step(self, x: Any, w: Any, s: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Return state and memory after one time step.

@@ -217,6 +217,23 @@ class MMGForces(nn.Module):
         self.x_R = rudder.x
         self.race_share = rudder.race
 
+    def mass_matrix(self, theta: Tensor) -> Tensor:
+        """Return the mass matrix [3, 3] about midship, in SI, for parameters theta [34].
+
+        Added mass has no coupling of sway and yaw in this model.
+        """
+        m_x, m_y, J_z = theta[:3]
+        mass_scale = self.pressure_factor * self.length
+        coupling = theta.new_tensor(self.x_G * self.mass)
+        zero = torch.zeros_like(coupling)
+        return torch.stack(
+            (
+                torch.stack((self.mass + m_x * mass_scale, zero, zero)),
+                torch.stack((zero, self.mass + m_y * mass_scale, coupling)),
+                torch.stack((zero, coupling, self.inertia + J_z * mass_scale * self.length**2)),
+            )
+        )
+
     def forward(self, z: Tensor, theta: Tensor) -> Tensor:
         """Compute nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34].
 

@@ -252,13 +252,27 @@ class RegressorBaseline(ParametricBaseline):
     ) -> Solution:
         """Combine the solutions of the axes; their tables give the coefficients by term."""
         theta = torch.zeros_like(self.theta)
+        covariance = theta.new_zeros(self.n_dof, self.library.n_terms, self.library.n_terms)
+        is_covariance_known = True
         for axis, fit in axis_fits.items():
-            for coefficient in fit.table:
-                theta[axis, self.library.terms.index(coefficient.term)] = coefficient.value
+            columns = [self.library.terms.index(coefficient.term) for coefficient in fit.table]
+            for column, coefficient in zip(columns, fit.table, strict=True):
+                theta[axis, column] = coefficient.value
+            if fit.covariance is None:
+                is_covariance_known = False
+            elif columns:
+                covariance[axis][torch.tensor(columns)[:, None], torch.tensor(columns)] = (
+                    fit.covariance[0]
+                )
         table = tuple(
             coefficient for axis in sorted(axis_fits) for coefficient in axis_fits[axis].table
         )
-        return Solution(hyperparameters, {"theta": theta}, table)
+        return Solution(
+            hyperparameters,
+            {"theta": theta},
+            table,
+            covariance=covariance if is_covariance_known else None,
+        )
 
 
 def active_terms(

@@ -34,7 +34,7 @@ EXPORT void *fmi3InstantiateCoSimulation(
     Instance *m;
     (void)name; (void)resources; (void)visible; (void)logging; (void)event_mode;
     (void)early_return; (void)required; (void)required_count; (void)update;
-    if (strcmp(token, MODEL_TOKEN) != 0) return NULL;
+    if (strcmp(token, FMU_MODEL_TOKEN) != 0) return NULL;
     m = (Instance *)calloc(1, sizeof(Instance));
     if (!m) return NULL;
     m->environment = environment;

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines import BaselineConfig
+from residnet.baselines.base import Baseline, ParametricBaseline
 from residnet.baselines.given import ZeroBaselineConfig
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
@@ -437,7 +438,7 @@ class Fitter:
             model, model.baseline, solutions, self.score_on_validation
         )
         coefficients = list(solution.table)
-        covariance = None
+        covariance = _free_covariance(model.baseline, solution)
         notes: dict[str, Any] = {
             "samples": len(self.training_samples),
             **solution.hyperparameters,
@@ -450,9 +451,14 @@ class Fitter:
                 name, model, coefficients, notes
             )
         notes["coefficients"] = [coefficient_to_dict(entry) for entry in coefficients]
+        if covariance is not None:
+            notes["covariance"] = covariance.tolist()
         notes |= self._validation_notes(model)
         notes["seconds"] = round(time.perf_counter() - start_time, 1)
-        return self._save_and_reload(FittedModel(spec, model, notes, covariance))
+        is_refitted = name in self.settings.refit
+        return self._save_and_reload(
+            FittedModel(spec, model, notes, covariance if is_refitted else None)
+        )
 
     def _refit_through_rollouts(
         self,
@@ -749,3 +755,15 @@ def check_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
                 if window_config is not None:
                     window_config.make_samplers(window_store, training_config.steps)
     return fitter
+
+
+def _free_covariance(baseline: Baseline, solution: Solution) -> torch.Tensor | None:
+    """Return the least-squares covariance of the free parameters [P, P]; None if unknown.
+
+    Axes are fitted one at a time, so that parameters of different axes are not correlated.
+    """
+    if not isinstance(baseline, ParametricBaseline) or solution.covariance is None:
+        return None
+    free_indices = baseline.free_indices()
+    by_axis: torch.Tensor = torch.block_diag(*solution.covariance)
+    return by_axis[free_indices][:, free_indices]

@@ -1,0 +1,286 @@
+"""Dimensions of coefficients, non-dimensional systems of ship hydrodynamics and Froude scaling.
+
+The prime systems are those of SNAME (1952), Nomenclature for Treating the Motion of a Submerged
+Body Through a Fluid, Technical and Research Bulletin 1-5, in the notation of Fossen (2011),
+Handbook of Marine Craft Hydrodynamics and Motion Control, section 7.2.5, as is Norrbin's (1970)
+bis system.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from pydantic import Field
+
+from residnet.core.config import Config, Kilograms, Metres, MetresPerSecond
+from residnet.core.errors import UsageError
+from residnet.physics.parameters import Density
+from residnet.physics.terms import Factor
+
+SystemName = Literal["prime_i", "prime_ii", "bis"]
+GRAVITY = 9.81
+"""Acceleration of gravity in m/s^2."""
+
+
+class Dimension(NamedTuple):
+    """Exponents of mass, length and time of a quantity."""
+
+    mass: float
+    length: float
+    time: float
+
+    def times(self, other: Dimension, power: float = 1.0) -> Dimension:
+        """Return the dimension of the product with another quantity to a power."""
+        return Dimension(
+            self.mass + power * other.mass,
+            self.length + power * other.length,
+            self.time + power * other.time,
+        )
+
+    @property
+    def unit(self) -> str:
+        """SI unit, such as kg m^-1."""
+        parts = [
+            symbol if exponent == 1 else f"{symbol}^{exponent:g}"
+            for symbol, exponent in zip(("kg", "m", "s"), self, strict=True)
+            if exponent
+        ]
+        return " ".join(parts) or "-"
+
+
+DIMENSIONLESS = Dimension(0, 0, 0)
+_DIMENSION_OF_UNIT = {
+    "-": DIMENSIONLESS,
+    "rad": DIMENSIONLESS,
+    "m": Dimension(0, 1, 0),
+    "s": Dimension(0, 0, 1),
+    "1/s": Dimension(0, 0, -1),
+    "1/s^2": Dimension(0, 0, -2),
+    "m/s": Dimension(0, 1, -1),
+    "rad/s": Dimension(0, 0, -1),
+    "m/s^2": Dimension(0, 1, -2),
+    "rad/s^2": Dimension(0, 0, -2),
+    "kg": Dimension(1, 0, 0),
+    "kg m": Dimension(1, 1, 0),
+    "kg m^2": Dimension(1, 2, 0),
+    "N": Dimension(1, 1, -2),
+    "N m": Dimension(1, 2, -2),
+    "W": Dimension(1, 2, -3),
+}
+
+
+def dimension_of_unit(unit: str) -> Dimension | None:
+    """Return the dimension of an SI unit; None if it is not mechanical, such as V."""
+    return _DIMENSION_OF_UNIT.get(unit)
+
+
+def dimension_of_term(factors: Sequence[Factor], units: Mapping[str, str]) -> Dimension | None:
+    """Return the dimension of a product of channels.
+
+    Args:
+        factors: factors of the term, from `parse_term`.
+        units: SI unit of each channel.
+
+    Returns:
+        The dimension; None if a channel has no mechanical unit, or a sine or cosine is taken of a
+        quantity that is no angle.
+    """
+    dimension = DIMENSIONLESS
+    for factor in factors:
+        base = dimension_of_unit(units[factor.name])
+        if base is None:
+            return None
+        if factor.function in ("sin", "cos"):
+            if base != DIMENSIONLESS:
+                return None
+            continue
+        root = {"sqrt": 0.5, "ssqrt": 0.5, "inv": -1.0}.get(factor.function, 1.0)
+        dimension = dimension.times(base, root * factor.power)
+    return dimension
+
+
+@dataclass(frozen=True)
+class ReferenceScales:
+    """Units of mass, length and time of a non-dimensional system.
+
+    Attributes:
+        mass: in kg.
+        length: in m.
+        time: in s.
+    """
+
+    mass: float
+    length: float
+    time: float
+
+    def factor(self, dimension: Dimension) -> float:
+        """Return the size, in SI units, of 1 in this system; divide by it to remove dimensions."""
+        factor: float = (
+            self.mass**dimension.mass * self.length**dimension.length * self.time**dimension.time
+        )
+        return factor
+
+
+class Particulars(Config):
+    """Main particulars of a vessel.
+
+    Attributes:
+        length: length between perpendiculars L.
+        speed: service speed U, about which derivatives are taken.
+        density: density of the water.
+        draught: draught T; None if unknown.
+        beam: beam B; None if unknown.
+        mass: displacement; None if unknown.
+        centre_of_gravity: x_G, positive ahead of the origin of the body axes.
+        gyradius: radius of gyration in yaw about the centre of gravity in units of L.
+    """
+
+    length: Metres = Field(gt=0)
+    speed: MetresPerSecond = Field(gt=0)
+    density: Density = Field(default=1000.0, gt=0)
+    draught: Metres | None = Field(default=None, gt=0)
+    beam: Metres | None = Field(default=None, gt=0)
+    mass: Kilograms | None = Field(default=None, gt=0)
+    centre_of_gravity: Metres = 0.0
+    gyradius: float = Field(default=0.25, gt=0, lt=1)
+
+    @property
+    def froude_number(self) -> float:
+        """Froude number U / sqrt(g L)."""
+        return self.speed / math.sqrt(GRAVITY * self.length)
+
+    def reference_scales(self, system: SystemName) -> ReferenceScales | None:
+        """Return the units of a non-dimensional system; None if a particular is unknown.
+
+        `prime_i` has the unit of mass 1/2 rho L^3, `prime_ii` 1/2 rho L^2 T, and both the unit of
+        time L/U; `bis` has the mass of the vessel and sqrt(L/g).
+        """
+        if system == "bis":
+            if self.mass is None:
+                return None
+            return ReferenceScales(self.mass, self.length, math.sqrt(self.length / GRAVITY))
+        area = self.length if system == "prime_i" else self.draught
+        if area is None:
+            return None
+        return ReferenceScales(
+            0.5 * self.density * self.length**2 * area, self.length, self.length / self.speed
+        )
+
+    def scaled(self, scale: float, density_ratio: float = 1.0) -> Particulars:
+        """Return the particulars of a geometrically similar vessel at the same Froude number.
+
+        Args:
+            scale: length of the other vessel in units of this one's, such as 50 for full scale.
+            density_ratio: density of the other vessel's water in units of this one's.
+        """
+        return Particulars(
+            length=self.length * scale,
+            speed=self.speed * math.sqrt(scale),
+            density=self.density * density_ratio,
+            draught=None if self.draught is None else self.draught * scale,
+            beam=None if self.beam is None else self.beam * scale,
+            mass=None if self.mass is None else self.mass * scale**3 * density_ratio,
+            centre_of_gravity=self.centre_of_gravity * scale,
+            gyradius=self.gyradius,
+        )
+
+
+def froude_factor(dimension: Dimension, scale: float, density_ratio: float = 1.0) -> float:
+    """Return the factor of a quantity between similar vessels at the same Froude number.
+
+    Lengths scale by `scale`, times by its square root and masses by its cube times the ratio of
+    densities (Froude's law of similarity; viscous scale effects are not included).
+
+    Args:
+        dimension: dimension of the quantity.
+        scale: ratio of lengths.
+        density_ratio: ratio of the densities of the water.
+    """
+    scales = ReferenceScales(scale**3 * density_ratio, scale, math.sqrt(scale))
+    return scales.factor(dimension)
+
+
+class AddedMass(NamedTuple):
+    """Added masses in three degrees of freedom, as positive entries of the mass matrix, SI.
+
+    Attributes:
+        surge: -X_udot in kg.
+        sway: -Y_vdot in kg.
+        sway_yaw: -Y_rdot in kg m.
+        yaw_sway: -N_vdot in kg m.
+        yaw: -N_rdot in kg m^2.
+    """
+
+    surge: float
+    sway: float
+    sway_yaw: float
+    yaw_sway: float
+    yaw: float
+
+
+def estimate_added_mass(particulars: Particulars) -> AddedMass | None:
+    """Estimate added masses from main particulars; None if beam, draught or mass is unknown.
+
+    Sway and yaw follow the regressions of Clarke, Gedling and Hine (1983), The application of
+    manoeuvring criteria in hull design using linear theory, Trans. RINA 125; surge follows Söding
+    (1982), X_udot = -2.7 rho volume^(5/3) / L^2, in the form of Brix (1993), Manoeuvring Technical
+    Manual.
+    """
+    if particulars.beam is None or particulars.draught is None or particulars.mass is None:
+        return None
+    length = particulars.length
+    beam = particulars.beam
+    draught = particulars.draught
+    volume = particulars.mass / particulars.density
+    block_coefficient = volume / (length * beam * draught)
+    if block_coefficient > 1.0:
+        raise UsageError(
+            f"mass: {particulars.mass:g} kg displace {volume:.4g} m^3, more than length x beam x"
+            f" draught ({length * beam * draught:.4g} m^3); correct the particulars"
+        )
+    slenderness = math.pi * (draught / length) ** 2
+    half_density = 0.5 * particulars.density
+    return AddedMass(
+        surge=2.7 * particulars.density * volume ** (5 / 3) / length**2,
+        sway=half_density
+        * length**3
+        * slenderness
+        * (1.0 + 0.16 * block_coefficient * beam / draught - 5.1 * (beam / length) ** 2),
+        sway_yaw=half_density
+        * length**4
+        * slenderness
+        * (0.67 * beam / length - 0.0033 * (beam / draught) ** 2),
+        yaw_sway=half_density
+        * length**4
+        * slenderness
+        * (1.1 * beam / length - 0.041 * beam / draught),
+        yaw=half_density
+        * length**5
+        * slenderness
+        * (1.0 / 12.0 + 0.017 * block_coefficient * beam / draught - 0.33 * beam / length),
+    )
+
+
+def estimate_linear_derivatives(particulars: Particulars) -> dict[str, float] | None:
+    """Estimate Y_v, Y_r, N_v and N_r in the prime I system; None if particulars are missing.
+
+    The regressions are those of Clarke, Gedling and Hine (1983), for the hull without m U terms.
+    """
+    if particulars.beam is None or particulars.draught is None or particulars.mass is None:
+        return None
+    beam_to_draught = particulars.beam / particulars.draught
+    beam_to_length = particulars.beam / particulars.length
+    draught_to_length = particulars.draught / particulars.length
+    block_coefficient = particulars.mass / (
+        particulars.density * particulars.length * particulars.beam * particulars.draught
+    )
+    slenderness = math.pi * draught_to_length**2
+    return {
+        "Y_v": -slenderness * (1.0 + 0.40 * block_coefficient * beam_to_draught),
+        "Y_r": -slenderness * (-0.5 + 2.2 * beam_to_length - 0.080 * beam_to_draught),
+        "N_v": -slenderness * (0.5 + 2.4 * draught_to_length),
+        "N_r": -slenderness * (0.25 + 0.039 * beam_to_draught - 0.56 * beam_to_length),
+    }
