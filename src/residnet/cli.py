@@ -773,8 +773,8 @@ def derivatives(
 
     Masses from beam, draught and mass turn derivatives of accelerations into those of forces.
     """
-    from residnet.api.models import load
     from residnet.core.files import write_owned
+    from residnet.tasks.derivatives import derive_run
 
     particulars = {
         "length": length,
@@ -786,11 +786,13 @@ def derivatives(
         "gyradius": gyradius,
         "density": density,
     }
-    table = load(folder, model, trust=trust).derivatives(
+    table = derive_run(
+        folder,
+        model,
+        {name: value for name, value in particulars.items() if value is not None},
         order=order,
         scale=scale,
         density_ratio=density_ratio,
-        **{name: value for name, value in particulars.items() if value is not None},
     )
     print(table.to_text())
     if output_file is not None:
