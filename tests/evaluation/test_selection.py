@@ -56,7 +56,7 @@ def test_the_standard_error_is_that_of_paired_differences() -> None:
     )
 
 
-LOST = "passed over: lstm (7 of its 7 validation windows diverged (T30))"
+LOST = "excluded: lstm (7 of its 7 validation windows diverged (T30))"
 FAULT = ("its damping has the wrong sign",)
 WITHIN = "baseline is the simplest sound model within one standard error (7.1 %) of the best one"
 
@@ -149,7 +149,7 @@ def test_of_stretches_half_a_standard_error_is_taken() -> None:
     models = (ZERO, baseline(0.5, 0.1), contender("mlp", "network", 0.5 * math.exp(-0.05)))
     found = select_models(models, SelectionBlocks(EVEN.weights, "stretches"))
     assert found.selected == "mlp"
-    assert "no simpler one comes within half a standard error" in found.reason
+    assert "no simpler one is within half a standard error" in found.reason
 
 
 def test_a_tenth_of_the_least_error_is_added_to_that_of_each_block() -> None:

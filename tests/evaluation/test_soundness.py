@@ -228,7 +228,7 @@ def test_symmetry_needs_to_know_what_steers() -> None:
     }
     found = findings(*made(terms, ("lever", "wheel")))
     assert found[SYMMETRY].ok is None
-    assert "nobody said which input steers" in found[SYMMETRY].text
+    assert "no steering input is recognised" in found[SYMMETRY].text
 
 
 def test_wind_from_the_other_side_is_the_mirror_of_wind() -> None:

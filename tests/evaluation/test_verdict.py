@@ -143,10 +143,10 @@ def test_unsound_models_and_divergences_are_named() -> None:
         # a tenth of the way is no use where the bow points elsewhere
         ([horizon(30, errors(3.0, 67.0))], "limited", "30 s ahead mlp is off by 3.0 m"),
         # the upper end of the interval counts, and where there is none nobody can say
-        ([horizon(30, errors(5.0, 5.0, half=0.5))], "limited", "Good would be"),
+        ([horizon(30, errors(5.0, 5.0, half=0.5))], "limited", "A good model has"),
         ([horizon(30, errors(3.0, 5.0, half=None))], "too few windows", "5 of 3 logs are needed"),
         # nor is a model that errs far more than another one of the run
-        ([horizon(30, errors(3.0, 5.0), best=errors(1.0, 4.0))], "limited", "Good would be"),
+        ([horizon(30, errors(3.0, 5.0), best=errors(1.0, 4.0))], "limited", "A good model has"),
         (
             [horizon(60, errors(35.0, 160.0), windows=1)],
             "too few windows",

@@ -1,4 +1,4 @@
-"""What a run says of a model and of its logs, as the card of every export holds it."""
+"""Assessment of a model and its logs, for the card of every export."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from dataclasses import dataclass
 from typing import Any
 
 SPLIT_NAMES = {"train": "identification"}
-"""Splits of a run that have another name in cards; the others keep theirs."""
+"""Names of splits in cards, where they differ from those in the run."""
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """What a run says of a model and of the logs that it was made of and judged on.
+    """Verdict on a model, findings on its data, and the logs of its run.
 
     Attributes:
-        level: key of `residnet.evaluation.verdict.LEVELS`; empty where no verdict was passed.
-        verdict: its sentences.
-        findings: of the data checks, those above a note, each with `log`, `level`, `code`, `text`
-            and `action`; None where no data were checked.
-        split: names of logs by split, of the run's data; None where the run has no logs.
+        level: key of `residnet.evaluation.verdict.LEVEL_TEXTS`; empty without a verdict.
+        verdict: sentences of the verdict.
+        findings: findings of the data checks above the level of a note, each with `log`, `level`,
+            `code`, `text` and `action`; None if the data were not checked.
+        split: names of the logs by split; None for a run without logs.
     """
 
     level: str = ""

@@ -1,4 +1,4 @@
-"""Bands: how far the free runs of a model may be off, against the horizon."""
+"""Bands: prediction intervals of the errors of free runs as functions of the horizon."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def band_channels(states: np.ndarray, position_radius: np.ndarray) -> np.ndarray:
-    """Return what has bands [L, 2 + n] of states [L, 3 + n], with the radius [L] of position."""
+    """Return the band channels [L, 2 + n] of states [L, 3 + n] and position radius [L]."""
     velocities = states[:, VELOCITIES]
     heading = states[:, HEADING]
     return np.column_stack((velocities, heading, position_radius, states[:, EXTRA_STATES]))
@@ -46,9 +46,9 @@ class BandsConfig(Config):
 
 
 _MIN_MEAN_SQUARE_SHARE = 0.02
-"""Share of the usual mean square below which a measure says nothing more."""
+"""Floor of the intensity measures, relative to the root mean square over all runs."""
 _MAX_STANDARD_SCORE = 2.5
-"""Standard deviations beyond which a measure counts no further."""
+"""Limit of the standardised intensity measures, which bounds the extrapolation of widths."""
 
 
 def running_mean_squares(states: np.ndarray, step: float) -> np.ndarray:
@@ -73,9 +73,9 @@ class MotionIntensity:
     """Standardised logarithms of the mean squares of a predicted run.
 
     Attributes:
-        floor: added to each mean square [2 n], squares of SI units.
-        log_mean: mean of the logarithms over the runs that calibrated [2 n].
-        log_std: their standard deviation [2 n].
+        floor: constant added to each mean square [2 n], squares of SI units.
+        log_mean: mean of the logarithms over the calibration runs [2 n].
+        log_std: standard deviation of the logarithms [2 n].
     """
 
     floor: np.ndarray
@@ -84,11 +84,11 @@ class MotionIntensity:
 
     @classmethod
     def from_runs(cls, squares: Sequence[np.ndarray], weights: np.ndarray) -> MotionIntensity:
-        """Return what standardises the runs of a calibration.
+        """Return the statistics of the runs of a calibration.
 
         Args:
             squares: `running_mean_squares` of each of W runs, [L, 2 n].
-            weights: of each run [W].
+            weights: weight of each run [W].
         """
         sample_weights = np.concatenate(
             [
@@ -117,7 +117,7 @@ class MotionIntensity:
 
 
 _MAX_SCORES_PER_LOG = 5.0
-"""Independent scores that a log holds at most, as far as it has so many runs."""
+"""Largest effective number of independent scores of one log."""
 
 
 def compute_run_weights(log_names: Sequence[str]) -> np.ndarray:
@@ -132,12 +132,12 @@ def compute_run_weights(log_names: Sequence[str]) -> np.ndarray:
 
 
 def weighted_quantile(scores: np.ndarray, weights: np.ndarray, level: float) -> np.ndarray:
-    """Return the smallest score [...] that at least a share `level` of the weight lies below.
+    """Return the smallest score [...] at or below which at least a share `level` of the weight is.
 
     Args:
-        scores: [W, ...]; NaN counts nowhere.
-        weights: of each run [W].
-        level: between 0 and 1.
+        scores: scores of W runs [W, ...]; NaN is ignored.
+        weights: weight of each run [W].
+        level: level of the quantile, between 0 and 1.
     """
     is_scored = np.isfinite(scores)
     ranking = np.argsort(np.where(is_scored, scores, np.inf), axis=0)
@@ -156,12 +156,13 @@ def weighted_quantile(scores: np.ndarray, weights: np.ndarray, level: float) -> 
 def effective_sample_size(
     coverage: np.ndarray, weights: np.ndarray, log_names: Sequence[str], level: float
 ) -> float:
-    """Return how many independent scores the runs hold, from how logs differ in their coverage.
+    """Return the effective number of independent scores, from the variance of coverage over logs.
 
     Args:
-        coverage: share of each run's samples that a quantile holds [W]; NaN where nothing is
-            scored.
-        weights: of each run [W].
+        coverage: share of each run's samples below a quantile [W]; NaN for unscored runs.
+        weights: weight of each run [W].
+        log_names: log of each run.
+        level: level of the quantile.
     """
     _, log_indices = np.unique(log_names, return_inverse=True)
     n_logs = int(log_indices.max()) + 1
@@ -179,13 +180,14 @@ def effective_sample_size(
         * len(log_coverage)
         / (len(log_coverage) - 1)
     )
+    # independent samples would have the binomial variance level (1 - level) / n
     effective_count = level * (1.0 - level) / max(variance, 1e-12)
     max_count = min(_MAX_SCORES_PER_LOG * len(log_coverage), int(is_scored.sum()))
     return float(np.clip(effective_count, 1.0, max_count))
 
 
 def conformal_level(level: float, n_scores: float) -> float:
-    """Return the level whose quantile of so many scores holds a new score at `level`.
+    """Return the level of the quantile of `n_scores` scores that covers a new score at `level`.
 
     Source: split conformal prediction, the smallest of the (n + 1) level-th scores of n.
     """
@@ -193,7 +195,7 @@ def conformal_level(level: float, n_scores: float) -> float:
 
 
 _MAX_LOG_FACTOR = 2.0
-"""Largest logarithm of the factor by which liveliness changes a width."""
+"""Largest logarithm of the factor by which the intensity of the motion changes a width."""
 
 
 @dataclass(frozen=True)
@@ -262,7 +264,7 @@ class Band:
         return np.asarray(np.sqrt(half_widths**2 + disagreement_variance))
 
     def interpolate(self, values: np.ndarray, n_steps: int) -> np.ndarray:
-        """Return a table [G, c] at steps 1 to `count`, [count, c]."""
+        """Return a table [G, c] at steps 1 to `n_steps`, [n_steps, c]."""
         steps = np.arange(1, n_steps + 1)
         interpolated = np.stack(
             [np.interp(steps, self.steps, column) for column in values.T], axis=1
@@ -275,8 +277,8 @@ class Band:
         return float(self.steps[-1] * self.step)
 
     def to_table(self) -> BandTable:
-        """Return what an exported model carries: half widths that take every run for the same."""
-        # reading a config or a report does not wait for PyTorch
+        """Return the table of an exported model: half widths that ignore the intensity."""
+        # imported here because it imports PyTorch, which readers of configs and reports do not need
         from residnet.dynamics.store import BandTable
 
         columns = dict(zip(self.channels, self.unconditional_width.T.tolist(), strict=True))
@@ -284,7 +286,7 @@ class Band:
         return BandTable.model_validate({**metadata, "steps": self.steps.tolist(), **columns})
 
     def to_json(self) -> dict[str, Any]:
-        """Return the band as JSON takes it."""
+        """Return the contents of the band for JSON."""
 
         def map_by_channel(by_channel: np.ndarray) -> dict[str, Any]:
             return dict(zip(self.channels, by_channel.T.tolist(), strict=True))
@@ -357,12 +359,13 @@ def excess_disagreement(
     """
     is_radial = np.array([name == "position" for name in channels])
     normal_quantile = NormalDist().inv_cdf(0.5 + level / 2.0)
+    # the radius of two normal coordinates has a Rayleigh distribution with this quantile
     squared_quantiles = np.where(is_radial, -2.0 * np.log(1.0 - level), normal_quantile**2)
     return np.asarray(squared_quantiles * np.maximum(spread**2 - typical_spread**2, 0.0))
 
 
 def width_factors(intensities: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return the factors [..., c] of half widths at measures of liveliness [..., 2 n]."""
+    """Return the factors [..., c] on half widths for intensity measures [..., 2 n]."""
     return np.asarray(np.exp(np.clip(intensities @ slope, -_MAX_LOG_FACTOR, _MAX_LOG_FACTOR)))
 
 
@@ -378,14 +381,14 @@ def is_covered(error: np.ndarray, half_width: np.ndarray) -> np.ndarray:
 def interval_score(error: np.ndarray, half_width: np.ndarray, level: float) -> np.ndarray:
     """Return the interval score [..., c] of half widths, NaN where nothing is scored.
 
-    Source: Gneiting and Raftery (2007), eq. (43): the width, and what lies outside by 2 / (1 -
-    level).
+    Source: Gneiting and Raftery (2007), eq. (43): the width plus 2 / (1 - level) times the excess
+    of the error.
     """
     return np.asarray(2.0 * half_width + 2.0 / (1.0 - level) * np.maximum(error - half_width, 0.0))
 
 
 def largest_error_ratios(errors: Sequence[np.ndarray], widths: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the largest error of each run in its half widths [W, c]; NaN where unscored."""
+    """Return the largest ratio of error to half width of each run [W, c]; NaN where unscored."""
     ratios = np.full((len(errors), errors[0].shape[1]), np.nan)
     for i, (error, width) in enumerate(zip(errors, widths, strict=True)):
         is_scored = np.isfinite(error)
@@ -401,7 +404,8 @@ def build_bands_file(run: str, bands: BandsByModel) -> BandsFile:
     """Return the contents of bands.json.
 
     Args:
-        bands: by model and protocol; models without any are left out.
+        run: name of the run.
+        bands: bands by model and protocol; models without bands are omitted.
     """
     models = {
         model: {protocol: band.to_json() for protocol, band in bands_by_protocol.items()}
@@ -412,7 +416,7 @@ def build_bands_file(run: str, bands: BandsByModel) -> BandsFile:
 
 
 def read_bands(content: Mapping[str, Any]) -> dict[str, dict[str, Band]]:
-    """Return the bands by model and protocol from the contents of bands.json; none where empty."""
+    """Return the bands by model and protocol from the contents of bands.json; may be empty."""
     return {
         model: {protocol: Band.from_json(band) for protocol, band in bands_by_protocol.items()}
         for model, bands_by_protocol in content.get("models", {}).items()

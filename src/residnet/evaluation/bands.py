@@ -1,4 +1,4 @@
-"""Bands from errors of free runs over logs that the model was not fitted on, and how they fared."""
+"""Calibration of bands on errors of free runs over unseen logs, and their coverage."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from residnet.preprocessing.prepare import PreparedLog
 
 _MASKED_CHANNELS = tuple(PLANAR_LAYOUT.band_channels.index(name) for name in ("u", "v", "position"))
-"""Channels that are scored over usable samples alone."""
+"""Channels that are scored only at usable samples, since they depend on the position sensor."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class RunErrors:
     dof: DegreesOfFreedom = SURGE_SWAY_YAW
 
     def half_widths(self, band: Band) -> np.ndarray:
-        """Return the half widths [L, c] that a band gives the run."""
+        """Return the half widths [L, c] of a band along the run."""
         return band.half_widths(self.states, self.spread)
 
     def __len__(self) -> int:
@@ -76,8 +76,15 @@ def compute_run_errors(
     logs: Sequence[PreparedLog],
     errors: FreeRunErrors | None = None,
 ) -> list[RunErrors]:
-    """Return the errors of one model's free runs over W windows, their first samples left out."""
-    # reports of finished runs read this module and do not wait for PyTorch
+    """Return the errors of one model's free runs over W windows, without their initial samples.
+
+    Args:
+        windows: windows of the free runs.
+        predictions: prediction for each window.
+        logs: prepared logs of the windows.
+        errors: errors of the predictions, if already computed.
+    """
+    # imported here because it imports PyTorch, which reports of finished runs do not need
     from residnet.evaluation.freerun import FreeRunErrors
 
     errors = (
@@ -111,12 +118,12 @@ class BandCounts:
     """Sums over the scored samples of each of W windows, by channel [W, c].
 
     Attributes:
-        channels: names.
-        n_scored: number of samples.
-        n_inside: how many of them the band holds.
-        is_run_inside: 1 where the band of whole runs holds the window, NaN where nothing is scored.
+        channels: names of the channels.
+        n_scored: number of scored samples.
+        n_inside: number of samples within the band.
+        is_run_inside: 1 if the whole window is within the simultaneous band, NaN if unscored.
         interval_score_sum: sum of the interval scores, in the units of the band.
-        constant_score_sum: the same of a band of one width.
+        constant_score_sum: sum of the interval scores of a band with constant width.
     """
 
     channels: tuple[str, ...]
@@ -127,7 +134,7 @@ class BandCounts:
     constant_score_sum: np.ndarray
 
     def to_row(self, window_mask: np.ndarray) -> dict[str, Any]:
-        """Return what a row of metrics.json says of chosen windows [W] bool."""
+        """Return the coverage entries of a row of metrics.json for selected windows [W] bool."""
         n_scored = self.n_scored[window_mask].sum(axis=0)
         is_scored = n_scored > 0
 
@@ -148,7 +155,7 @@ class BandCounts:
 
 
 def count_coverage(runs: Sequence[RunErrors], band: Band) -> BandCounts:
-    """Return how a band fared over free runs of its model."""
+    """Return coverage and interval scores of a band over free runs of its model."""
     errors = [run.error for run in runs]
     widths = [run.half_widths(band) for run in runs]
     largest_ratios = largest_error_ratios(errors, widths)
@@ -194,24 +201,24 @@ def band_limits(states: np.ndarray, half_width: np.ndarray) -> tuple[np.ndarray,
 MIN_LOGS = 9
 """Smallest number of logs that can guarantee 90 % coverage for any error distribution."""
 _MAX_HORIZONS = 100
-"""Horizons that half widths are kept at."""
+"""Largest number of horizons at which half widths are tabulated."""
 _SMOOTHING_SHARE = 0.11
 """Share of the horizon over which widths are smoothed."""
 _SLOPE_RIDGE = 0.02
-"""Pull of the slopes to zero, against measures of unit variance."""
+"""Ridge on the slopes, for measures of unit variance."""
 _ALTERNATIONS = 2
-"""Turns of shape and slopes, each given the other; chosen by hand."""
+"""Number of alternations between shape and slopes, each fitted given the other."""
 _SCALE_FOLDS = 5
 """Number of folds of the cross-fitted error scales."""
 _HORIZON_STRIDE = 3
-"""Of so many horizons one says how liveliness acts."""
+"""Stride of the horizons at which slopes are fitted; neighbouring horizons are correlated."""
 _NEWTON_STEPS = 8
-"""Of Newton's method; chosen by hand: near the end each doubles the digits."""
+"""Number of Newton steps; near the solution each doubles the number of correct digits."""
 
 
 @dataclass(frozen=True)
 class _CalibrationRuns:
-    """Errors [W, G, c] of W runs at G horizons, and measures [W, G, 2 n] of how lively they are."""
+    """Errors [W, G, c] of W runs at G horizons, and their intensity measures [W, G, 2 n]."""
 
     names: Sequence[str]
     weights: np.ndarray
@@ -221,7 +228,7 @@ class _CalibrationRuns:
     intensity: MotionIntensity
 
     def select(self, run_mask: np.ndarray) -> _CalibrationRuns:
-        """Return those runs that are chosen [W] bool."""
+        """Return the selected runs [W] bool, with their weights normalised."""
         return replace(
             self,
             names=[name for name, selected in zip(self.names, run_mask, strict=True) if selected],
@@ -234,13 +241,17 @@ class _CalibrationRuns:
 def calibrate_band(
     runs: Sequence[RunErrors], coverage_level: float, step: float, score_unit: np.ndarray
 ) -> Band:
-    """Return the band that holds a share `coverage_level` of the errors of runs to come.
+    """Return the band that covers a share `coverage_level` of the errors of new runs.
+
+    Locally scaled split conformal prediction: errors are divided by a scale that depends on horizon
+    and intensity, and the half width is the scale times a quantile of the ratios. The scale is
+    cross-fitted over logs, and the level is raised for the effective number of independent scores.
 
     Args:
-        runs: over logs that the model was not fitted on, under one protocol; at least one.
-        coverage_level: wanted.
-        step: of the runs in s.
-        score_unit: that scores are given in, [c].
+        runs: runs of one protocol over logs that the model was not fitted on; at least one.
+        coverage_level: nominal coverage.
+        step: time step of the runs in s.
+        score_unit: unit of the interval scores [c].
     """
     all_errors = _to_calibration_runs(runs, step)
     names = all_errors.names
@@ -252,7 +263,8 @@ def calibrate_band(
     if len(run_spreads) == len(runs):
         spreads = _sample_at_horizons(run_spreads, unexplained_errors.steps)
         typical_spread = _smoothed_rms(spreads, unexplained_errors)
-        # what the disagreement of models explains is no error that the rest of the band must hold
+        # the excess disagreement is added to the variance in `Band.half_widths`, so that its share
+        # is removed from the errors here
         disagreement_variance = np.nan_to_num(
             excess_disagreement(spreads, typical_spread, coverage_level, channels)
         )
@@ -273,7 +285,7 @@ def calibrate_band(
     n_scores = effective_sample_size(coverage, weights, names, coverage_level)
     corrected_level = conformal_level(coverage_level, n_scores)
     quantiles = _normalized_quantiles(unexplained_errors, cross_fitted_scale, corrected_level)
-    # a channel that no velocity moves is not scored, and its band has no width
+    # channels without a model are not scored (NaN) and get a zero width
     half_width = np.nan_to_num(rms_shape * quantiles)
     unconditional_shape = _rms_shape(all_errors, np.zeros_like(slopes))
     unconditional_width = unconditional_shape * _normalized_quantiles(
@@ -306,7 +318,8 @@ def calibrate_band(
     largest_ratios = largest_error_ratios(
         [run.error for run in runs], [run.half_widths(band) for run in runs]
     )
-    # as far as the runs of other logs know the scale
+    # the ratios above use the in-sample scale; they are corrected to the cross-fitted one, which is
+    # what a new run would have
     in_sample_scale = rms_shape * width_factors(unexplained_errors.intensities, slopes)
     largest_ratios *= _largest_error_ratios(
         unexplained_errors.errors, cross_fitted_scale * quantiles
@@ -320,7 +333,7 @@ def calibrate_band(
 
 
 def _sample_at_horizons(series: Sequence[np.ndarray], steps: np.ndarray) -> np.ndarray:
-    """Return rows [L, c] of each run at some steps [W, G, c]; NaN beyond its end."""
+    """Return the values [W, G, c] of series [L, c] at given steps; NaN beyond the end of a run."""
     values = np.full((len(series), len(steps), series[0].shape[1]), np.nan)
     for values_of_run, run_series in zip(values, series, strict=True):
         reached_samples = steps[steps <= len(run_series)] - 1
@@ -345,7 +358,7 @@ def _smoothed_rms(values: np.ndarray, runs: _CalibrationRuns) -> np.ndarray:
 
 
 def _largest_error_ratios(error: np.ndarray, half_width: np.ndarray) -> np.ndarray:
-    """Return the largest error in half widths of each run [W, c], over horizons."""
+    """Return the largest ratio of error to half width over the horizons of each run [W, c]."""
     ratios = np.where(
         np.isfinite(error) & (half_width > 0.0), error / np.maximum(half_width, 1e-300), 0.0
     )
@@ -353,7 +366,7 @@ def _largest_error_ratios(error: np.ndarray, half_width: np.ndarray) -> np.ndarr
 
 
 def _fit_scale(runs: _CalibrationRuns) -> tuple[np.ndarray, np.ndarray]:
-    """Return shape [G, c] and slopes [2 n, c] of the errors of runs."""
+    """Return the shape over horizons [G, c] and the intensity slopes [2 n, c] of the errors."""
     slopes = np.zeros((runs.intensities.shape[2], runs.errors.shape[2]))
     for _ in range(_ALTERNATIONS):
         slopes = _fit_slopes(runs, _rms_shape(runs, slopes), slopes)
@@ -377,18 +390,18 @@ def _cross_fitted_scales(runs: _CalibrationRuns) -> np.ndarray:
 
 
 def describe_few_logs(n_logs: int) -> tuple[str, ...]:
-    """Return what to say where logs are too few for a promise."""
+    """Return a caution if there are too few logs for a guaranteed coverage; else nothing."""
     if n_logs >= MIN_LOGS:
         return ()
     subject = f"{n_logs} logs calibrate" if n_logs > 1 else "One log calibrates"
     return (
-        f"{subject} this band; below {MIN_LOGS} no method can promise 90 % for every"
-        " distribution of errors.",
+        f"{subject} this band; with fewer than {MIN_LOGS}, 90 % coverage cannot be"
+        " guaranteed for every distribution of errors.",
     )
 
 
 def _to_calibration_runs(runs: Sequence[RunErrors], step: float) -> _CalibrationRuns:
-    """Return the errors and measures of runs at the horizons that a band is kept at."""
+    """Return errors and intensity measures of runs at the horizons of the band's tables."""
     longest_run = max(map(len, runs))
     steps = np.unique(
         np.linspace(1, longest_run, min(_MAX_HORIZONS, longest_run)).round().astype(int)
@@ -404,7 +417,7 @@ def _to_calibration_runs(runs: Sequence[RunErrors], step: float) -> _Calibration
 
 
 def _rms_shape(runs: _CalibrationRuns, slopes: np.ndarray) -> np.ndarray:
-    """Return the root mean square [G, c] of errors over what liveliness explains, smoothed."""
+    """Return the root mean square [G, c] of errors divided by their intensity factor, smoothed."""
     rms = _smoothed_rms(runs.errors / width_factors(runs.intensities, slopes), runs)
     return np.asarray(np.maximum(rms, 1e-12 + 1e-6 * np.nan_to_num(rms).max(axis=0)))
 
@@ -419,7 +432,7 @@ def _normalized_quantiles(runs: _CalibrationRuns, scale: np.ndarray, level: floa
 def _smooth_over_horizons(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return moving means [G, c] over neighbouring horizons; gaps take the values of neighbours."""
     half_window = 0.5 * _SMOOTHING_SHARE * steps[-1]
-    # the first steps, where errors begin, are smoothed over what lies as near as the start itself
+    # near the start the window shrinks to stay symmetric, since errors grow quickly there
     half_windows = np.minimum(half_window, steps - 1 + 0.5)
     is_neighbour = np.abs(steps[:, None] - steps[None, :]) <= half_windows[:, None]
     is_finite = np.isfinite(values)
@@ -437,9 +450,10 @@ def _smooth_over_horizons(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
 def _fit_slopes(
     runs: _CalibrationRuns, rms_shape: np.ndarray, initial_slopes: np.ndarray
 ) -> np.ndarray:
-    """Return by how much liveliness raises the logarithm of the errors [2 n, c].
+    """Return the slopes [2 n, c] of the logarithm of the errors by the intensity measures.
 
-    Errors over the shape are taken for gamma distributed with a logarithmic link; Newton's method.
+    Gamma regression with a logarithmic link of the errors divided by their shape, by Newton's
+    method.
     """
     slopes = initial_slopes.copy()
     horizon_stride = slice(None, None, _HORIZON_STRIDE)
@@ -459,6 +473,7 @@ def _fit_slopes(
         coefficients = slopes[:, channel].copy()
         for _ in range(_NEWTON_STEPS):
             predicted = np.exp(np.clip(intensities @ coefficients, -20.0, 20.0))
+            # the mean is profiled out: the level of the errors is in the shape, not in the slopes
             predicted *= (sample_weights * y).sum() / max(
                 (sample_weights * predicted).sum(), 1e-300
             )

@@ -1,4 +1,4 @@
-"""The manoeuvring booklet and the table of indices, with intervals and limits of IMO."""
+"""The manoeuvring booklet and the table of indices, with intervals and IMO limits."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from residnet.manoeuvres.indices import INDEX_UNITS, LENGTH_INDICES
 from residnet.manoeuvres.trials import ManoeuvreRun, SimulatedVessel
 
 SCHEMA = "residnet.booklet/1"
-# power of the scale by which Froude's law brings a unit from the model to the ship
+# exponent of the length scale that converts a unit from model to ship by Froude's law
 _FROUDE_EXPONENTS = {"m": 1.0, "s": 0.5, "m/s": 0.5, "rad/s": -0.5, "rad": 0.0, "-": 0.0}
 
 
@@ -39,7 +39,7 @@ class BookletConfig(Config):
         inputs: inputs of the model with their shares of drive and steer, limits and rates.
         initial: initial states by name.
         manoeuvres: standard manoeuvres.
-        duration: duration of manoeuvres without an own one, and time limit of the others.
+        duration: duration of manoeuvres that define none, and time limit of the others.
         repeat: splits whose measured zigzags are repeated in closed loop with the measured rudder
             angles and reversals.
         draws: number of parameter draws.
@@ -71,7 +71,7 @@ class BookletConfig(Config):
         """Return the input that steers.
 
         Raises:
-            ConfigError: where none or several do.
+            ConfigError: if none or several inputs steer.
         """
         steering_inputs = [
             name for name, share in self.inputs.items() if share.steer not in (0, 0.0)
@@ -192,12 +192,14 @@ INDICES_SCHEMA = "residnet.indices/1"
 def build_index_rows(
     vessel: SimulatedVessel, runs: Sequence[ManoeuvreRun], length: float | None
 ) -> list[dict[str, Any]]:
-    """Return log, manoeuvre, craft, faults, indices and limits of each flight.
+    """Return log, manoeuvre, vessel, fault, indices and limits of each simulated manoeuvre.
 
-    Indices in SI and rad; each limit with whether it is kept.
+    Indices are in SI units and rad; each limit has a flag whether it is kept.
 
     Args:
-        length: of the hull in m; None where unknown, then there are neither lengths nor limits.
+        vessel: the simulated vessel.
+        runs: simulated manoeuvres.
+        length: length of the hull in m; None if unknown, then without lengths and limits.
     """
     rows = []
     for run in runs:

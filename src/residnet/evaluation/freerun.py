@@ -1,4 +1,4 @@
-"""The free-run evaluator: every model over every window of a protocol, in one batch."""
+"""Evaluation of models by free runs over the windows of protocols, in batches."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from residnet.evaluation.protocol import Window
 from residnet.preprocessing.prepare import PreparedLog
 
 _MAX_LENGTH_RATIO = 4
-"""Largest ratio of window lengths in one batch; shorter windows run on in vain."""
+"""Largest ratio of window lengths in one batch; shorter windows run on to the longest length."""
 _MAX_BATCH_NUMBERS = 30_000_000
-"""Numbers that the windows of a batch may hold."""
+"""Largest number of values of a batch, which bounds the memory used."""
 _MEASURED_SPEED_MARGIN = 2.0
-"""Factor on the measured maximum of a window below which no run has diverged."""
+"""A run has not diverged below this multiple of the measured maximum of the window."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class FreeRunErrors:
         predicted = np.concatenate([prediction.states for prediction in predictions])
         measured = np.concatenate([log.y[window_slice] for log, window_slice in log_slices])
         error = predicted - measured
-        # a turn too many is no error of where the vessel points
+        # headings that differ by full turns are equal
         error[:, HEADING] = wrap_angle_array(error[:, HEADING])
         dof = logs[windows[0].log_index].dof
         attitude_error = None
@@ -148,7 +148,7 @@ class FreeRunErrors:
         )
 
     def nrmse(self, scales: np.ndarray) -> np.ndarray:
-        """Return the mean over the live velocities of rmse / scale of each window [W]."""
+        """Return the mean of RMSE / scale over the modelled velocities of each window [W]."""
         return np.asarray((self.rmse / scales).take(self.dof.active_indices, axis=1).mean(1))
 
     @property
@@ -158,17 +158,17 @@ class FreeRunErrors:
 
     @property
     def is_scored(self) -> np.ndarray:
-        """Whether each of what moves counts at each sample [N, n]."""
+        """Whether each dynamic state is scored at each sample [N, n]."""
         always_scored = [np.ones_like(self.is_usable)] * (self.dof.n_dynamic - 2)
         return np.stack((self.is_usable, self.is_usable, *always_scored), axis=1)
 
     @property
     def velocity_errors(self) -> np.ndarray:
-        """Errors of what moves [N, n], zero where they do not count."""
+        """Errors of the dynamic states [N, n], zero where they are not scored."""
         return np.asarray(np.where(self.is_scored, self.error[:, self.dof.dynamic_columns], 0.0))
 
     def mean_by_window(self, values: np.ndarray) -> np.ndarray:
-        """Return the mean of values [N, n] over each window's samples that count [W, n]."""
+        """Return the mean of values [N, n] over the scored samples of each window [W, n]."""
         with np.errstate(invalid="ignore"):
             window_sums = np.add.reduceat(values, self.window_starts)
             return np.asarray(
@@ -177,16 +177,16 @@ class FreeRunErrors:
 
     @property
     def rmse(self) -> np.ndarray:
-        """Root mean square errors of what moves of each window [W, n]."""
+        """Root mean square errors of the dynamic states of each window [W, n]."""
         return np.asarray(np.sqrt(self.mean_by_window(self.velocity_errors**2)))
 
     @property
     def mae(self) -> np.ndarray:
-        """Mean absolute errors of what moves of each window [W, n]."""
+        """Mean absolute errors of the dynamic states of each window [W, n]."""
         return self.mean_by_window(np.abs(self.velocity_errors))
 
     def final_pose_errors(self, sample_indices: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Return the sizes [W] of the errors of the pose by name, see `Live.ends`.
+        """Return the magnitudes [W] of the pose errors by name, see `pose_error_sizes`.
 
         Args:
             sample_indices: samples [W]; None for the last of each window.
@@ -229,7 +229,8 @@ def run_free_runs(
     }
     for ensemble in ensembles:
         member_predictions = [*zip(*(predictions[name] for name in ensemble.members), strict=True)]
-        # where a member was replaced, what it really did is in nobody's prediction
+        # The prediction of a diverged member was replaced by constant velocity, so that the mean of
+        # predictions is not that of the ensemble: such windows are run again with all members.
         windows_with_divergence = [
             i
             for i, predictions_of_window in enumerate(member_predictions)
@@ -302,9 +303,10 @@ def _run_candidate(
         log_index: _input_table(candidate, logs[log_index])
         for log_index in {window.log_index for window in windows}
     }
-    # a copy: a validation in float32 must not round the model that it validates
+    # a copy, since a validation in float32 must not round the parameters of the model
     model = copy.deepcopy(candidate.model).to("cpu", dtype).eval()
-    # the pose is integrated from the velocities below, or composed of rotations by the model
+    # In the plane the pose does not affect the velocities and is integrated afterwards, for all
+    # models in the same way. In six degrees of freedom the attitude does, by restoring forces.
     model.has_position = model.spatial
     dof = logs[0].dof
     state_names = candidate.state_names or dof.state_names
@@ -338,13 +340,15 @@ def _window_length(window: Window) -> int:
 
 
 def _batch_windows(windows: Sequence[Window], numbers_per_step: int) -> Iterator[list[int]]:
-    """Yield the windows that are run together, by their numbers.
+    """Yield the indices of windows that are run in one batch.
 
-    Steps cost much the same for one row or many, so that long and short windows run side by side,
-    as long as none is kept going for far more than its own length and memory suffices.
+    A step takes about the same time for one row and for many. Windows of different lengths are
+    therefore run together, unless some would run on for far more than their length, or the batch
+    would need too much memory.
 
     Args:
-        numbers_per_step: numbers that each row keeps for each step.
+        windows: windows to run.
+        numbers_per_step: number of values stored per row and step.
     """
     indices_by_length = sorted(range(len(windows)), key=lambda row: -_window_length(windows[row]))
     batch: list[int] = []
@@ -369,22 +373,24 @@ def _simulate_batch(
     input_tables: Mapping[int, np.ndarray],
     dtype: torch.dtype,
 ) -> torch.Tensor:
-    """Return the states [W, L, nx] of windows that run together, each from its row of x0."""
+    """Return the states [W, L, nx] of one batch of windows, each from its row of x0."""
     longest_window = max(map(_window_length, windows))
+    # a window that is shorter than the longest repeats its last input; its surplus is cut off later
     future_inputs = np.stack(
         [
-            input_tables[w_history.log_index][
+            input_tables[window.log_index][
                 np.minimum(
-                    np.arange(w_history.start, w_history.start + longest_window - 1),
-                    w_history.stop - 1,
+                    np.arange(window.start, window.start + longest_window - 1),
+                    window.stop - 1,
                 )
             ]
-            for w_history in windows
+            for window in windows
         ]
     )
     with torch.no_grad():
         memory = model.initial_state(len(windows)).to(dtype)
         if isinstance(model, HybridDynamics):
+            # windows near a gap have less history; rows of equal length are warmed up together
             history_lengths = np.array([window.start - window.history_start for window in windows])
             for history_length in np.unique(history_lengths):
                 same_history = np.flatnonzero(history_lengths == history_length)
@@ -418,14 +424,20 @@ def _to_prediction(
     dt: float,
     velocity_limits: np.ndarray,
 ) -> Prediction:
-    """Return states [L, 3 + n] or what moves [L, n] with its pose; of `constant_velocity` if it ran
-    away.
+    """Return the prediction of a window; constant velocity replaces a diverged run.
+
+    Args:
+        window: the window.
+        simulated: simulated states [L, 3 + n], or dynamic states [L, n] without the pose.
+        logs: prepared logs.
+        dt: time step in s.
+        velocity_limits: limits [n] of the velocities; see `run_free_runs`.
     """
     log = logs[window.log_index]
     window_slice = slice(window.start, window.stop)
     velocities = simulated[:, -log.dof.n_dynamic :]
     measured_speeds = np.abs(log.y[window_slice, log.dof.dynamic_columns][log.usable[window_slice]])
-    # short training logs may hold far less than the window, and then it is the vessel that exceeds
+    # the vessel itself may exceed the limits in a window if the training logs are slow and short
     measured_limits = _MEASURED_SPEED_MARGIN * measured_speeds.max(0, initial=0.0)
     velocity_limits = np.where(
         velocity_limits < 0.0, velocity_limits, np.maximum(velocity_limits, measured_limits)
@@ -465,11 +477,12 @@ def _initial_state(candidate: Candidate, window: Window, log: PreparedLog) -> np
 def pose_error_sizes(
     error: np.ndarray, dof: DegreesOfFreedom, attitude_errors: np.ndarray | None
 ) -> dict[str, np.ndarray]:
-    """Return the sizes [W] of errors of the pose by name, see `Live.ends`.
+    """Return the magnitudes [W] of pose errors by name, see `DegreesOfFreedom.pose_error_names`.
 
     Args:
-        error: of states [W, 3 + n], psi within half a turn.
-        attitude_errors: angles between attitudes [W]; None on the surface.
+        error: errors of states [W, 3 + n], psi wrapped to half a turn.
+        dof: degrees of freedom, which determine the names.
+        attitude_errors: angles between attitudes [W]; None for surface vessels.
     """
     sizes = {"position": np.hypot(*error[:, POSITION].T), "heading": np.abs(error[:, HEADING])}
     if attitude_errors is not None:
@@ -483,13 +496,14 @@ def pose_error_sizes(
 def compute_integration_errors(
     y: np.ndarray, dof: DegreesOfFreedom, dt: float
 ) -> dict[str, np.ndarray]:
-    """Return how far integrated measured velocities end from the measured pose, by name [W].
+    """Return the final pose errors [W] of the integrated measured velocities, by name.
 
-    See `Live.ends`.
+    Even exact velocities of a model would have these errors, which are the noise floor.
 
     Args:
         y: measured states [W, L, 3 + n].
-        dt: between samples in s.
+        dof: degrees of freedom.
+        dt: time step in s.
     """
     error = np.zeros_like(y[:, -1])
     for error_of_run, measured in zip(error, y, strict=True):
@@ -514,9 +528,9 @@ def compute_integration_errors(
 
 
 def integrate_pose(pose: np.ndarray, nu: np.ndarray, dt: float) -> np.ndarray:
-    """Return the pose [L, 3] from its first value [3] and what moves [L, n].
+    """Return the pose [L, 3] from its initial value [3] and the dynamic states nu [L, n].
 
-    By the trapezoidal rule, heading first, then position.
+    Trapezoidal rule; the heading first, since the position depends on it.
     """
 
     def trapezoid(initial_value: float, rate: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Goodness of fit of one-step predictions (document 000, appendix E); how far repeats differ."""
+"""Goodness of fit of one-step predictions (document 000, appendix E); repeatability of logs."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from residnet.preprocessing.prepare import PreparedLog
 _COMMAND_TOLERANCE = 0.05
 _START_TOLERANCE = 0.25
 _SEARCH_INTERVAL = 0.5
-"""How much two runs of a pair differ at most: in commands, share of their range, and at the start,
-in scales. Starts are tried every `_SEARCH_INTERVAL` seconds. Chosen by hand: closer ones leave few
+"""Largest differences of repeated runs: of commands relative to their range, and of the initial
+velocities in scales; and the interval in s of the tried starts. Smaller values would leave few
 pairs.
 """
 
@@ -106,7 +106,7 @@ def find_pairs(
     state_scales: np.ndarray,
     dt: float,
 ) -> Iterator[RepeatedPair]:
-    """Return pairs of repeated runs; `scales` [n] belong to the velocities.
+    """Return pairs of repeated runs; `state_scales` [n] are the scales of the dynamic states.
 
     Each window of the protocol is paired with at most one segment per log, from its own log on.
     Repetitions are undefined without commands; the result is then empty.
@@ -146,7 +146,7 @@ def find_pairs(
                 )
                 is_repeat = (
                     (command_mismatch < _COMMAND_TOLERANCE)
-                    # an unbroken, usable stretch with nearly the initial velocities of the window
+                    # a usable segment without gaps and with similar initial velocities
                     & (other_log.segment[starts] >= 0)
                     & (other_log.segment[starts] == other_log.segment[starts + length - 1])
                     & other_log.usable[starts]
@@ -165,9 +165,10 @@ def find_pairs(
 
 
 def mismatch(reference_commands: np.ndarray, series: np.ndarray) -> np.ndarray:
-    """Return the difference of a stretch [L, m] to every stretch of a series, [T - L + 1].
+    """Return the difference of commands [L, m] to every segment of a series [T, m], [T - L + 1].
 
-    It is the root mean square, the largest over the columns of the series [T, m].
+    It is the root mean square difference of the worst column. The square is expanded, so that the
+    mixed term is a correlation, which is computed by FFT for all starts at once.
     """
     if len(series) < len(reference_commands):
         return np.zeros(0)
@@ -221,7 +222,7 @@ def _pair_differences(pair: RepeatedPair, logs: Sequence[PreparedLog]) -> list[f
 
 
 def _final_relative_pose(y: np.ndarray) -> np.ndarray:
-    """The pose [3] at the end of a run [T, 3 + n] in the axes of its start."""
+    """Return the final pose [3] of a run [T, 3 + n] in the axes of its start."""
     north, east, heading_change = y[-1, POSE] - y[0, POSE]
     cos_heading = np.cos(y[0, HEADING])
     sin_heading = np.sin(y[0, HEADING])
@@ -250,13 +251,13 @@ def _mean_differences(
 
 
 _N_BLOCK_RESAMPLES = 2_000
-"""Of the blocks: their 2.5 % tail then holds fifty."""
+"""Number of bootstrap resamples; the 2.5 % tail then contains fifty."""
 _NORMAL_APPROXIMATION_BLOCKS = 500
-"""From so many blocks on the mean of a resample is normal, and is not drawn."""
+"""Number of blocks from which the normal approximation replaces the bootstrap."""
 _MAX_INFLATION = 1.5
-"""Most that an interval is widened by; chosen by hand: of few blocks the factor is noise itself."""
+"""Largest widening of an interval; for few blocks the estimated factor is itself uncertain."""
 _CORRELATION_THRESHOLD = 2.0
-"""Standard deviations of a correlation that is no more than noise (Politis and White 2004, section
+"""Threshold of insignificant correlations in standard deviations (Politis and White 2004, section
 3.2: c = 2 for log base 10).
 """
 
@@ -265,12 +266,12 @@ Segments = Sequence[np.ndarray]
 
 @dataclass(frozen=True)
 class SerialDependence:
-    """The memory of a series: how far it remembers.
+    """Serial dependence of a series.
 
     Attributes:
         block_length: length of blocks for a bootstrap of its mean, in samples.
-        variance: its long-run variance, n times the variance of its mean.
-        effective_size: number of independent samples whose mean varies as much, at most n.
+        variance: long-run variance, n times the variance of the mean.
+        effective_size: number of independent samples with the same variance of the mean, at most n.
     """
 
     block_length: int
@@ -290,9 +291,10 @@ class BlockBootstrapInterval:
 
 
 def compute_autocovariance(segments: Segments, max_lag: int) -> np.ndarray:
-    """Return autocovariances at lags 0 .. `lags`, [lags + 1], about the mean of all pieces.
+    """Return autocovariances at lags 0 .. `max_lag` about the common mean of all segments.
 
-    Products are within pieces, over the number n of all samples.
+    Products are within segments only; their sum is divided by the number n of all samples, which
+    keeps the sequence positive semidefinite.
     """
     pooled = np.concatenate(list(segments))
     mean = pooled.mean()
@@ -336,7 +338,7 @@ def estimate_serial_dependence(segments: Segments) -> SerialDependence:
     windowed_covariance = (
         np.minimum(1.0, 2.0 * (1.0 - lag / bandwidth)) * covariance[1 : bandwidth + 1]
     )
-    # a window that is flat may sum to less than nothing
+    # the flat-top window does not guarantee a positive sum
     variance = max(
         float(covariance[0] + 2 * windowed_covariance.sum()), 0.05 * float(covariance[0])
     )

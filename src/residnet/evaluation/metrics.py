@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 
 CONFIDENCE_LEVEL = 0.95
-"""Of all intervals."""
+"""Level of all intervals."""
 _N_RESAMPLES = 10_000
-"""Of the blocks: their 2.5 % tail then holds 250."""
+"""Number of bootstrap resamples; the 2.5 % tail then contains 250."""
 MIN_LOGS_AS_BLOCKS = 5
 TARGET_BLOCKS = 8
 _MIN_BLOCKS = 5
@@ -174,7 +174,7 @@ def prediction_intervals(
 
 
 def bootstrap_tail_probability(n_blocks: int) -> float:
-    """Return the share of resampled means left out at either end, for at least 2 blocks.
+    """Return the tail probability of the percentiles at either end, for at least 2 blocks.
 
     It is 0.025 for many blocks and less for few.
     """
@@ -186,7 +186,7 @@ def bootstrap_tail_probability(n_blocks: int) -> float:
 
 @lru_cache(maxsize=16)
 def _draw_block_counts(n_blocks: int) -> np.ndarray:
-    """How often each block is drawn, [resamples, count]."""
+    """Return how often each block is drawn in each resample, [resamples, n_blocks]."""
     return (
         np.random.default_rng(0)
         .multinomial(n_blocks, np.full(n_blocks, 1 / n_blocks), size=_N_RESAMPLES)
@@ -229,7 +229,7 @@ LIMITS_SCHEMA = "residnet.limits/1"
 _N_WORST_WINDOWS = 3
 _N_SPEED_CLASSES = 3
 _MIN_CLASS_WINDOWS = 3
-"""Reported worst windows, classes of speed, windows needed per class; chosen by hand."""
+"""Number of reported worst windows, of speed classes, and of windows required per class."""
 _WIND_CHANNEL = "wind_speed"
 _HORIZONS = (10.0, 30.0, 100.0)
 """Horizons in s of the reported pose errors."""
@@ -250,7 +250,7 @@ class ProtocolEvaluation:
         logs: Sequence[PreparedLog],
         scales: Mapping[str, float],
     ) -> None:
-        # reports of finished runs read this module and do not wait for PyTorch
+        # imported here because it imports PyTorch, which reports of finished runs do not need
         from residnet.evaluation.freerun import FreeRunErrors
 
         self.free_run = free_run
@@ -380,7 +380,7 @@ class ProtocolEvaluation:
             "nrmse_mean_ci95": confidence_intervals[dof.n_dynamic],
             "ci95_blocks": resampling_blocks.to_row() if resampling_blocks is not None else None,
         }
-        # they stand behind the errors of what moves and their mean
+        # the pose errors are the columns after the dynamic states and the NRMSE
         for column, model_name in enumerate(pose_errors, dof.n_dynamic + 1):
             summary[f"{model_name}_error_end"] = float(errors_by_window[:, column].mean())
             summary[f"{model_name}_error_end_ci95"] = confidence_intervals[column]
@@ -508,7 +508,7 @@ class ProtocolEvaluation:
         for quantity, values in values_by_quantity.items():
             if not np.isfinite(values).all():
                 continue
-            # equal values stay together
+            # `searchsorted` keeps windows with equal values in one class
             class_limits = np.quantile(values, np.arange(1, _N_SPEED_CLASSES) / _N_SPEED_CLASSES)
             class_indices = np.searchsorted(class_limits, values, side="left")
             class_masks = [
@@ -621,7 +621,7 @@ class ProtocolEvaluation:
 def _summarize_pose_errors(
     pose_errors: Mapping[str, Mapping[str, np.ndarray]], log_indices: np.ndarray
 ) -> dict[str, dict[str, Any]]:
-    """Return means and intervals of sizes [W] of errors of the pose, by model and name."""
+    """Return means and intervals of the magnitudes [W] of pose errors, by model and name."""
     values = np.column_stack(
         [sizes for sizes_by_name in pose_errors.values() for sizes in sizes_by_name.values()]
     )
@@ -631,7 +631,7 @@ def _summarize_pose_errors(
     summary: dict[str, dict[str, Any]] = {}
     for model, sizes_by_name in pose_errors.items():
         mean_and_interval = {name: next(means_and_intervals) for name in sizes_by_name}
-        # an angle is off by half a turn at most
+        # errors of angles are at most half a turn
         upper_bounds = {
             name: math.pi if POSE_ERROR_UNITS[name] == "rad" else math.inf for name in sizes_by_name
         }
@@ -646,7 +646,7 @@ def _summarize_pose_errors(
 
 
 def find_row(rows: Sequence[Mapping[str, Any]], **labels: str) -> Mapping[str, Any]:
-    """Return the one row of a model, split, protocol and manoeuvre (`all` where not given)."""
+    """Return the one row of a model, split, protocol and manoeuvre (`all` by default)."""
     keys = {"manoeuvre": "all"} | labels
     matching_rows = [row for row in rows if all(row[key] == value for key, value in keys.items())]
     if len(matching_rows) != 1:
@@ -699,14 +699,14 @@ def build_metrics_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return rows of metrics.json as a table with one column per number.
 
     Args:
-        rows: of metrics.json, as `evaluate` or the file gives them.
+        rows: rows of metrics.json.
 
     Returns:
-        Columns model, kind, split, protocol, manoeuvre (and selected where the rows have it),
+        Columns model, kind, split, protocol, manoeuvre (and selected if the rows have it),
         windows, diverged, n, then rmse_u, rmse_v, rmse_r (m/s, m/s, rad/s), the same for mae and
-        nrmse with nrmse_mean, note (such as "2/12 diverged", where such windows count with the
+        nrmse with nrmse_mean, note (such as "2/12 diverged"; diverged windows count with the
         error of `constant_velocity`), and position_error_end (m), heading_error_end (rad), or
-        depth_error_end (m) and attitude_error_end (rad) where the vessel dives.
+        depth_error_end (m) and attitude_error_end (rad) for vessels that dive.
     """
     import pandas as pd
 
@@ -717,7 +717,7 @@ def _flatten_row(row: Mapping[str, Any]) -> dict[str, Any]:
     flat_row = {name: row[name] for name in (*_LABEL_COLUMNS, *_COUNT_COLUMNS) if name in row}
     for name in _CHANNEL_COLUMNS:
         flat_row |= {f"{name}_{channel}": value for channel, value in row[name].items()}
-    # beside the score, since the diverged windows in it are no errors of the model
+    # next to the score, which contains constant-velocity errors for diverged windows
     flat_row["note"] = describe_divergence(row)
     return flat_row | {name: row[name] for name in _POSE_ERROR_COLUMNS if name in row}
 
@@ -820,5 +820,5 @@ def write_rollouts(
     for log, columns in iterate_rollout_columns(runs, logs, inputs, bands):
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
         with atomic_write(folder / f"{make_file_stem(log.log.name)}.parquet") as file:
-            # dictionaries of numbers that do not repeat take time and room
+            # dictionary encoding pays only for repeated texts, not for floating-point columns
             pq.write_table(table, file, compression="zstd", use_dictionary=["protocol", "model"])

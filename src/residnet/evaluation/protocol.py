@@ -1,4 +1,4 @@
-"""What models are judged by: protocols, which stretches of a log they predict, and scales."""
+"""Protocols, which define the windows of free runs, and scales of the errors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Window:
         start: sample of the initial state.
         stop: one past the last sample.
         history_start: first sample of the measured past that may warm up a memory.
-        initial_velocities: initially, what moves [n].
+        initial_velocities: initial values of the dynamic states [n].
     """
 
     log_index: int
@@ -39,16 +39,16 @@ class Window:
 
 
 class WindowProtocol(Config):
-    """A protocol of back-to-back windows of one length, as for the measured tanker.
+    """A protocol of back-to-back windows of equal length.
 
-    A start on a sample that is not usable moves on to the first that is; an incomplete tail is
+    A start on an unusable sample moves to the next usable one; an incomplete window at the end is
     dropped. The initial state is measured.
 
     Attributes:
-        kind: `make_windows`.
-        length: of a window in s.
+        kind: `windows`.
+        length: length of a window in s.
         first: start of the first window after the log's start, in s.
-        history: time before a window that may warm up a memory, in s.
+        history: measured time before a window that may initialise a memory, in s.
     """
 
     kind: Literal["windows"] = "windows"
@@ -57,16 +57,16 @@ class WindowProtocol(Config):
     history: Seconds = Field(default=5.0, ge=0)
 
     def make_windows(self, log: PreparedLog, log_index: int, dt: float) -> list[Window]:
-        """Return the windows of one log; none where it is too short."""
+        """Return the windows of one log; empty if it is too short."""
         return self._place_windows(log, log_index, dt, self.length)
 
     def make_overlapping_windows(
         self, log: PreparedLog, log_index: int, dt: float, interval: float | None = None
     ) -> list[Window]:
-        """Return windows of the same length with starts every `every` seconds.
+        """Return windows of the same length with starts every `interval` seconds.
 
-        The default is a quarter of the length. A choice between models needs more windows than the
-        back-to-back windows of a few logs; the incomplete window at the end of a log is dropped.
+        The default is a quarter of the length. A few logs have too few back-to-back windows for a
+        choice between models. An incomplete window at the end of a log is dropped.
         """
         interval = self.length / 4 if interval is None else min(interval, self.length)
         return self._place_windows(log, log_index, dt, interval)
@@ -85,10 +85,10 @@ class WindowProtocol(Config):
             if start + n_steps >= len(log):
                 break
             if segment_ends[start] <= start + n_steps:
-                # a break inside: nothing can be simulated across it
+                # a gap within the window: inputs are missing there
                 start = int(segment_ends[start])
                 continue
-            # a break ends the past that may warm up a memory
+            # the history must not extend beyond the gap before this segment
             history_start = max(
                 start - round(self.history / dt),
                 int(np.searchsorted(segment_ends, segment_ends[start])),
@@ -107,15 +107,15 @@ class WindowProtocol(Config):
 
 
 class ManoeuvreProtocol(Config):
-    """A protocol that takes every uninterrupted stretch of a log as one free run.
+    """A protocol with one free run over each segment of a log without gaps.
 
-    The initial velocities are the mean of the first seconds, which also warm up a memory; scoring
-    starts after them. Stretches without a sample to score are left out.
+    The initial velocities are the mean over the first seconds, which also initialise a memory;
+    scoring starts after them. Segments without a usable sample are omitted.
 
     Attributes:
         kind: `manoeuvre`.
-        initial: how long the initial velocities are averaged, in s.
-        shortest: shorter stretches are left out, in s.
+        initial: time over which the initial velocities are averaged, in s.
+        shortest: shortest length of a segment, in s; shorter ones are omitted.
     """
 
     kind: Literal["manoeuvre"] = "manoeuvre"
@@ -123,7 +123,7 @@ class ManoeuvreProtocol(Config):
     shortest: Seconds = Field(default=5.0, gt=0)
 
     def make_windows(self, log: PreparedLog, log_index: int, dt: float) -> list[Window]:
-        """Return one window per stretch."""
+        """Return one window per segment."""
         n_initial = max(round(self.initial / dt), 1)
         windows = []
         _, segment_ends = find_run_bounds(log.segment)
@@ -162,7 +162,7 @@ ProtocolConfig = Annotated[WindowProtocol | ManoeuvreProtocol, Field(discriminat
 
 
 def longest_segment_length(log: PreparedLog) -> int:
-    """Return the samples of the longest stretch without a gap, which no free run goes across."""
+    """Return the number of samples of the longest segment without a gap."""
     return int((find_run_bounds(log.segment)[1] - np.arange(len(log))).max())
 
 
@@ -177,11 +177,14 @@ def make_windows(
     """Return the windows of a protocol over several logs.
 
     Args:
-        protocol_name: of the protocol.
-        is_overlapping: whether they overlap, see `Windows.overlapping`.
+        protocol: the protocol.
+        logs: prepared logs.
+        dt: time step in s.
+        protocol_name: name of the protocol, for the message.
+        is_overlapping: whether windows overlap, see `make_overlapping_windows`.
 
     Raises:
-        DataError: where no log is long enough for a single one.
+        DataError: if no log is long enough for a window.
     """
     make_log_windows = (
         protocol.make_overlapping_windows if is_overlapping else protocol.make_windows
@@ -196,32 +199,29 @@ def make_windows(
         longest_segment = max(map(longest_segment_length, logs))
         raise DataError(
             f"protocol {protocol_name}: none of {len(logs)} '{logs[0].split}' logs holds a"
-            f" window; the"
-            f" longest, {longest_log.log.name}, lasts {len(longest_log) * dt:.1f} s, and the"
-            f" longest"
-            f" stretch without a gap {longest_segment * dt:.1f} s; give longer logs, fill gaps"
-            f" that may be"
-            " interpolated, or shorten the protocol"
+            f" window; the longest, {longest_log.log.name}, lasts {len(longest_log) * dt:.1f} s,"
+            f" and the longest stretch without a gap {longest_segment * dt:.1f} s; use longer logs,"
+            " fill gaps that may be interpolated, or shorten the protocol"
         )
     return windows
 
 
 class Scales(Config):
-    """Scales that nrmse divides by: typical spreads of the measured velocities.
+    """Scales of the errors, the denominators of the NRMSE: typical spreads of the measured motion.
 
-    Other logs that a run is evaluated on are judged by the same scales. Each velocity that the
-    model moves (`signals.velocities`) has one.
+    Each velocity that the model predicts (`signals.velocities`) has a scale. The same scales apply
+    to other logs on which the run is evaluated, so that errors remain comparable.
 
     Attributes:
-        u: of the surge velocity in m/s.
-        v: of the sway velocity in m/s.
-        r: of the yaw rate in rad/s.
-        p: of the roll rate in rad/s, for models that roll.
-        phi: of the roll angle in rad, with p.
-        w: of the heave velocity in m/s, for models of six degrees of freedom.
-        q: of the pitch rate in rad/s, for these.
-        z: of the depth in m, for these.
-        theta: of the pitch angle in rad, for these.
+        u: scale of the surge velocity in m/s.
+        v: scale of the sway velocity in m/s.
+        r: scale of the yaw rate in rad/s.
+        p: scale of the roll rate in rad/s, for models with roll.
+        phi: scale of the roll angle in rad, for models with roll.
+        w: scale of the heave velocity in m/s, for models of six degrees of freedom.
+        q: scale of the pitch rate in rad/s, for models of six degrees of freedom.
+        z: scale of the depth in m, for models of six degrees of freedom.
+        theta: scale of the pitch angle in rad, for models of six degrees of freedom.
     """
 
     u: Annotated[MetresPerSecond, Field(gt=0)] | None = None
@@ -235,7 +235,7 @@ class Scales(Config):
     theta: Annotated[Radians, Field(gt=0)] | None = None
 
     def to_array(self) -> np.ndarray:
-        """Return the scales of what moves as one array [n], SI; 1 without a scale."""
+        """Return the scales of the dynamic states as one array [n], SI; 1 without a scale."""
         layout = (
             SIX_DOF_LAYOUT
             if self.w is not None
@@ -246,7 +246,7 @@ class Scales(Config):
         return np.array([self.to_dict().get(name, 1.0) for name in layout.dynamic_states])
 
     def to_dict(self) -> dict[str, float]:
-        """Return the scales by the name of what moves."""
+        """Return the scales by the name of the dynamic state."""
         scales_by_name = {name: getattr(self, name) for name in SIX_DOF_LAYOUT.dynamic_states}
         return {name: float(value) for name, value in scales_by_name.items() if value is not None}
 
@@ -255,10 +255,10 @@ class EvaluationConfig(Config):
     """Settings of the evaluation: protocols and scales.
 
     Attributes:
-        protocols: by name, as in metrics.json.
-        selection: the protocol whose mean nrmse over the validation windows selects models and
+        protocols: protocols by name, as in metrics.json.
+        selection: the protocol whose mean NRMSE over the validation windows selects models and
             stops training early.
-        scales: denominators of the nrmse.
+        scales: denominators of the NRMSE.
         groups: named sets of manoeuvre kinds with rows of their own.
         divergence: a free run has diverged if a velocity exceeds this multiple of its largest
             training value.

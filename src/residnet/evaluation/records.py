@@ -17,7 +17,7 @@ ByChannel = dict[str, float]
 Interval = tuple[float, float]
 """Lower and upper limit."""
 ModelKind = Literal["constant_velocity", "baseline", "head", "plant", "ensemble"]
-"""What a model is."""
+"""Kinds of models."""
 
 # metrics.json
 
@@ -26,7 +26,7 @@ class BlockCount(Record):
     """The blocks that a bootstrap resamples or a selection pairs.
 
     Attributes:
-        of: what a block is: all windows of a log (`logs`), or parts of logs.
+        of: whether a block is all windows of a log (`logs`), or a part of a log.
         count: number of blocks.
     """
 
@@ -140,7 +140,7 @@ class MetricsFile(FileRecord):
 
 
 class SelectionRow(Record):
-    """A model as the selection sees it.
+    """A candidate of the model selection.
 
     Attributes:
         model: name of the model.
@@ -270,7 +270,7 @@ class OutsideRange(Record):
 
 
 class ProtocolLimits(Record):
-    """Where the models fail under one protocol of one split.
+    """Limits of the models under one protocol of one split.
 
     Attributes:
         kinematics: number of windows, and mean and root mean square of each pose error of the

@@ -29,7 +29,7 @@ MODEL_FAMILIES = (
     "network",
     "ensemble",
 )
-"""What a model is, the simplest first."""
+"""Families of models in ascending order of complexity."""
 
 _EQUIVALENCE_STANDARD_ERRORS = {"logs": 1.0, "stretches": 0.5}
 """Standard errors within which models are equally good; segments of few logs are correlated."""
@@ -39,17 +39,17 @@ _ERROR_OFFSET_SHARE = 0.1
 
 @dataclass(frozen=True)
 class SelectionCandidate:
-    """A model with what decides whether it is chosen.
+    """A model with the criteria of the selection.
 
     Attributes:
-        name: of the model.
+        name: name of the model.
         family: one of `MODEL_FAMILIES`.
         n_parameters: number of its fitted parameters.
         mean_nrmse: its mean NRMSE over the validation windows.
-        block_scores: what each block of the validation data contributes to the mean logarithm of
+        block_scores: contribution of each block of the validation data to the mean logarithm of
             its error, [B]; see `block_log_errors`.
         n_diverged: number of its validation windows that diverged, over all protocols.
-        faults: sentences on what makes it unsound, divergences among them; empty for a sound model.
+        faults: texts on failed checks and divergences; empty for a sound model.
     """
 
     name: str
@@ -82,7 +82,7 @@ class SelectionBlocks:
 
     Attributes:
         weights: share of each block in the mean over windows, [B]; their sum is 1.
-        block_kind: `logs` where a block is all windows of a log, else `stretches` of logs.
+        block_kind: `logs` if a block is all windows of a log, else `stretches` of logs.
     """
 
     weights: np.ndarray
@@ -203,7 +203,7 @@ def select_models(candidates: Iterable[SelectionCandidate], blocks: SelectionBlo
     )
     ensembles = [candidate for candidate in all_candidates if candidate.family == "ensemble"]
     best_ensemble = min(
-        ensembles, key=lambda one: (one.n_diverged, one.mean_log_error), default=None
+        ensembles, key=lambda model: (model.n_diverged, model.mean_log_error), default=None
     )
     return Selection(
         selected_model.name,
@@ -217,16 +217,17 @@ def select_models(candidates: Iterable[SelectionCandidate], blocks: SelectionBlo
 def _simplest_equivalent(
     single_models: Sequence[SelectionCandidate], blocks: SelectionBlocks
 ) -> tuple[SelectionCandidate, str]:
-    """Return the simplest of the models that are as good as the best, the sound first, and why."""
+    """Return the simplest model equivalent to the best, preferably a sound one, and the reason."""
     bounded_models = [model for model in single_models if not model.n_diverged]
-    most_accurate = min(bounded_models, key=lambda one: one.mean_log_error)
+    most_accurate = min(bounded_models, key=lambda model: model.mean_log_error)
     tolerance_text = (
         "one standard error"
         if blocks.equivalence_standard_errors == 1.0
         else "half a standard error"
     )
     for candidate in sorted(
-        bounded_models, key=lambda one: (not one.is_sound, *one.complexity_rank, one.mean_log_error)
+        bounded_models,
+        key=lambda model: (not model.is_sound, *model.complexity_rank, model.mean_log_error),
     ):
         mean_log_ratio, standard_error = log_error_ratio(candidate, most_accurate, blocks)
         if mean_log_ratio <= (tolerance := blocks.equivalence_standard_errors * standard_error):
@@ -235,10 +236,10 @@ def _simplest_equivalent(
     if candidate.family == CONSTANT_VELOCITY:
         reason = f"No model is better than constant velocity by more than {tolerance_text}"
     elif candidate is most_accurate:
-        reason = f"{candidate.name} errs least ({error_text})"
+        reason = f"{candidate.name} has the smallest error ({error_text})"
         if any(model.complexity_rank < most_accurate.complexity_rank for model in bounded_models):
             reason += (
-                f", and no {'simpler' if most_accurate.is_sound else 'sound'} one comes"
+                f", and no {'simpler' if most_accurate.is_sound else 'sound'} one is"
                 f" within {tolerance_text}"
             )
     else:
@@ -256,7 +257,7 @@ def _simplest_equivalent(
     ]
     if diverged_models:
         diverged_text = ", ".join(f"{model.name} ({model.faults[0]})" for model in diverged_models)
-        reason += f"; passed over: {diverged_text}"
+        reason += f"; excluded: {diverged_text}"
     if not candidate.is_sound:
         reason += f", with these faults: {'; '.join(candidate.faults)}"
     return candidate, reason + "."
@@ -294,7 +295,7 @@ def make_selection_blocks(free_run: FreeRun) -> tuple[SelectionBlocks, list[np.n
             strict=True,
         ):
             block_numbers[window_index] = log_position * segments_per_log + window_block_numbers
-    # a log of fewer samples than pieces leaves numbers out
+    # a log with fewer samples than segments leaves unused numbers, which are removed
     unique_blocks, log_block_numbers = np.unique(np.concatenate(block_numbers), return_inverse=True)
     block_numbers = np.split(log_block_numbers, np.cumsum(window_lengths)[:-1])
     weights = np.zeros(len(unique_blocks))
@@ -346,14 +347,14 @@ def block_error_shares(
 def block_log_errors(
     error_shares: Mapping[str, np.ndarray], block_weights: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return what each block contributes to the mean logarithm of a model's error, [B] by model.
+    """Return the contribution of each block to the mean logarithm of the error, [B] by model.
 
-    A tenth of the least mean error is added to each error, so that no block counts much where all
-    models are nearly right.
+    A tenth of the smallest mean error is added to each error. Otherwise blocks in which all models
+    are nearly exact would dominate the mean of the logarithms.
 
     Args:
-        error_shares: what each block contributes to the mean NRMSE, [B] by model.
-        block_weights: of the blocks, [B].
+        error_shares: contribution of each block to the mean NRMSE, [B] by model.
+        block_weights: weights of the blocks, [B].
     """
     least_mean_error = min(
         (float(share_of_model.sum()) for share_of_model in error_shares.values()), default=0.0

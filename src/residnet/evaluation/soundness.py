@@ -48,29 +48,29 @@ DAMPING, STABILITY, SYMMETRY, BOUNDEDNESS = CHECKS = ("damping", "stability", "s
 _N_CHECK_POINTS = 90
 """Number of recorded states to check, without those of extreme inputs; chosen by hand."""
 _NEGLIGIBLE_SLOPE_SHARE = 0.05
-"""Share of a slope's size elsewhere below which a positive one is no wrong sign."""
+"""A positive slope below this share of the typical magnitude does not count as a wrong sign."""
 _MAX_DOUBLING_TIME = 300.0
-"""Time in s within which a growing disturbance counts."""
+"""Longest doubling time in s of a disturbance that counts as unstable."""
 _MAX_ASYMMETRY = 0.1
-"""Uneven part of the acceleration, share of its spread, beyond which sides differ; by choice."""
+"""Largest asymmetric part of the acceleration of a symmetric model, relative to its spread."""
 _LONG_RUN_DURATION = 300.0
-"""Time in s that inputs are held at least: within it a disturbance doubles that counts."""
+"""Shortest run in s with constant inputs; a disturbance that counts doubles within it."""
 _MEMORY_SETTLING_TIME = 10.0
 _STEADY_TOLERANCE = 1e-4
 _SPEED_FRACTIONS = (0.0, 0.25, 0.5, 0.67, 1.0, 1.5)
 _CRUISE_FRACTION = 0.67
-"""Speeds of straight running, in the largest of the training data."""
+"""Speeds of straight running, relative to the largest training speed."""
 _MAX_CORNERS = 64
-"""Corners of the inputs' ranges: all of up to six inputs."""
+"""Largest number of corners of the input ranges: all corners of up to six inputs."""
 _CONSTANT_INPUT_TOLERANCE = 0.02
 _MIN_CONSTANT_DURATION = 5.0
-"""Share of an input's range within which it is held, and for how long in s at least."""
+"""Tolerance of a constant input relative to its range, and shortest duration in s."""
 _MIN_MODEL_GROWTH = 20.0
 _MAX_MEASURED_GROWTH = 3.0
 _MIN_MEASURED_DECAY = 3.0
 _MAX_STEADY_RUNS = 20
 _SETTLING_SHARE = 0.25
-"""Steady runs that are looked at, and the share of each that settles; chosen by hand."""
+"""Number of steady runs that are checked, and the initial share of each for the settling."""
 _DISTURBANCE_SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
 
 
@@ -78,9 +78,9 @@ _DISTURBANCE_SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
 class SanityFinding:
     """A finding of one check of one model.
 
-    `ok` is None where the check does not apply or could not be made. `fault` says in a few words
-    what makes the model unsound, so that one that is as good comes first; it is empty where the
-    finding is only reported.
+    `ok` is None if the check does not apply or could not be made. `fault` is a short text on why
+    the model is unsound, so that an equally good model is preferred; it is empty for a finding that
+    is only reported.
     """
 
     model: str
@@ -117,13 +117,13 @@ class SteadyRun:
 
 @dataclass(frozen=True)
 class TrainingPoints:
-    """What training logs hold for the checks.
+    """States, inputs and steady runs of the training logs for the checks.
 
     Attributes:
         x: recorded states [K, 3 + n] with the pose at zero.
         w: inputs [K, m].
-        longest_duration: how long the longest log lasts in s.
-        steady_runs: stretches with held inputs.
+        longest_duration: duration of the longest log in s.
+        steady_runs: segments with constant inputs.
     """
 
     x: Tensor
@@ -134,7 +134,8 @@ class TrainingPoints:
     @classmethod
     def from_logs(cls, logs: Sequence[PreparedLog], dt: float) -> TrainingPoints:
         """Return samples at evenly spaced speeds, samples of extreme inputs, and steady runs."""
-        # all states of large data would fill the memory: only those of the points are put together
+        # large data sets do not fit into memory: only speeds are concatenated over all logs, states
+        # only at the selected samples
         usable_indices = [np.flatnonzero(log.usable) for log in logs]
         logs_and_indices = list(zip(logs, usable_indices, strict=True))
         speed = np.concatenate(
@@ -186,10 +187,10 @@ class TrainingPoints:
 
 
 def find_steady_runs(logs: Sequence[PreparedLog], dt: float) -> list[SteadyRun]:
-    """Return the stretches of logs whose inputs hold within 2 % of their ranges.
+    """Return the segments of logs with inputs constant within 2 % of their ranges.
 
-    The first quarter of each is left out, in which the motion settles, and so are stretches of
-    fewer than five seconds.
+    Segments last at least five seconds. The statistics exclude the first quarter of each, in which
+    the motion settles.
     """
     usable_inputs = [log.w[log.usable] for log in logs if log.usable.any()]
     input_ranges = np.max([inputs.max(0) for inputs in usable_inputs], 0) - np.min(
@@ -272,14 +273,14 @@ def check_model(
         training_points: states, inputs and steady runs of the training logs.
         divergence_factor: multiple of the largest training velocity above which a run has diverged.
     """
-    # a copy: the checks run in float64, and must not round what others hold
+    # a copy, since the checks convert it to float64
     model = copy.deepcopy(model).to(torch.float64).eval()
     n_threads = torch.get_num_threads()
-    # products this small only lose time to a second thread
+    # for such small matrices a second thread costs more time than it saves
     torch.set_num_threads(1)
-    # the memory of a mean is too large for a Jacobian at each point; free runs show what it does
-    ensemble_text = "not looked at: the mean of several models, whose free runs are bounded or not"
-    straight_text = "not looked at: the model neither sways nor turns"
+    # the memory of an ensemble is too large for a Jacobian at each point; its free runs are checked
+    ensemble_text = "not checked for a mean of several models; see the check of bounded free runs"
+    straight_text = "not checked: the model has neither sway nor yaw"
     straight_text = straight_text if spec.signals.velocities == ("u",) else ""
     skip_reason = straight_text or (ensemble_text if isinstance(model, MeanOfTrajectories) else "")
     try:
@@ -332,7 +333,7 @@ def check_damping(
     against its values at the other points.
     """
     x, dof = training_points.x.clone().requires_grad_(), spec.signals.dof
-    # a model may depend on no velocity at all
+    # autograd needs a dependence on x, which a model without velocity terms does not have
     nu_dot = settled_acceleration(model, x, training_points.w) + 0.0 * all_but_pose(x)
     damping_slopes = np.stack(
         [
@@ -359,7 +360,7 @@ def check_damping(
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Straight running at a speed: state x [3 + n], inputs w [m], and whether the data reach it."""
+    """Straight running: state x [3 + n], inputs w [m], and whether it is in the training range."""
 
     label: str
     speed: float
@@ -388,7 +389,7 @@ def find_operating_points(spec: ModelSpec, model: HybridDynamics) -> list[Operat
     )
     mirror_partners = get_partners(input_names)
     for name, partner_name in mirror_partners.items():
-        # both sides alike, over the range that they share
+        # both sides get equal inputs, within their common range
         pair_columns = [input_names.index(name), input_names.index(partner_name)]
         lower[pair_columns], upper[pair_columns] = (
             lower[pair_columns].max(),
@@ -429,7 +430,7 @@ def _range_tensor(limits: Sequence[float]) -> Tensor:
 def check_stability(
     spec: ModelSpec, model: HybridDynamics, training_points: TrainingPoints
 ) -> SanityFinding:
-    """Check how small disturbances of sway, yaw, roll and memory grow in straight running."""
+    """Check the growth of small disturbances of sway, yaw, roll and memory in straight running."""
     motion_names = {"v": "sway", "r": "yaw", "p": "roll"}
     motion_text = " and ".join(
         motion_names[name] for name in motion_names if name in spec.signals.velocities
@@ -461,8 +462,7 @@ def check_stability(
         )
         text = (
             f"{motion_text} {verb} stable in straight running at {speeds} m/s (no mode doubles"
-            f" within"
-            f" {_MAX_DOUBLING_TIME:.0f} s). {summary}"
+            f" within {_MAX_DOUBLING_TIME:.0f} s). {summary}"
         )
         return _to_sanity_finding(spec, STABILITY, True, text, fault)
     unstable_inside = [
@@ -470,14 +470,15 @@ def check_stability(
         for rate_and_point in unstable_points
         if rate_and_point[1].is_inside_training_range
     ]
-    mode_rate, worst_point = max(unstable_inside or unstable_points, key=lambda one: one[0])
+    mode_rate, worst_point = max(
+        unstable_inside or unstable_points, key=lambda rate_and_point: rate_and_point[0]
+    )
     range_text = "inside the training data" if unstable_inside else "only outside the training data"
     text = (
-        f"{motion_text} unstable in straight running, {range_text}: worst at {worst_point}, a"
-        f" disturbance"
-        f" doubles in {format_number(math.log(2) / mode_rate, 2)} s. Some full hulls are so in"
-        f" truth; otherwise"
-        f" do not trust long free runs there. {summary}"
+        f"{motion_text} unstable in straight running, {range_text}: worst at {worst_point},"
+        f" where a disturbance doubles in {format_number(math.log(2) / mode_rate, 2)} s. Some full"
+        " hulls are unstable in reality; for other vessels long free runs there are unreliable."
+        f" {summary}"
     )
     return _to_sanity_finding(spec, STABILITY, False, text, fault)
 
@@ -488,7 +489,7 @@ def compute_growth_rate(model: HybridDynamics, x: Tensor, w: Tensor) -> float:
     It is the logarithm of the step map's spectral radius over dt.
 
     Args:
-        model: in float64 and evaluation mode.
+        model: model in float64 and evaluation mode.
         x: state [3 + n].
         w: inputs [m].
     """
@@ -501,7 +502,7 @@ def compute_growth_rate(model: HybridDynamics, x: Tensor, w: Tensor) -> float:
     next_states, next_memory = model.step(
         states, w.expand(n_variables, -1), variables[:, n_velocities:]
     )
-    # one row of the batch for each output: one backward pass gives the whole Jacobian
+    # row i of the batch is used for output i only, so that one backward pass gives the Jacobian
     next_variables = torch.cat((next_states[:, SWAY:], next_memory), dim=1)
     jacobian = torch.autograd.grad(next_variables.diagonal().sum(), variables)[0]
     spectral_radius = float(torch.linalg.eigvals(jacobian).abs().max())
@@ -532,17 +533,17 @@ def find_contradicting_steady_run(model: HybridDynamics, steady_runs: Sequence[S
         ):
             return (
                 "it is unstable where the logs are not (a disturbance would double in"
-                f" {format_number(math.log(2.0) / model_rate, 2)} s; log {run.log} runs steadily"
-                f" for"
-                f" {run.duration:.0f} s)"
+                f" {format_number(math.log(2.0) / model_rate, 2)} s; log {run.log} is steady"
+                f" for {run.duration:.0f} s)"
             )
     return ""
 
 
 def _final_deviation(model: HybridDynamics, run: SteadyRun) -> float:
-    """How far the model ends from a steady run, in deviations of the vessel; infinite out of range.
+    """Return the final deviation of the model from a steady run, relative to that of the vessel.
 
-    It begins with deviations of the vessel's size; the mean over the last third is looked at.
+    Runs start with deviations as large as the observed scatter. The result is the mean over the
+    last third; infinite for a run that is not finite.
     """
     deviation_scale = torch.from_numpy(np.maximum(run.scatter, 1e-9))
     initial_states = torch.from_numpy(run.mean_state).repeat(len(_DISTURBANCE_SIGNS), 1)
@@ -564,9 +565,9 @@ def _final_deviation(model: HybridDynamics, run: SteadyRun) -> float:
 
 
 def mirror_inputs(input_names: Sequence[str], w: Tensor) -> Tensor | None:
-    """Return inputs w [B, m] as a mirror shows them; None where it is not known how that is.
+    """Return mirrored inputs w [B, m]; None if the mirror image of an input is unknown.
 
-    Rudders change sign, port and starboard change places, wind comes from the other side.
+    Rudders and the lateral wind change sign, port and starboard inputs are exchanged.
     """
     mirror_partners = get_partners(input_names)
     parity_by_name = {"wind_speed": 1, "wind_dir": -1}
@@ -594,8 +595,8 @@ def check_symmetry(
     mirror_image = mirror_inputs(input_names, w)
     if mirror_image is None:
         text = (
-            f"not checked: nobody said which input steers (inputs {', '.join(spec.signals.inputs)};"
-            " delta and *_port/*_stbd pairs are understood)"
+            f"not checked: no steering input is recognised among {', '.join(spec.signals.inputs)}"
+            " (known are delta and pairs *_port/*_stbd)"
         )
         return SanityFinding(spec.name, SYMMETRY, None, text)
     dof = spec.signals.dof
@@ -619,7 +620,7 @@ def check_symmetry(
     acceleration_std = torch.cat((accelerations, mirrored_accelerations)).std(0).clamp(min=1e-12)
     rms_asymmetry = asymmetry.square().mean(0).sqrt() / acceleration_std
     max_asymmetry = asymmetry.amax(0) / acceleration_std
-    # the torque of a lone propeller heels the vessel to one side
+    # the torque of a single propeller heels the vessel to one side
     roll_excluded = {"p"} if find_heeling_propellers(model.signals.names) else set()
     checked_velocities = [name for name in dof.velocities if name not in roll_excluded]
     percentages = (100 * torch.stack((rms_asymmetry, max_asymmetry), dim=1)).tolist()
@@ -631,15 +632,18 @@ def check_symmetry(
         for name in dof.velocities
     )
     details += (
-        "; a propeller's torque heels, so that the roll is not judged" if roll_excluded else ""
+        "; roll is not checked, because the torque of a single propeller heels the vessel"
+        if roll_excluded
+        else ""
     )
     reason = (
-        "A single screw, an offset of the steering or too few turns one way may be the reason. "
+        "Possible reasons are a single propeller, an offset of the steering, or too few turns to"
+        " one side. "
     )
     text = (
-        f"port and starboard {'alike' if is_symmetric else 'differ'}: the uneven part of the"
-        f" acceleration is"
-        f" up to {max_percentage:.0f} % of its spread. {'' if is_symmetric else reason}RMS over"
+        f"port and starboard {'alike' if is_symmetric else 'differ'}: the asymmetric part of the"
+        f" acceleration is up to {max_percentage:.0f} % of its spread."
+        f" {'' if is_symmetric else reason}RMS over"
         f" {int(is_inside.sum())} points of the training data: {details}"
     )
     return SanityFinding(spec.name, SYMMETRY, is_symmetric, text)
@@ -677,7 +681,7 @@ def check_boundedness(
     memory = model.initial_state(len(x)).double()
     previous_velocities = all_but_pose(x)
     chunk_steps = max(round(_MEMORY_SETTLING_TIME / model.dt), 1)
-    # where the vessel is says nothing of how fast it is
+    # the position does not affect the velocities
     model_without_pose = copy.deepcopy(model)
     model_without_pose.has_position = False
     n_steps = round(max(_LONG_RUN_DURATION, training_points.longest_duration) / model.dt)
@@ -685,6 +689,7 @@ def check_boundedness(
     constant_inputs = w.unsqueeze(1).expand(-1, chunk_steps, -1)
     divergence_time = torch.zeros(len(x))
     with torch.no_grad():
+        # in chunks, so that the loop ends early when all runs are steady or have diverged
         for k in range(chunk_steps, n_steps + 1, chunk_steps):
             states, _, memory = rollout(x, constant_inputs, memory)
             x = states[:, -1]

@@ -18,19 +18,21 @@ from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.names import POSE_ERROR_UNITS
 
 JsonObject = Mapping[str, Any]
-"""What a JSON object holds."""
+"""Contents of a JSON object."""
 
 UNSEEN_SPLITS = ("test", "external")
-"""Splits that no fit has seen."""
+"""Splits that are not used in a fit."""
 
 
 def order_protocols(rows: Sequence[JsonObject], split: str, selection_protocol: str) -> list[str]:
-    """Return the protocols of some rows, that by which a split is judged first.
+    """Return the protocols of rows, first the main one of a split.
 
-    It is the one that chose between the models, unless the split is too short for it.
+    The main protocol is that of the model selection, unless the logs of the split are too short.
 
     Args:
-        selection_protocol: protocol that chose; empty where nothing was chosen.
+        rows: rows of metrics.json.
+        split: the split.
+        selection_protocol: protocol of the model selection; empty without a selection.
     """
     protocol_names = dict.fromkeys(row["protocol"] for row in rows)
     protocols_of_split = {row["protocol"] for row in rows if row["split"] == split}
@@ -83,9 +85,9 @@ The last level means that there are too few data. Styles of the page define thei
 """
 GOOD_LEVEL, LIMITED_LEVEL, DO_NOT_USE, TOO_FEW_WINDOWS = LEVEL_TEXTS
 _MIN_WINDOWS = 5
-"""Windows below which nothing is said of how good a model is."""
+"""Smallest number of windows for a rating of a model."""
 MIN_LOGS_FOR_INTERVAL = 3
-"""Logs below which there is no interval, and so nothing is said either."""
+"""Smallest number of logs for an interval, and therefore for a rating."""
 _MAX_DISTANCE_SHARE = 0.10
 _MAX_ANGLE_ERROR = math.radians(10.0)
 """Largest errors of a good model: share of the distance travelled, and heading error in rad.
@@ -112,7 +114,7 @@ def write_verdict(evidence: VerdictEvidence) -> list[str]:
     )
     sentences = [
         lead_sentence,
-        f"That is no more than limited, for {evidence.one_sided_text}."
+        f"The rating is at most limited, because {evidence.one_sided_text}."
         * bool(evidence.one_sided_text),
         evidence.data_quality_text,
         *horizon_sentences,
@@ -124,7 +126,7 @@ def write_verdict(evidence: VerdictEvidence) -> list[str]:
 
 
 def rate_model(evidence: VerdictEvidence) -> str:
-    """Return a key of `LEVEL_TEXTS`; empty where the selected model has no free runs."""
+    """Return a key of `LEVEL_TEXTS`; empty if the selected model has no free runs."""
     if is_useless(evidence):
         return DO_NOT_USE
     if evidence.selected not in evidence.rows_by_model:
@@ -142,8 +144,8 @@ def rate_model(evidence: VerdictEvidence) -> str:
 def known_horizons(evidence: VerdictEvidence) -> list[JsonObject]:
     """Return the horizons with known errors of the selected model, in ascending order.
 
-    Each horizon is evaluated by the protocol, under its key `protocol`, with most windows of that
-    length.
+    A horizon may occur in several protocols; the one with the most windows is used and named under
+    the key `protocol`.
     """
     entry_by_time: dict[float, dict[str, Any]] = {}
     for protocol in sorted(evidence.limits_by_protocol, key=lambda name: name != evidence.protocol):
@@ -160,19 +162,19 @@ def known_horizons(evidence: VerdictEvidence) -> list[JsonObject]:
 
 
 def _has_enough_data(evidence: VerdictEvidence, horizon_entry: JsonObject) -> bool:
-    """Return whether a horizon has windows, and logs for an interval, by which to judge a model."""
+    """Return whether a horizon has enough windows, and logs for an interval, for a rating."""
     has_intervals = all(horizon_entry["models"][evidence.selected]["intervals"].values())
     return has_intervals and horizon_entry["windows"] >= _MIN_WINDOWS
 
 
 def _protocol_limits(evidence: VerdictEvidence) -> JsonObject:
-    """Return what limits.json says under the protocol of the rows."""
+    """Return the entry of limits.json for the protocol of the rows; may be empty."""
     limits: JsonObject = evidence.limits_by_protocol.get(evidence.protocol) or {}
     return limits
 
 
 def longest_good_horizon(evidence: VerdictEvidence) -> float:
-    """Return the time in s up to which the selected model is good; 0 where it never is."""
+    """Return the horizon in s up to which the selected model is good; 0 for none."""
     row = evidence.rows_by_model[evidence.selected]
     longest_horizon = 0.0
     if row.get("diverged") and evidence.split in UNSEEN_SPLITS:
@@ -186,7 +188,7 @@ def longest_good_horizon(evidence: VerdictEvidence) -> float:
         models = horizon_entry["models"]
         selected_errors = models[evidence.selected]
         error_intervals = models[evidence.selected]["intervals"]
-        # what the plant itself leaves, started from measured states, is noise too
+        # the errors of the plant itself, started from noisy measured states, are also a noise floor
         noise_floors = [
             horizon_entry["floor"],
             *(models[name] for name in plant_models & set(models)),
@@ -268,9 +270,9 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
             )
         )
         criterion_sentences = [
-            f"Good would be within {good_limits_text} up to the upper end of the interval, or"
-            f" twice the noise"
-            " floor, without a diverged window and near the best model of the run."
+            f"A good model has errors within {good_limits_text} up to the upper end of the"
+            " interval, or within twice the noise floor, no diverged window, and errors near those"
+            " of the best model of the run."
         ]
     reference_labels = {CONSTANT_VELOCITY: "constant velocity", evidence.baseline: "baseline"}
     reference_texts = [
@@ -278,7 +280,7 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
         for name, label in reference_labels.items()
         if name in main_entry["models"] and name != evidence.selected
     ]
-    # a pose that was integrated from the velocities has no floor but rounding
+    # a pose that was itself integrated from the velocities has only rounding errors
     has_noise_floor = any(main_entry["floor"][error_name] > 1e-9 for error_name in error_names)
     noise_floor_text = (
         f"noise floor (measured velocities, integrated) {_format_pose_errors(main_entry['floor'])}"
@@ -313,7 +315,7 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
 
 
 def format_pose_error(error_name: str, error: float) -> str:
-    """Return an error of the pose (`END_UNITS`) with its unit."""
+    """Return a pose error (key of `POSE_ERROR_UNITS`) with its unit."""
     unit, unit_factor = display_unit(POSE_ERROR_UNITS[error_name])
     return (
         f"{format_number(unit_factor * error, 2)} {unit}{_POSE_ERROR_SUFFIXES.get(error_name, '')}"
@@ -373,10 +375,7 @@ def list_model_objections(evidence: VerdictEvidence) -> list[str]:
 
 
 def is_useless(evidence: VerdictEvidence) -> bool:
-    """Return whether the selected model is `constant_velocity_row`, or is not shown to be better.
-
-    Then no range is to be trusted.
-    """
+    """Return whether the selected model is not shown to be better than constant velocity."""
     selected_row = evidence.rows_by_model.get(evidence.selected)
     constant_velocity_row = evidence.rows_by_model.get(CONSTANT_VELOCITY)
     if evidence.selected == CONSTANT_VELOCITY:
@@ -396,9 +395,8 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
     split = evidence.split
     if model_name == CONSTANT_VELOCITY:
         return (
-            "NOTHING BEATS CONSTANT VELOCITY, which holds the initial velocities of each free"
-            " run: no"
-            " model of this run is of use for prediction."
+            "NOTHING BEATS CONSTANT VELOCITY, which keeps the initial velocities of each free"
+            " run: no model of this run is useful for prediction."
         )
     selected_row = evidence.rows_by_model.get(model_name)
     constant_velocity_row = evidence.rows_by_model.get(CONSTANT_VELOCITY)
@@ -464,7 +462,7 @@ def describe_soundness(evidence: VerdictEvidence) -> str:
         )
     if faults:
         return f"It is UNSOUND: {'; '.join(faults)}."
-    return "No window diverged, and no check of its physics speaks against it."
+    return "No window diverged, and it passed all physical checks."
 
 
 def describe_extrapolation(evidence: VerdictEvidence) -> str:
@@ -482,7 +480,7 @@ def describe_extrapolation(evidence: VerdictEvidence) -> str:
     return (
         f"Of the {evidence.split} data, {_format_percent(outside_share)} lies outside the range"
         f" of the training"
-        f" data ({channel_texts}); nothing is known of the model there but these runs."
+        f" data ({channel_texts}); these runs are the only evidence on the model there."
     )
 
 
@@ -511,13 +509,13 @@ def _diverged_suffix(row: JsonObject) -> str:
 
 
 def _difference_to(evidence: VerdictEvidence, reference_name: str) -> JsonObject:
-    """Return the difference to another model, empty where nobody looked."""
+    """Return the paired difference to another model; empty if it was not computed."""
     differences = (_protocol_limits(evidence).get("compared") or {}).get(evidence.selected) or {}
     return differences.get(reference_name) or {}
 
 
 def _is_indistinguishable(evidence: VerdictEvidence, reference_name: str) -> bool:
-    """Return whether there is an interval of the difference to another model that holds zero."""
+    """Return whether the interval of the difference to another model includes zero."""
     paired_difference = _difference_to(evidence, reference_name)
     return (
         bool(paired_difference)
@@ -537,7 +535,7 @@ def _format_paired_interval(evidence: VerdictEvidence, reference_name: str) -> s
     suffix = (
         ""
         if paired_difference["excludes_zero"]
-        else ", which holds zero: the data cannot tell them apart"
+        else ", which includes zero: the difference is not significant"
     )
     return f" (paired 95 % interval of the difference {lower:+.3g} to {upper:+.3g}{suffix})"
 

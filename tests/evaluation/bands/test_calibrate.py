@@ -94,7 +94,7 @@ def test_unscored_samples_and_runs_of_other_lengths_are_left_out() -> None:
     assert found.horizon == LENGTH * STEP
     assert found.cautions == ()
     told = calibrate_band(given[:13], 0.9, STEP, np.ones(5)).cautions
-    assert "4 logs calibrate this band; below 9" in told[0]
+    assert "4 logs calibrate this band; with fewer than 9" in told[0]
 
 
 def test_a_roll_has_bands_of_its_own(band: Band) -> None:
