@@ -90,7 +90,7 @@ def test_gain_and_time_are_enough(tmp_path: Path) -> None:
     for given, out, rudder, said in (
         ("0.31,7.4", "kt", None, "exists; give --overwrite"),
         ("0,7.4", "other", None, "both positive"),
-        ("0.31", "other", None, "such as 0.12,18"),
+        ("0.31", "other", None, "for example 0.12,18"),
         ("0.31,7.4", "other", "15 kg", "rudder"),
     ):
         with pytest.raises(UsageError, match=said):

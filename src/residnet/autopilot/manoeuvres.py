@@ -1,4 +1,4 @@
-"""Courses: way-points under an autopilot, and the four corners of document 002."""
+"""Course manoeuvres: way-points with an autopilot, and the four-corner course of document 002."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ _POSE = PLANAR_LAYOUT.pose
 
 
 class Waypoints(Manoeuvre):
-    """Straight legs between way-points, under line-of-sight guidance.
+    """Straight legs between way-points with line-of-sight guidance.
 
-    The steer is in proportion to heading error and yaw rate.
+    The steer is proportional to heading error and yaw rate (PD control).
 
     Attributes:
-        drive: held throughout.
-        points: way-points (north, east), the first leg begins where the vessel does.
+        drive: constant drive.
+        points: way-points (north, east); the first leg begins at the initial position.
         acceptance: radius of the circle in which a way-point counts as reached.
-        lookahead: how far before it on its leg the vessel steers for.
+        lookahead: distance along the leg to the point towards which the vessel steers.
         gain: share of full steer per rad of heading error.
         rate_gain: share of full steer per rad/s of yaw rate.
     """
@@ -61,7 +61,7 @@ class Waypoints(Manoeuvre):
 
     @classmethod
     def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Return the closed loop on position and heading; each row has a course of its own."""
+        """Return the closed loop on position and heading, with a separate course for each row."""
         for name in (*_POSE, "r"):
             helm.state_column(name)
         sources = [m._build_loop(helm) for m in manoeuvres if isinstance(m, Waypoints)]
@@ -84,7 +84,7 @@ class Waypoints(Manoeuvre):
         return f"the last of {len(self.points)} way-points"
 
     def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return cross-track errors from the leg that was sailed, and the time of the course."""
+        """Return cross-track errors relative to the active legs, and the duration of the course."""
         x = torch.from_numpy(np.nan_to_num(log.stack(_POSE)))
         guidance = self.build_guidance(_POSE)
         s = guidance.initial_state(x[:1])
@@ -103,7 +103,8 @@ class Waypoints(Manoeuvre):
 
 _RIGHT_ANGLE = math.pi / 2
 _HALF_RIGHT_ANGLE = math.pi / 4
-# Table 4.1 prints the twelve twice (correction J12); headings are followed as written (J13)
+# Table 4.1 prints the twelve poses twice (correction J12); headings are not wrapped, so that the
+# vessel turns in the direction written in the table (J13)
 SEGMENTS: tuple[Waypoint, ...] = (
     (0.0, -15.0, -_RIGHT_ANGLE),
     (15.0, -15.0, 0.0),
@@ -121,16 +122,16 @@ SEGMENTS: tuple[Waypoint, ...] = (
 
 
 class FourCorner(Manoeuvre):
-    """Poses given one after the other through a reference filter, followed by a PID.
+    """A sequence of poses, smoothed by a reference filter and followed by a PID controller.
 
-    Twelve segments of surge, sway and yaw, alone and together. The vessel must be commanded in all
-    three forces. Source: document 002 section 4.1, Table 4.1.
+    The twelve segments of the document excite surge, sway and yaw, alone and combined. The vessel
+    must have commands for all three forces. Source: document 002 section 4.1, Table 4.1.
 
     Attributes:
-        poses: (north, east, heading); the twelve of the document where absent.
-        interval: between poses; the course lasts so long for each.
-        frequency: of the reference filter in x, y and psi, in rad/s.
-        damping: relative damping of the reference filter in x, y and psi.
+        poses: poses (north, east, heading); by default the twelve of the document.
+        interval: time for each pose.
+        frequency: natural frequencies of the reference filter in x, y and psi, in rad/s.
+        damping: damping ratios of the reference filter in x, y and psi.
         control: gains of the PID.
     """
 
@@ -152,19 +153,19 @@ class FourCorner(Manoeuvre):
         )
 
     def duration_within(self, duration: float) -> float:
-        """Return one interval for each pose, or `self.duration` where that is less."""
+        """Return one interval per pose, or `self.duration` if it is shorter."""
         return min(self.filter_config.duration, self.duration or math.inf)
 
     @classmethod
     def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Return the closed loop on the pose; each row has a course and gains of its own.
+        """Return the closed loop on the pose, with a separate course and gains for each row.
 
         Raises:
-            UsageError: where the vessel has no command for each of the three forces.
+            UsageError: if the vessel lacks a command for one of the three forces.
         """
         if helm.forces is None or helm.state[MOTION] != PLANAR_LAYOUT.state_names:
             raise UsageError(
-                "a four-corner course needs a vessel in surge, sway and yaw that is commanded in"
+                "a four-corner course needs a vessel in surge, sway and yaw with commands for"
                 " all three, by forces or azimuth thrusters"
             )
         step = float(t[1] - t[0])

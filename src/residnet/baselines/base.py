@@ -247,7 +247,7 @@ _MIN_TARGET_STD = 1e-9
 def fit_parameters(baseline: Baseline, samples: Samples) -> Solution:
     """Fit all parameters of a baseline by nonlinear least squares, from their current values.
 
-    The residuals are those of the accelerations, divided by the standard deviation of each axis.
+    The residuals are errors of the accelerations, divided by the standard deviation of each axis.
     Standard errors are cluster-robust over manoeuvres.
 
     Args:

@@ -4,7 +4,7 @@ The model has separate forces of hull, propeller and rudder with their interacti
 
 Source: Yasukawa and Yoshimura, Introduction of MMG standard method for ship maneuvering
 predictions, J Mar Sci Technol 20 (2015) 37-52. The prior means of the linear hull derivatives are
-those of Kijima et al., On the manoeuvring performance of a ship with the parameter of loading
+from Kijima et al., On the manoeuvring performance of a ship with the parameter of loading
 condition, J SNAJ 168 (1990).
 """
 
@@ -441,7 +441,7 @@ def _subsample(samples: Samples) -> Samples:
 class MMGConfig(IdentifiedConfig):
     """MMG standard model of a ship with one propeller and one rudder.
 
-    The model is that of Yasukawa and Yoshimura (2015). Every parameter has a prior with a mean and
+    The model follows Yasukawa and Yoshimura (2015). Every parameter has a prior with a mean and
     a standard deviation, which default to usual values. The fit is the maximum a posteriori
     estimate from the measured accelerations. A `refit` of this baseline on free runs continues from
     it and yields the standard errors of the prediction intervals.

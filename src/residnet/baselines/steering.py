@@ -153,7 +153,7 @@ class _NomotoBaselineConfig(SteeringBaselineConfig, ABC):
 def _lag_ratios(state: str, drive: str, suffix: str) -> dict[str, Ratio]:
     """Return T, K and b of T x_dot + x = K drive + b as ratios of a, k, c.
 
-    The coefficients are those of x_dot = a x + k drive + c.
+    The coefficients belong to x_dot = a x + k drive + c.
     """
     numerators = {"T": None, "K": drive, "b": "1"}
     return {f"{name}{suffix}": Ratio(-1.0, term, state) for name, term in numerators.items()}

@@ -243,7 +243,7 @@ def infer_input_shares(spec: ModelSpec) -> Mapping[str, InputShare]:
 
 @dataclass(frozen=True)
 class PredictionGoal:
-    """Manoeuvres whose prediction intervals are to be reduced, such as those of a booklet.
+    """Manoeuvres whose prediction intervals are to be reduced, for example in a booklet.
 
     Attributes:
         manoeuvres: the manoeuvres.

@@ -194,7 +194,7 @@ def make_hull_terms(data_summary: TrainingDataSummary) -> list[str] | dict[str, 
     linear and quadratic in it and decreases with the inflow. Forces enter directly.
 
     For short logs each axis has only the terms of a mirror-symmetric vessel and the asymmetry of a
-    single propeller: half as many coefficients as all terms in all axes.
+    single propeller: half of the coefficients of all terms in all axes.
     """
     terms = _all_terms(data_summary)
     if has_long_logs(data_summary):
@@ -637,7 +637,7 @@ def make_evaluation_settings(
     """Return protocols, selection and scales of a config, for logs by split.
 
     Test logs do not influence the selection protocol: if they are shorter than its free runs, a
-    shorter protocol is added for them. The scales are those of the training logs.
+    shorter protocol is added for them. The scales follow from the training logs.
 
     Args:
         splits: `train`, `validation` and `test`.

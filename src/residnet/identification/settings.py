@@ -248,7 +248,7 @@ def check_known_names(
         config_key: setting that contains the names, for the message.
         names_to_check: names in the config.
         valid_names: names that may be used.
-        noun: what the names denote, for the message.
+        noun: kind of the named objects, for the message.
 
     Raises:
         ValueError: if a name is unknown; the message suggests the most similar valid name.

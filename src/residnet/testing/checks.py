@@ -280,8 +280,9 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
     _check_round_trip(config, HeadConfig, subject)
     fitted_model = make_example_model(spec)
     samples = make_example_samples(signals=signals).z
-    # the checks change the precision of the copy
+    # a copy, since the checks change the precision; the original is stored and compared below
     model = copy.deepcopy(fitted_model)
+    # rows from different manoeuvres, and not from rest at their starts
     start_rows = torch.arange(_N_ROWS) * (len(samples) // _N_ROWS) + 30
     z = samples[start_rows[:, None] + torch.arange(_N_STEPS)[None]]
     case = _HeadCase(subject, model.head.eval(), z, signals.dof.n_dynamic)
@@ -289,7 +290,7 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
         _check_single_steps(case)
         max_inside = _check_sequences(case)
         _check_traced_steps(case)
-        # tracing was in single precision
+        # tracing was in single precision; the comparison with the model needs double precision
         case.head.double()
         _check_extrapolation(case, samples, max_inside)
         _check_free_run(case, model)
@@ -396,7 +397,7 @@ def _check_traced_steps(case: _HeadCase) -> None:
 
 
 def _check_extrapolation(case: _HeadCase, samples: Tensor, max_inside: float) -> None:
-    """Check that residuals and memory stay bounded far outside the training range.
+    """Check that residuals and memory are bounded far outside the training range.
 
     Args:
         case: the head.
@@ -432,7 +433,7 @@ def _check_free_run(case: _HeadCase, model: HybridDynamics) -> None:
     w = z[..., case.n_dynamic : case.n_dynamic + model.signals.n_inputs]
     s = torch.rand(_N_ROWS, model.n_state).to(z)
     rollout = Rollout(model.double())
-    # the head reads no position; without one the rollout is shorter
+    # the head does not depend on the position, whose integration would only take time
     model.has_position = False
     states, _, memory = rollout(x, w, s)
     for k in range(_N_STEPS):
@@ -502,8 +503,8 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
 
     Args:
         config: config of the baseline.
-        samples: samples whose target is the measured acceleration [N, n]; those of
-            `make_example_samples` if None.
+        samples: samples whose target is the measured acceleration [N, n]; None for the example
+            samples.
 
     Raises:
         AssertionError: one line with the violated contract.
@@ -512,6 +513,7 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
     training_samples = make_example_samples() if samples is None else samples
     resolved = config.without_file_references()
     n_dynamic = get_dof(training_samples.names).n_dynamic
+    # two fits: a random start or an order of a set would give different coefficients
     baseline, refitted = (resolved.build(training_samples.names) for _ in range(2))
     table = resolved.fit_preferred(baseline, training_samples)
     assert_true(
@@ -530,6 +532,8 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
         assert_close(refitted(z), accelerations, 0.0, f"{subject}: two fits give different results")
         batched = baseline(z[None].expand(2, -1, -1))
         assert_close(batched[1], accelerations, 1e-12, f"{subject}: fails for channels [B, T, nz]")
+        # the tolerance allows for different summation orders of matrix products with other batch
+        # sizes
         message = f"{subject}: the answer for a row depends on the other rows of the batch"
         assert_close(baseline(z[3:4]), accelerations[3:4], 1e-9, message)
         single_precision = copy.deepcopy(baseline).float()(z.float())
@@ -541,7 +545,7 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
             single_precision.double(), accelerations, 1e-3, f"{subject}: float32 differs too much"
         )
     differentiable = z.clone().requires_grad_()
-    # a baseline may be constant, so add a term that depends on the channels
+    # autograd needs a dependence on the channels, which a constant baseline does not have
     (baseline(differentiable).sum() + 0.0 * differentiable.sum()).backward()
     gradient = torch.zeros_like(z) if differentiable.grad is None else differentiable.grad
     assert_finite(gradient, f"{subject}: its gradient with respect to the channels is not finite")
@@ -646,6 +650,7 @@ def check_manoeuvre(
     flight = simulate_manoeuvres(craft, [manoeuvre], environment, duration, _TIME_STEP)[0]
     _check_indices(manoeuvre.compute_indices(flight.true_log, length), subject)
     motion = flight.true_log
+    # a recording may end before a manoeuvre: indices must then be omitted instead of NaN
     short_channels = {name: values[:_SHORT_SAMPLES] for name, values in motion.channels.items()}
     short_log = Log(motion.name, motion.t[:_SHORT_SAMPLES], short_channels, motion.units)
     _check_indices(manoeuvre.compute_indices(short_log, None), subject)
@@ -671,6 +676,7 @@ def _simulate(
         ]
     )
     w = torch.zeros(len(manoeuvres), len(t), len(plant.input_names), dtype=torch.float64)
+    # a nonzero value shows whether the manoeuvre overwrites exogenous inputs
     w[:, :, plant.n_commands :] = 0.01
     source = make_manoeuvre_source(manoeuvres, helm, t)
     with torch.no_grad():
@@ -743,6 +749,7 @@ def check_reader(config: Config, file: Path) -> Log:
 def _check_error_messages(reader: LogReader, folder: Path, file: Path, subject: str) -> None:
     empty_file, damaged_file = (folder / f"{name}{file.suffix}" for name in ("empty", "damaged"))
     empty_file.write_bytes(b"")
+    # a fixed seed, so that a failure can be repeated
     damaged_file.write_bytes(np.random.default_rng(0).bytes(4096))
     (folder / "nothing").mkdir()
     cases: list[tuple[Path, str, type[ResidnetError]]] = [
@@ -787,6 +794,7 @@ def check_exporter(exporter: Exporter) -> None:
         exporter.suffix.count(".") >= 1, f"{subject}: the suffix {exporter.suffix!r} has no ending"
     )
     for spec, model in make_example_models():
+        # clones: `state_dict` returns references, which would change with the model
         state_before = {name: value.clone() for name, value in model.state_dict().items()}
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "exports" / f"{spec.name}{exporter.suffix}"
@@ -830,8 +838,8 @@ def check_bad_inputs(
 
     Each case is a short free run. At one step, elements of the state, the inputs or the memory are
     NaN, infinite or far outside the training range. All results must be finite. The flag must be
-    set for values outside the range and for no others. Unflagged results must equal those of the
-    model, and results after the bad step must not depend on it.
+    set for values outside the range and for no others. Unflagged results must equal the results
+    of the model, and results after the bad step must not depend on it.
 
     Args:
         exported: an object with the methods `initial_state`, `warmup`, `step` and `rollout` of
@@ -852,6 +860,7 @@ def check_bad_inputs(
         n_dynamic = guard.dof
         lower = guard.ranges.lower[n_pose:]
         upper = guard.ranges.upper[n_pose:]
+        # not at the edges of the range, where rounding to float32 could decide about the flag
         range_share = 0.05 + 0.9 * torch.rand(
             cases, _PAST_STEPS + _FREE_STEPS, lower.numel(), generator=generator
         )
@@ -882,6 +891,7 @@ def replace_entries(
     bad_values = torch.tensor(_BAD_VALUES)[
         torch.randint(len(_BAD_VALUES), values.shape, generator=generator)
     ]
+    # from 1 % to 10,000 times beyond the limit: values just outside are the difficult ones
     edge_factor = 10.0 ** (6.0 * torch.rand(values.shape, generator=generator) - 2.0)
     beyond_edge = (upper_edge + upper_edge.abs().clamp(min=1e-3) * edge_factor).expand_as(values)
     random_kind = torch.rand(values.shape, generator=generator)
@@ -905,6 +915,7 @@ def _check_steps(
         inputs = w[:, k]
         memory = s
         if k == _BAD_STEP_INDEX:
+            # state, inputs and memory are damaged independently, so that all combinations occur
             is_damaged = torch.rand(3, len(x), 1, generator=generator) < 0.5
             state = torch.where(
                 is_damaged[0], replace_entries(x, guard.ranges.upper[:columns], 0.4, generator), x
@@ -940,7 +951,7 @@ def _check_answer(
     answer: tuple[Tensor, Tensor, Tensor],
     subject: str,
 ) -> None:
-    """Check the result of a step: finite, correctly flagged, and equal to that of the model."""
+    """Check that the result of a step is finite, correctly flagged and equal to the model's."""
     x, w, s = step_inputs
     next_state, memory, outside = answer
     assert_true(outside.dtype == torch.bool, f"{subject}: the flag is {outside.dtype}, not bool")
@@ -1049,6 +1060,7 @@ def _check_histories(
         0.0,
         f"{subject}: a history of NaN changes the memory",
     )
+    # a missing sample must act as a repetition of the previous one
     repeated = past_states.clone()
     repeated[:, 2] = repeated[:, 1]
     w = past_inputs.clone()

@@ -1,7 +1,7 @@
 """The predictive heading autopilot of document 004 (Gouletas 2020): law, predictors, configs.
 
-Source: sections 6.1.1 to 6.1.3 and 6.2, eqs. (6.3), (6.4), corrections of document 004. There is no
-Lightning here, to keep `residnet check` fast.
+Source: sections 6.1.1 to 6.1.3 and 6.2, eqs. (6.3), (6.4), corrections of document 004. This
+module does not import Lightning, so that `residnet check` is fast.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _Units = Annotated[int, Field(ge=1)]
 class Predictor(nn.Module, ABC):
     """A prediction of heading error and yaw rate after a horizon, for each of C rudder angles.
 
-    It is a network, or a model that is simulated.
+    It is a network or a simulated model.
     """
 
     @abstractmethod
@@ -40,20 +40,20 @@ class Predictor(nn.Module, ABC):
 
         Args:
             x: states [B, nx].
-            heading: reference [B] of now, which the error is measured from (the source's own
-                listing does so, correction G22).
+            heading: current reference [B], from which the predicted error is computed as in the
+                listing of the source (correction G22).
             rudder: candidates [C] in rad.
         """
 
 
 @final
 class SimulatedPredictor(Predictor):
-    """Simulates a model of the vessel, the rudder command held over the horizon.
+    """Prediction by simulation of a model of the vessel with a constant rudder command.
 
     Args:
-        model: with the columns of the controlled vessel's state; its commands begin with the rudder
-            angle.
-        steps: of the model, which make the horizon.
+        model: model with the state of the controlled vessel; its first input is the rudder.
+        state: names of the state.
+        steps: number of steps of the model in the horizon.
         other_inputs: the other inputs [m - 1], constant over the horizon.
     """
 
@@ -95,13 +95,16 @@ class NetworkPredictor(Predictor):
 
     It has outputs for each rudder angle (sections 6.1.2 and 6.2.2).
 
-    What moves the vessel goes in: velocities, heel, and the rudder's angle where it takes time to
-    move. Where the vessel is and heads changes nothing in calm water, so that the heading error
-    itself passes through. With linear layers, as in the source's listing, the map is affine: exact
-    for Nomoto's model, and no more than a tangent to the 4-DOF vessel (correction G21).
+    Inputs are velocities, heel and, with a rate limit, the rudder angle. In calm water position and
+    heading do not affect the motion, so that the network predicts the change of the heading only.
+    With linear layers, as in the listing of the source, the map is affine: exact for Nomoto's
+    model, but only a tangent for the 4-DOF vessel (correction G21).
 
     Args:
-        linear: without activations.
+        state: names of the state of the vessel.
+        candidates: number of rudder angles.
+        hidden: widths of the hidden layers.
+        linear: whether activations are omitted.
     """
 
     def __init__(
@@ -129,11 +132,11 @@ class NetworkPredictor(Predictor):
         self.scale: Tensor
 
     def calibrate(self, x: Tensor, change: Tensor) -> None:
-        """Take the scales from states [S, nx] and their changes [S, 2, C]."""
+        """Set the scales from states [S, nx] and their changes [S, 2, C]."""
         inputs = x[:, self.input_columns]
         self.centre.copy_(inputs.mean(0))
         standard_deviation = inputs.std(0)
-        # what does not vary says nothing; Nomoto's speed is one
+        # constant inputs, such as the speed in Nomoto's model, get a scale of one
         self.spread.copy_(
             torch.where(
                 standard_deviation > 1e-9 * (1.0 + self.centre.abs()), standard_deviation, 1.0
@@ -154,7 +157,7 @@ class NetworkPredictor(Predictor):
     def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
         """Return the heading errors and yaw rates [B, C].
 
-        The angles are those that it was trained for.
+        The rudder angles must be those of the training, since they only select outputs.
         """
         change = self.predict_changes(x)
         return (heading - x[:, self.psi]).unsqueeze(-1) - change[:, 0], x[:, self.r].unsqueeze(
@@ -166,17 +169,18 @@ class NetworkPredictor(Predictor):
 class DocumentAutopilot(Policy):
     """The law delta = weight d_e + (1 - weight) d_r among candidate rudder angles.
 
-    d_e leads to the smallest heading error and d_r to the smallest yaw rate.
+    d_e gives the smallest predicted heading error and d_r the smallest predicted yaw rate.
 
-    The source takes 41 candidates between -5 and 5 deg, weight 0.2 and a horizon of one step of
-    0.01 s. There the first choice saturates and the second stops the yaw, so that it turns at 0.011
-    deg/s (corrections of document 004); a horizon of seconds repairs it.
+    The source uses 41 candidates between -5 and 5 deg, a weight of 0.2 and a horizon of one step of
+    0.01 s. With this horizon d_e is saturated and d_r stops the yaw, so that the vessel turns at
+    only 0.011 deg/s (corrections of document 004). A horizon of seconds avoids this.
 
     Args:
-        limit: of the candidates in rad, either side.
-        candidates: how many, evenly spaced, both limits included; an odd number has the rudder
-            amidships among them.
-        weight: of the choice for the heading error.
+        predictor: prediction for the candidates.
+        limit: largest rudder angle of the candidates in rad, to both sides.
+        candidates: number of evenly spaced candidates, including both limits; an odd number
+            includes the rudder amidships.
+        weight: weight of d_e.
     """
 
     def __init__(
@@ -190,7 +194,7 @@ class DocumentAutopilot(Policy):
             )
         self.predictor = predictor
         self.weight = weight
-        # from whole numbers, so that amidships is zero and both sides are alike
+        # from integers, so that amidships is exactly zero and both sides are symmetric
         angles = limit * (
             torch.arange(1 - candidates, candidates, 2, dtype=torch.float64) / (candidates - 1)
         )
@@ -214,10 +218,10 @@ class DocumentAutopilot(Policy):
 
 @final
 class NominalSteering(Dynamics):
-    """The vessel without variation, and without memory, as predictors expect it.
+    """The nominal vessel as dynamics without memory, as required by predictors.
 
     Attributes:
-        other_inputs: the other inputs at service speed [m - 1].
+        other_inputs: inputs other than the rudder at service speed [m - 1].
     """
 
     def __init__(self, vessel: SteeredVessel, dt: float) -> None:
@@ -244,7 +248,7 @@ class _PredictiveLawConfig(Config):
     def build_exact_predictor(self, task: ControlTask) -> SimulatedPredictor:
         """Return the exact predictor: a simulation of the nominal vessel.
 
-        Long horizons are predicted in steps of at most a twentieth of T.
+        Long horizons are divided into steps of about a twentieth of T, which are accurate enough.
         """
         steps = math.ceil(self.horizon / max(task.nomoto.time / 20.0, task.dt))
         model = NominalSteering(task.vessel, self.horizon / steps)
@@ -261,9 +265,10 @@ class DocumentConfig(_PredictiveLawConfig, ControllerConfig):
     """The predictive law of document 004 with an exact predictor of the nominal vessel.
 
     Attributes:
-        horizon: of the prediction; the source's 0.01 s cannot settle (corrections of document 004).
-        candidates: rudder angles.
-        weight: of the choice for the heading error.
+        horizon: horizon of the prediction in s; the heading does not settle with the 0.01 s of the
+            source (corrections of document 004).
+        candidates: number of rudder angles.
+        weight: weight of the angle with the smallest heading error.
     """
 
     kind: Literal["document"] = "document"
@@ -280,7 +285,7 @@ class PredictorSpec(Stored):
         state: names of the state of the vessel that it was trained on.
         candidates: number of rudder angles.
         hidden: widths of the layers.
-        linear: without activations.
+        linear: whether activations are omitted.
     """
 
     schema_name: Literal["residnet.heading_predictor/1"] = Field(
@@ -299,18 +304,17 @@ class PredictorSpec(Stored):
 
 
 class PredictorTraining(OneStage):
-    """Settings of a supervised training, from random states to what each rudder angle brings.
+    """Settings of the supervised training on random states and their simulated changes.
 
     Document 004, 6.1.1 and 6.2.1.
 
     Attributes:
         states: number of states for training; a fifth of this number is used for validation.
-        wander: longest time under random rudder angles before a state is taken, from straight ahead
-            at service speed.
-        hold: mean time between these angles.
-        scatter: noise that is added to these states, as a share of each channel's standard
-            deviation.
-        batch: states.
+        wander: longest time with random rudder angles before a state is sampled, from straight
+            motion at service speed.
+        hold: mean time between changes of these angles.
+        scatter: noise added to the states, relative to the standard deviation of each channel.
+        batch: number of states in a batch.
     """
 
     states: int = Field(default=4000, ge=100, le=10_000_000)
@@ -327,19 +331,18 @@ class PredictorTraining(OneStage):
 class PredictiveConfig(_PredictiveLawConfig):
     """The predictive autopilot of document 004: a trained predictor and the control law (6.4).
 
-    The predictor is a perceptron. It says which heading error and yaw rate each candidate rudder
-    angle leads to; the law mixes the angle that is best for the one and that for the other.
+    The predictor is a perceptron. It predicts heading error and yaw rate for each candidate rudder
+    angle; the law is a weighted mean of the angles that minimise the one and the other.
 
     Attributes:
-        horizon: how far ahead the perceptron predicts, in s; the heading cannot settle with the
+        horizon: horizon of the prediction, in s; the heading does not settle with the
             document's 0.01 s (corrections, "The controller of document 004").
         candidates: number of rudder angles that are compared, evenly spaced between the limits.
-        weight: weight in (6.4) of the angle that is best for the heading error, from 0 to 1; the
-            angle that is best for the yaw rate has the complement.
+        weight: weight in (6.4) of the angle with the smallest heading error, from 0 to 1.
         hidden: widths of the hidden layers; the document has 20 units for Nomoto's model and 30 for
             the 4-DOF vessel.
-        linear: leave the activations out, as the document's listing does (correction G21).
-        training: how the perceptron is trained.
+        linear: whether activations are omitted, as in the document's listing (correction G21).
+        training: settings of the training.
     """
 
     hidden: Annotated[tuple[_Units, ...], Field(min_length=1)] = (20,)

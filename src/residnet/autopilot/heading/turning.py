@@ -20,8 +20,8 @@ _N_RATES = 10
 _MAX_COARSE_SAMPLES = 4000
 """Largest number of samples of a manoeuvre in the coarse search."""
 _RUDDER_RATE_RANGE = (math.radians(1.0), math.radians(40.0))
-"""Rates of steering gears in rad/s that are searched: SOLAS II-1/29 asks ships for 2.3 deg/s, and
-beyond the fastest a rudder of 20 deg is there within half a second.
+"""Range of rudder rates in rad/s of the search: SOLAS II-1/29 requires 2.3 deg/s of ships, and at
+the largest rate a rudder angle of 20 deg is reached within half a second.
 """
 _MIN_EXPLAINED = 0.5
 """Smallest fraction of the yaw-rate variance that a response must explain."""
@@ -143,11 +143,10 @@ def fit_response(
     if candidate.gain <= 0 or candidate.explained_variance < _MIN_EXPLAINED:
         raise FitError(
             f"steering: the best response found has K {candidate.gain:.3g} 1/s and explains"
-            f" {100 * candidate.explained_variance:.0f} % of the yaw rate; check the rudder's sign"
-            " and"
-            " unit, and that the vessel answers its rudder"
+            f" {100 * candidate.explained_variance:.0f} % of the yaw rate; check the sign and unit"
+            " of the rudder, and that the vessel responds to it"
         )
-    # the rate must explain more than chance does
+    # likelihood-ratio test of the additional parameter: a rate reduces the error even by chance
     relative_gain = refined_fits[math.inf][1] / sum_of_squares - 1.0
     return refined_fits[best if relative_gain * n_independent >= _CHI2_95 else math.inf][0]
 
@@ -155,9 +154,10 @@ def fit_response(
 def _refine_response(
     records: Sequence[ManoeuvreRecord], time: float, delay: float, rate: float, max_delay: float
 ) -> tuple[SteeringResponse, float, float]:
-    """Return the response of least error near one of the grid; an infinite rate is kept.
+    """Refine a response of the grid search; an infinite rate is not changed.
 
-    The sum of its squared errors follows, and how many of them do not hang together over time.
+    Returns:
+        The response, its sum of squared errors, and the effective number of independent errors.
     """
     from scipy.optimize import least_squares
 
@@ -180,7 +180,8 @@ def _refine_response(
     initial_point += [math.log(rate)] if math.isfinite(rate) else []
     lower, upper = np.full((2, len(initial_point)), math.inf) * [[-1.0], [1.0]]
     lower[2], upper[2] = -1e-9, max_delay + 1e-9
-    # steps of derivatives are a share of a sample: delays lie between samples
+    # the delay changes by interpolation between samples, so that default steps near the rounding
+    # error would give inaccurate derivatives
     solution = least_squares(
         prediction_errors,
         initial_point,
@@ -193,7 +194,7 @@ def _refine_response(
     autocorrelation = float(residuals[1:] @ residuals[:-1]) / max(
         float(residuals @ residuals), 1e-30
     )
-    # errors that hang together over time count less often
+    # effective sample size of first-order autoregressive errors: N (1 - rho) / (1 + rho)
     n_independent = max(len(residuals) * (1.0 - autocorrelation) / (1.0 + autocorrelation), 8.0)
     sum_of_squares = float(residuals @ residuals)
     jacobian = np.asarray(solution.jac)
@@ -223,9 +224,10 @@ def _refine_response(
 
 
 def _unit_responses(record: ManoeuvreRecord, time: float, delay: float) -> tuple[Array, Array]:
-    """Return the answers [N, 2] to the rudder and to a constant one at K = 1, and yaw rates [N].
+    """Return responses [N, 2] to the rudder and to a constant angle for K = 1, and yaw rates [N].
 
-    The answer to the yaw rate that the record begins with is projected out of all three.
+    The unknown initial yaw rate of the record contributes a decaying exponential. It is projected
+    out of responses and yaw rates, so that it needs no parameter.
     """
     count = len(record.rudder)
     shifted = np.interp(np.arange(count) - delay / record.dt, np.arange(count), record.rudder)
@@ -246,7 +248,7 @@ def _unit_responses(record: ManoeuvreRecord, time: float, delay: float) -> tuple
 def _solve_linear_terms(
     records: Sequence[ManoeuvreRecord], time: float, delay: float
 ) -> tuple[float, float, float]:
-    """Return the sum of squared errors, K and K bias of the best response with T and a delay."""
+    """Return the sum of squared errors, K and K bias of the best response for given T and delay."""
     normal_matrix = np.zeros((2, 2))
     normal_rhs = np.zeros(2)
     sum_of_squares = 0.0
@@ -267,7 +269,7 @@ def _solve_linear_terms(
 class NomotoModel:
     """T r_dot + r = K (delta - c psi) at a speed: K [1/s], T [s], u [m/s] and c [-].
 
-    The heading of a vessel has no c; the dive angle of one that rights itself is held by planes.
+    c is the restoring coefficient of a dive angle; it is zero for the heading.
     """
 
     gain: float

@@ -109,10 +109,10 @@ class EvaluationConditions(Config):
 
 
 class DepthStepTestConfig(Config):
-    """A step of the depth reference in place of the heading's.
+    """A step of the depth reference instead of the heading reference.
 
     Attributes:
-        change: of the depth in m, down and up in turn.
+        change: change of the depth in m, alternately down and up.
         band: depth error in m within which the change has settled.
     """
 
@@ -124,19 +124,19 @@ class StepTestConfig(Config):
     """Test of all controllers: a step of the heading reference on a straight course.
 
     Attributes:
-        depth: a step of the depth instead, which makes depth controllers of all of them, with the
-            stern planes as their rudder; null for the heading.
-        heading: change of the reference in rad; no prefilter smooths it.
+        depth: a step of the depth instead; all controllers are then depth controllers with the
+            stern planes as their rudder. Null for the heading.
+        heading: change of the reference in rad, without a prefilter.
         band: heading error in rad; the change has settled at the last entry into this band.
         dt: step of simulation and controllers in s.
-        duration: of a flight in s.
+        duration: duration of a simulation in s.
         plants: number of random vessels, in addition to the corners of the ranges.
         bias: constant rudder angle of the steady-error test in rad.
         bias_time: duration of the steady-error test in s.
         wind: mean wind speed in m/s of the same test in wind, from eight directions and without
             bias; null for none.
         sea: waves in which the course is kept after the step; null for none.
-        sea_time: how long in s, counted from the end of the step's flight.
+        sea_time: duration in waves in s, from the end of the step test.
     """
 
     depth: DepthStepTestConfig | None = None
@@ -159,7 +159,7 @@ class StepTestConfig(Config):
 
     @property
     def step_and_tolerance(self) -> tuple[float, float]:
-        """The change and its band in rad, or in m of depth."""
+        """The change and its tolerance band, in rad of heading or m of depth."""
         if self.depth is None:
             return self.heading, self.band
         return self.depth.change, self.depth.band
@@ -170,24 +170,23 @@ class AutopilotConfig(ComputingTask):
     """Policies of heading or depth trained through the vessel, compared with tuned controllers.
 
     Attributes:
-        seed: of weights, batches and random vessels.
+        seed: seed of weights, batches and random vessels.
         vessel: name or file of the vessel.
-        rudder: largest rudder angle in rad that controllers may use.
-        turning_time: time in s until the turn at that angle is steady.
+        rudder: rudder limit of the controllers in rad.
+        turning_time: time in s until a turn at this angle is steady.
         pace: factor on all times in `test`, `conditions` and the trainings of `policies`, except
             delays; `vessel` for the turning time of the vessel divided by the turning time of the
             vessel of document 004.
-        test: the step of the heading reference that all controllers fly, over the vessels of
-            `conditions.stated`.
-        conditions: that all controllers are tuned, trained and judged under; null to compare peers
-            whose constants are given, by `test` alone.
+        test: step test of all controllers, over the vessels of `conditions.stated`.
+        conditions: conditions of the tuning, training and evaluation; null to compare peers with
+            given constants in `test` only.
         policies: learned policies by name.
-        predictive: the document's own autopilots, by name.
-        peers: by name; constants that are left out are tuned.
-        floor: peer that knows the vessel exactly: the others are measured in multiples of its
-            settling time.
-        safe: what an exported policy commands while its inputs are wrong: the last good command, or
-            rudder amidships.
+        predictive: predictive autopilots of document 004 by name.
+        peers: classical controllers by name; constants that are not given are tuned.
+        floor: peer with exact knowledge of the vessel (time-optimal); settling times are reported
+            as multiples of its settling time.
+        safe: command of an exported policy for invalid inputs: the last valid command, or rudder
+            amidships.
     """
 
     task: Literal["autopilot"]
@@ -235,7 +234,7 @@ class AutopilotConfig(ComputingTask):
         """Refuse policies without conditions, and initial controllers without an observer."""
         for name, policy in self.policies.items():
             if self.conditions is None:
-                raise ValueError(f"policies.{name}: give 'conditions' to train it under")
+                raise ValueError(f"policies.{name}: give 'conditions' for its training")
             if policy.start is None:
                 continue
             if not isinstance(angle_law_of(self.peers.get(policy.start)), ObservedConfig):
@@ -245,14 +244,14 @@ class AutopilotConfig(ComputingTask):
                 )
 
     def _validate_without_conditions(self) -> None:
-        """Refuse what needs evaluation conditions: tuned constants and a pace."""
+        """Refuse settings that require evaluation conditions: tuned constants and a pace."""
         for name, peer in self.peers.items():
             if isinstance(peer, TunableConfig) and None in peer.parameter_values().values():
                 raise ValueError(
-                    f"peers.{name}: give all constants, or 'conditions' to tune them under"
+                    f"peers.{name}: give all constants, or 'conditions' for their tuning"
                 )
         if self.pace != 1.0:
-            raise ValueError("pace: give 'conditions', whose times have a pace")
+            raise ValueError("pace: it scales the times of 'conditions', which are missing")
 
     def _validate_axis(self) -> None:
         is_depth = self.test.depth is not None
@@ -260,21 +259,22 @@ class AutopilotConfig(ComputingTask):
         for name, conditions in conditions_by_name.items():
             if (conditions.depth is not None) != is_depth:
                 raise ValueError(
-                    f"conditions.{name}.depth: give it where test.depth is given, and only there"
+                    f"conditions.{name}.depth: required with test.depth, and allowed only with it"
                 )
         for name, peer in self.peers.items():
             if isinstance(peer, DepthConfig) != is_depth:
                 expected_kind = "depth, with its law under 'pitch'" if is_depth else "any but depth"
                 raise ValueError(
                     f"peers.{name}: test.depth is {'given' if is_depth else 'not given'}, so its"
-                    " kind"
-                    f" must be {expected_kind}"
+                    f" kind must be {expected_kind}"
                 )
         for name, policy in self.policies.items():
             if is_depth and policy.start is None:
                 raise ValueError(f"policies.{name}: a depth policy begins with a peer (start)")
         if is_depth and (self.predictive or self.pace != 1.0):
-            raise ValueError("test.depth: leave out 'predictive' and 'pace', which turn headings")
+            raise ValueError(
+                "test.depth: remove 'predictive' and 'pace', which apply to the heading only"
+            )
 
     @model_validator(mode="after")
     def _validate_vessel(self) -> Self:
@@ -320,7 +320,7 @@ class AutopilotConfig(ComputingTask):
         return SteeredPlant(load_vessel(self.vessel).build(), axis=self.axis)
 
     def policy_spec_class(self, name: str) -> type[RecurrentSpec]:
-        """Return the kind of description that a policy is stored with."""
+        """Return the class of the stored description of a policy."""
         if self.test.depth is not None:
             return DepthPolicySpec
         return NetworkPolicySpec if self.policies[name].start is None else ObservedPolicySpec
@@ -333,11 +333,11 @@ class AutopilotConfig(ComputingTask):
         """Check that the vessel and learned models turn steadily and can perform the tests.
 
         Raises:
-            UsageError: where a run or a model is missing.
+            UsageError: if a run or a model is missing.
             FitError: if a learned model does not turn steadily towards the rudder.
-            ConfigError: where the vessel does not, has no time for its changes of heading or no
-                rudder left to hold its course, or where the inputs of a learned model are not its
-                own.
+            ConfigError: if the vessel does not turn steadily, a change of heading takes longer than
+                its simulation, disturbances need all of the rudder, or the inputs of a learned
+                model differ from those of the vessel.
         """
         learned_models = [
             (self.training_vessel(name), policy.training.dt)
@@ -350,7 +350,7 @@ class AutopilotConfig(ComputingTask):
         except FitError as error:
             raise ConfigError(f"vessel '{self.vessel}' cannot be steered: {error}") from error
         config = self.with_scaled_times()
-        # a change of depth takes the time of a dive angle, and its way
+        # the minimum time below is that of a turn; a change of depth also needs a path
         heading_changes = (
             {} if config.test.depth else {"test": (config.test.heading, config.test.duration)}
         )
@@ -365,18 +365,17 @@ class AutopilotConfig(ComputingTask):
                 if conditions.bias + _PUSH_STD_FACTOR * conditions.push >= config.rudder:
                     raise ConfigError(
                         f"conditions.{name}: a bias of {math.degrees(conditions.bias):.3g} deg and"
-                        f" a push of {math.degrees(conditions.push):.3g} deg leave nothing of a"
-                        f" rudder of {math.degrees(config.rudder):.3g} deg to steer with; give more"
-                        " rudder, or less of them"
+                        f" a push of {math.degrees(conditions.push):.3g} deg need all of the"
+                        f" rudder of {math.degrees(config.rudder):.3g} deg; increase the rudder, or"
+                        " reduce bias or push"
                     )
         for key, (change, duration) in heading_changes.items():
             minimum_time = minimum_turn_time(nomoto, config.rudder, vessel.rate, change)
             if minimum_time > duration:
                 raise ConfigError(
                     f"{key}.duration: a change of heading of {math.degrees(change):.3g} deg takes"
-                    f" this vessel {minimum_time:.3g} s at least, given {duration:.3g} s; give"
-                    " more time,"
-                    " or more rudder"
+                    f" this vessel at least {minimum_time:.3g} s, given {duration:.3g} s; increase"
+                    " the duration or the rudder"
                 )
         for model, dt in learned_models:
             model.estimate_nomoto(self.rudder, self.turning_time, dt)
@@ -385,9 +384,9 @@ class AutopilotConfig(ComputingTask):
         """Return what a policy is trained on: the vessel under the conditions, or a learned model.
 
         Raises:
-            UsageError: where the run or the model is missing.
+            UsageError: if the run or the model is missing.
             ConfigError: if its inputs differ from the vessel's inputs, or the conditions have
-                weather, which a learned model does not feel.
+                weather, which a learned model does not describe.
         """
         assert self.conditions is not None
         learned_config = self.policies[name].learned
@@ -399,8 +398,8 @@ class AutopilotConfig(ComputingTask):
             return SteeredPlant(plant, in_calm_water=not has_weather, axis=self.axis)
         if has_weather:
             raise ConfigError(
-                f"policies.{name}.learned: a learned model feels no wind or current; leave them out"
-                " of conditions"
+                f"policies.{name}.learned: a learned model does not describe wind and current;"
+                " remove them from conditions"
             )
         spec, model = load_model(
             learned_config.run
@@ -416,14 +415,14 @@ class AutopilotConfig(ComputingTask):
         the times.
 
         Raises:
-            FitError: where the vessel does not turn steadily.
+            FitError: if the vessel does not turn steadily.
         """
         pace = self.pace
         if pace == "vessel":
             vessel = self.steered_vessel
             nomoto = vessel.estimate_nomoto(self.rudder, self.turning_time)
             minimum_time = minimum_turn_time(nomoto, self.rudder, vessel.rate)
-            # two digits are enough, and steps stay numbers that can be read
+            # rounded to two digits, so that the scaled times are readable
             pace = float(f"{minimum_time / minimum_turn_time(*REFERENCE_STEERING, None):.2g}")
             log_message(f"  pace {pace:g}: a change of 30 deg takes {minimum_time:.3g} s at least")
         if pace == 1.0 or self.conditions is None:
@@ -469,7 +468,7 @@ class AutopilotConfig(ComputingTask):
         """Train, tune and compare.
 
         Raises:
-            FitError: where tuning or training fails.
+            FitError: if tuning or training fails.
         """
         from residnet.autopilot.tasks.autopilot_run import run_autopilot
 
@@ -488,7 +487,7 @@ _PUSH_STD_FACTOR = 2.0
 
 _REFERENCE_STEP = math.radians(30.0)
 REFERENCE_STEERING = NomotoModel(3.47, 3.94, 3.2), math.radians(5.0)
-"""K, T and rudder of the vessel of document 004, whose times configs state at a pace of one."""
+"""K, T and rudder of the vessel of document 004; times in configs refer to it at a pace of one."""
 
 
 def minimum_turn_time(
@@ -496,13 +495,14 @@ def minimum_turn_time(
 ) -> float:
     """Return the least time in s of a change of heading [rad] by T r_dot + r = K delta.
 
-    Full rudder is held until full counter-rudder stops the yaw rate on the new heading; each way of
-    the rudder to one side takes additional time.
+    Time-optimal control: full rudder, then full counter-rudder until the yaw rate is zero at the
+    new heading. The finite rate of the rudder adds the time of two movements from amidships.
     """
     steady_yaw_rate = abs(nomoto.gain) * rudder_limit
     time_constant = nomoto.time
 
     def turn_and_time(first_duration: float) -> tuple[float, float]:
+        # from r(t1) = r_max (1 - exp(-t1 / T)) the counter-rudder needs T log(1 + r(t1) / r_max)
         second_duration = time_constant * math.log1p(
             1.0 - math.exp(-first_duration / time_constant)
         )

@@ -31,18 +31,17 @@ from residnet.runs.task import ComputingTask, ExportRequest, PartName, TaskOutco
 
 
 class CourseSpreadConfig(Config):
-    """Random vessels, each in a steady current of random direction.
+    """Random vessels, each in a constant current of random direction.
 
     All controllers and guidance laws are simulated with the same vessels.
 
     Attributes:
         flights: number of vessels.
-        seed: of the random numbers.
-        effect: least and largest effect of the rudder, as a multiple of the nominal one (K of
-            Nomoto's model).
-        time: least and largest time constants of sway and yaw, as a multiple of the nominal ones (T
-            of Nomoto's model).
-        bias: largest constant angle that is added to the rudder's, in rad.
+        seed: seed of the random numbers.
+        effect: range of the rudder effect (K of Nomoto's model), relative to the nominal one.
+        time: range of the time constants of sway and yaw (T of Nomoto's model), relative to the
+            nominal ones.
+        bias: largest constant offset of the rudder angle, in rad.
         current: speed of the current in m/s.
     """
 
@@ -83,25 +82,24 @@ class CourseTaskConfig(ComputingTask):
     """A course past buoys, the compared controllers, and line-of-sight laws without a plan.
 
     Attributes:
-        autopilot: folder of a finished autopilot run, or the config of one, which is then carried
-            out first, in this run's own folder. Vessel, rudder, policy and tuned peers come from
-            there.
-        policy: its name there.
-        peers: names of tuned peers and of the document's own autopilots there.
+        autopilot: folder of a finished autopilot run, or a config of task `autopilot`, which is
+            then run first in the folder of this run. It defines vessel, rudder, policy and peers.
+        policy: name of the policy in that run.
+        peers: names of tuned peers and of predictive autopilots in that run.
         others: further controllers, for example the document's law with another horizon.
-        course: start, buoys and how the course is planned.
-        protocols: what passing a buoy means: `enter` its circle of acceptance, or leave it on its
+        course: start, buoys and settings of the planning.
+        protocols: conditions for passing a buoy: `enter` its circle of acceptance, or pass on its
             side and outside its circle (`sides`).
-        integral: gain in m/s of integral action against a steady current in the guidance along the
-            plan; null for none.
-        line_of_sight: laws that are also flown without a plan, on straight legs from way-point to
-            way-point, as the source did it; for the protocol `enter`.
-        legs_change: where they do: in the circle of acceptance, as in the source, or at the
-            wheel-over before it.
+        integral: gain in m/s of integral action against a constant current in the guidance along
+            the plan; null for none.
+        line_of_sight: guidance laws that are also simulated without a plan, on straight legs
+            between way-points as in the source; for the protocol `enter`.
+        legs_change: position of the change to the next leg: in the circle of acceptance, as in the
+            source, or at the wheel-over point before it.
         spread: random vessels and currents, in addition to the nominal vessel
             without current; null for none.
-        dt: step of simulation and controllers in s.
-        duration: time in s after which a flight that has not ended is given up.
+        dt: time step of simulation and controllers in s.
+        duration: time limit of a simulation in s.
         safe: command of the exported policy for invalid inputs: the last valid command,
             or rudder amidships.
     """
@@ -125,7 +123,7 @@ class CourseTaskConfig(ComputingTask):
     def _validate_laws(self) -> Self:
         kinds = [law.kind for law in self.line_of_sight]
         if len(set(kinds)) < len(kinds):
-            raise ValueError(f"line_of_sight: each kind once, given {', '.join(kinds)}")
+            raise ValueError(f"line_of_sight: each kind may occur once, given {', '.join(kinds)}")
         check_steps(self.duration, self.dt)
         return self
 
@@ -140,7 +138,7 @@ class CourseTaskConfig(ComputingTask):
 
         Raises:
             UsageError: if the folder is not a finished autopilot run.
-            ConfigError: where the file is no config of an autopilot, or has no such policy or peer.
+            ConfigError: if the file is not a config of an autopilot, or lacks the policy or a peer.
         """
         autopilot_path = self.autopilot
         file = (
@@ -176,9 +174,9 @@ class CourseTaskConfig(ComputingTask):
         """Check the autopilot's run folder or config, and that the courses can be planned.
 
         Raises:
-            UsageError: where it is a folder of something else, or of an unfinished run.
-            ConfigError: where it is no config of an autopilot, or has no such policy or peer, or
-                where no course fits the vessel's turns.
+            UsageError: if the folder is not a finished autopilot run.
+            ConfigError: if the file is not a config of an autopilot, lacks the policy or a peer, or
+                if no course is possible with the turns of the vessel.
         """
         autopilot = self.load_autopilot_config()
         vessel = autopilot.steered_vessel
@@ -194,8 +192,8 @@ class CourseTaskConfig(ComputingTask):
         """Train the policy if necessary, plan the courses, simulate and compare.
 
         Raises:
-            ConfigError: where no course fits the vessel's turns.
-            FitError: where training fails.
+            ConfigError: if no course is possible with the turns of the vessel.
+            FitError: if training fails.
         """
         from residnet.autopilot.tasks.course_run import run_course
 

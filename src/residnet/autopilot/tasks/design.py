@@ -41,21 +41,21 @@ from residnet.tasks.registry import open_finished_task
 
 _RUDDER_CHANNELS = ("cmd_delta", "delta")
 _MIN_SAMPLES = 50
-"""Usable samples below which K and T are not looked for; chosen by hand."""
+"""Smallest number of usable samples for an identification of K and T."""
 _MIN_RUDDER_STD = 1e-3
-"""Least spread of the rudder in rad, rms."""
+"""Smallest standard deviation of the rudder in rad for an identification."""
 
 
 class IdentifiedSteering(NamedTuple):
-    """What logs say about a vessel's steering.
+    """Steering of a vessel, identified from logs.
 
     Attributes:
-        response: K, T, delay and rudder rate, and how well they simulate the yaw rates.
-        speed: mean surge velocity in m/s; NaN where no log has it.
+        response: K, T, delay and rudder rate, with the error of the simulated yaw rates.
+        speed: mean surge velocity in m/s; NaN if it is in no log.
         noise: standard deviations of the white noise on the heading in rad and on the yaw rate in
-            rad/s, at the step of the logs; NaN where no log has the channel.
+            rad/s, at the step of the logs; NaN for a channel that is in no log.
         dt: median step of the logs in s.
-        rudder: largest angle in rad that the logs hold.
+        rudder: largest rudder angle in rad in the logs.
     """
 
     response: SteeringResponse
@@ -66,17 +66,17 @@ class IdentifiedSteering(NamedTuple):
 
 
 def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> IdentifiedSteering:
-    """Return K, T and delay of the vessel that logs are of.
+    """Identify K, T and delay of a vessel from logs.
 
     Args:
-        logs: with yaw rate `r` or heading `psi`, and the rudder; turns to both sides are best. The
-            rudder is the command where a log has it, since the delay of the steering gear counts,
-            otherwise the measured angle.
-        longest_delay: that is searched for, in s.
+        logs: logs with yaw rate `r` or heading `psi`, and the rudder; turns to both sides are best.
+            The rudder command is preferred to the measured angle, since the identified delay must
+            include the steering gear.
+        longest_delay: largest delay of the search, in s.
 
     Raises:
-        DataError: where a log lacks the channels, or the rudder hardly moves.
-        FitError: where no response to the rudder is found.
+        DataError: if a log lacks the channels, or the rudder is nearly constant.
+        FitError: if no response to the rudder is found.
     """
     if not logs:
         raise DataError("steering: no logs given")
@@ -86,9 +86,8 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
     max_rudder_std = max(float(np.std(record.rudder)) for record in records)
     if max_rudder_std < _MIN_RUDDER_STD:
         raise DataError(
-            f"steering: the rudder of the logs moves by {max_rudder_std:.2g} rad (rms); K and T"
-            " need turns,"
-            " such as a zigzag"
+            f"steering: the rudder of the logs varies by only {max_rudder_std:.2g} rad (rms);"
+            " K and T need turns, such as a zigzag"
         )
     logs_with_motion = [
         complete_motion(log, MotionConfig()) if {"x", "y", "psi"} <= log.channels.keys() else log
@@ -106,20 +105,19 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
 
 
 def _estimate_noise(logs: Sequence[Log], name: str) -> float:
-    """Return the standard deviation of a channel's white noise; NaN where no log has it."""
+    """Return the standard deviation of a channel's white noise; NaN if it is in no log."""
     channel_values = [log[name][log.usable] for log in logs if name in log.channels]
     return estimate_noise_std(np.concatenate(channel_values)) if channel_values else float("nan")
 
 
 def _to_uniform_record(log: Log) -> tuple[ManoeuvreRecord, str]:
-    """Return a log on a uniform grid at its median step, and the rudder's channel."""
+    """Return a log resampled to its median step, and the name of its rudder channel."""
     name = next((name for name in _RUDDER_CHANNELS if name in log.channels), None)
     source = next((name for name in ("r", "psi") if name in log.channels), None)
     if name is None or source is None:
         raise DataError(
             f"log {log.name}: K and T need the rudder ({' or '.join(_RUDDER_CHANNELS)}) and the"
-            " yaw rate r"
-            f" or the heading psi; it has {', '.join(log.channels)}"
+            f" yaw rate r or the heading psi; it has {', '.join(log.channels)}"
         )
     usable = log.usable & np.isfinite(log[source]) & np.isfinite(log[name])
     if int(usable.sum()) < _MIN_SAMPLES:
@@ -131,7 +129,7 @@ def _to_uniform_record(log: Log) -> tuple[ManoeuvreRecord, str]:
     usable_times = log.t[usable]
     values = np.interp(grid, usable_times, log[source][usable])
     rate = values if source == "r" else np.gradient(values, dt)
-    # a command stands until the next
+    # a command is constant until the next one: zero-order hold instead of interpolation
     held_indices = np.clip(
         np.searchsorted(usable_times, grid + 1e-9 * dt, side="right") - 1, 0, None
     )
@@ -141,22 +139,25 @@ def _to_uniform_record(log: Log) -> tuple[ManoeuvreRecord, str]:
 
 _GAIN_TIME_PATTERN = re.compile(r"\s*([0-9.eE+-]+)\s*,?\s*([0-9.eE+-]*)\s*")
 _DEFAULT_UNCERTAINTY = 0.2
-"""Share by which K and T may be off where nobody has measured how far."""
+"""Relative uncertainty of K and T that are given without one."""
 _MIN_UNCERTAINTY = 0.1
-"""Least such share: K goes with the speed and T against it, and few vessels keep their speed within
-a tenth in wind and turns.
+"""Smallest relative uncertainty of identified K and T: K is proportional to speed and T inversely,
+and few vessels keep their speed within a tenth in wind and turns.
 """
 _DEFAULT_DELAY = (0.0, 0.4)
-"""Delay in s of electronics that nobody has measured, from at once to two cycles at 5 Hz."""
+"""Range in s of an unknown delay of the electronics: from none to two cycles at 5 Hz."""
 _DEFAULT_NOISE_DEG = 0.1
-"""Noise in deg and deg/s of a magnetic compass and a MEMS gyro, where no log shows it."""
+"""Noise in deg and deg/s of a magnetic compass and a MEMS gyro, if unknown."""
 _DEFAULT_BIAS_DEG = 1.0
 _DEFAULT_PUSH_DEG = 0.5
-"""Rudder offset and slow push in deg that are usual, where logs show no more."""
+"""Typical rudder offset and slow push in deg; used unless the logs have a larger offset."""
 _TRAINING_SETTINGS = {"epochs": 12, "batch": 192, "quiet": 0.25}
-"""Of ten drawn vessels' policies one kept swinging after six epochs and one overshot too far; these
-cost 13 to 14 % less than the best law after twelve, in place of 9 to 13 %. Of ten others one still
-swung with a tenth of quiet flights, and not with a quarter.
+"""Training of the policy, chosen on random vessels.
+
+After six epochs one of ten policies oscillated and one overshot; after twelve none did, and the
+cost was 13 to 14 % below that of the best law, instead of 9 to 13 %. Of ten further policies one
+still oscillated with a share of 0.1 of simulations without a change of heading (`quiet`), none with
+0.25.
 """
 _REFERENCE_TIME_STEP = 0.02
 """Step in s of the vessel of document 004, which `pace` multiplies."""
@@ -166,16 +167,16 @@ class SteeringDescription(NamedTuple):
     """Identified steering of a vessel with its uncertainty.
 
     Attributes:
-        gain, time: K in 1/s and T in s.
+        gain, time_constant: K in 1/s and T in s.
         rate: rudder rate in rad/s; None for a rudder without a rate limit.
-        speed: at which they hold, in m/s.
-        rudder: largest angle in rad that controllers may use.
-        effect, slow: ranges of K and T as multiples.
-        delay: shortest and longest in s between a command and the steering gear.
-        bias: rudder angle in rad that may be felt amidships.
-        noise: of heading and yaw rate in rad and rad/s, and the step in s that it is of; None where
-            nothing shows it.
-        source: where all this is from.
+        speed: speed in m/s at which K and T are valid.
+        rudder: largest rudder angle in rad of the controllers.
+        gain_range, time_range: ranges of K and T as multiples.
+        delay: smallest and largest delay in s between a command and the steering gear.
+        bias: largest effective rudder angle in rad with the rudder amidships.
+        noise: standard deviations of heading and yaw rate in rad and rad/s, and their step in s;
+            None if unknown.
+        source: origin of these values, in words.
     """
 
     gain: float
@@ -211,17 +212,18 @@ def draft_autopilot_config(
     """Write the vessel file and the config of an autopilot; returns the config's path.
 
     Args:
-        source: `K,T` in 1/s and s; logs; or the folder of a finished fit, whose logs are taken.
+        source: `K,T` in 1/s and s; logs; or the folder of a finished fit, whose logs are used.
         output_file: config to write; the vessel file is written to the same folder.
-        rudder: rudder limit of the controllers with its unit; by default the angle that the logs
-            hold, and 20 deg without logs.
+        rudder: rudder limit of the controllers with its unit; by default the largest angle in the
+            logs, and 20 deg without logs.
         rate: rate of the steering gear with its unit; by default identified from the logs.
-        speed: at which K and T hold, with its unit; by default the mean of the logs.
+        speed: speed at which K and T are valid, with its unit; by default the mean of the logs.
+        overwrite: whether existing files are replaced.
 
     Raises:
         UsageError: if the source is neither, or an output file exists already.
-        DataError: where logs lack the channels.
-        FitError: where the logs show no answer to the rudder.
+        DataError: if logs lack the channels.
+        FitError: if the logs have no response to the rudder.
     """
     vessel_file = output_file.with_name(f"{output_file.stem}_vessel.yaml")
     for file in (output_file, vessel_file):
@@ -236,7 +238,7 @@ def draft_autopilot_config(
     steering = _describe_steering(source)
     if math.isnan(user_settings.get("speed", steering.speed)):
         log_message(
-            "  speed unknown: give --speed, or u is measured in multiples of the usual speed"
+            "  speed unknown: give --speed; without it u is in multiples of the usual speed"
         )
         user_settings["speed"] = 1.0
     steering = steering._replace(**user_settings)
@@ -247,7 +249,7 @@ def draft_autopilot_config(
             "\n" + yaml.safe_dump(_build_vessel_file(steering, vessel_file.stem), sort_keys=False)
         )
     with write_owned(output_file) as file:
-        # each of its own, so that no part is shared under a made-up name
+        # a copy through JSON: YAML would write shared dictionaries as anchors and aliases
         config = json.loads(json.dumps(_build_autopilot_config(steering, output_file, vessel_file)))
         file.write_text(
             f"# An autopilot for your vessel, drafted from {steering.source} by `residnet"
@@ -258,7 +260,7 @@ def draft_autopilot_config(
 
 
 def _describe_steering(source: Sequence[str | Path]) -> SteeringDescription:
-    """Return what a source says of a vessel's steering."""
+    """Return the steering of a vessel from K and T, logs or a finished fit."""
     gain_time_match = _GAIN_TIME_PATTERN.fullmatch(str(source[0])) if len(source) == 1 else None
     if gain_time_match and not Path(source[0]).exists():
         try:
@@ -266,7 +268,9 @@ def _describe_steering(source: Sequence[str | Path]) -> SteeringDescription:
         except ValueError:
             gain = time_constant = math.nan
         if not (gain > 0 and time_constant > 0):
-            raise UsageError(f"{source[0]}: K in 1/s and T in s, both positive, such as 0.12,18")
+            raise UsageError(
+                f"{source[0]}: K in 1/s and T in s, both positive, for example 0.12,18"
+            )
         relative_range = (1.0 - _DEFAULT_UNCERTAINTY, 1.0 + _DEFAULT_UNCERTAINTY)
         bias = math.radians(_DEFAULT_BIAS_DEG)
         return SteeringDescription(
@@ -280,7 +284,7 @@ def _describe_steering(source: Sequence[str | Path]) -> SteeringDescription:
             _DEFAULT_DELAY,
             bias,
             None,
-            f"K = {gain:g} 1/s and T = {time_constant:g} s as given",
+            f"K = {gain:g} 1/s and T = {time_constant:g} s",
         )
     logs, name = _read_source_logs([Path(item) for item in source])
     identified = identify_steering(logs)
@@ -294,12 +298,12 @@ def _describe_steering(source: Sequence[str | Path]) -> SteeringDescription:
     )
 
     def relative_interval(value: float, deviation: float) -> tuple[float, float]:
-        # two standard deviations hold nineteen of twenty
+        # two standard deviations: a 95 % interval
         relative_error = min(max(2.0 * deviation / value, _MIN_UNCERTAINTY), 0.5)
         return round(1.0 - relative_error, 3), round(1.0 + relative_error, 3)
 
     gain, time_constant, delay_deviation = response.standard_errors
-    # a command is logged up to a step after it was given
+    # a command is logged up to one step after it was issued
     delay_margin = 2.0 * delay_deviation + 0.5 * dt
     noise = (
         None if math.isnan(identified.noise[1]) else (identified.noise[0], identified.noise[1], dt)
@@ -323,11 +327,13 @@ def _describe_steering(source: Sequence[str | Path]) -> SteeringDescription:
 
 
 def _read_source_logs(paths: Sequence[Path]) -> tuple[list[Log], str]:
-    """Return the logs of files, or those that a finished fit has learned from, and their name."""
+    """Return the logs of files, or the training and validation logs of a fit, and their name."""
     if len(paths) == 1 and (paths[0] / "resolved.yaml").is_file():
         task = load_mapping(paths[0] / "resolved.yaml").get("task")
         if task != "fit":
-            raise UsageError(f"{paths[0]}: a run of task '{task}'; give that of a fit, or logs")
+            raise UsageError(
+                f"{paths[0]}: a run of task '{task}'; give the folder of a fit, or logs"
+            )
         _, config = open_finished_task(paths[0], "evaluate")
         splits = config.logs()
         logs = [*splits["train"], *splits["validation"]]
@@ -352,7 +358,7 @@ def _build_vessel_file(steering: SteeringDescription, name: str) -> dict[str, An
         "kind": "nomoto",
         "name": name,
         "description": "Own vessel, Nomoto model of first order",
-        # no controller asks for it
+        # required by the format of vessel files; no controller uses it
         "length": {"value": 1.0, "unit": "m", "source": "not known, and not used for steering"},
         "speed": float(f"{steering.speed:.4g}"),
         "K": quantity(steering.gain, "1/s"),
@@ -367,12 +373,12 @@ def _build_autopilot_config(
     """Return the content of the config."""
     nomoto = NomotoModel(steering.gain, steering.time_constant, steering.speed)
     turn_time = minimum_turn_time(nomoto, steering.rudder, steering.rate)
-    # two digits, as a person would write them into the config
+    # rounded to two digits, for a readable config
     pace = float(f"{turn_time / minimum_turn_time(*REFERENCE_STEERING, None):.2g}")
     noise = (_DEFAULT_NOISE_DEG, _DEFAULT_NOISE_DEG)
     if steering.noise is not None:
         heading, rate, dt = steering.noise
-        # the same spectrum at the controller's step
+        # white noise of equal spectral density: the variance is proportional to 1 / step
         scale = math.degrees(math.sqrt(dt / (_REFERENCE_TIME_STEP * pace)))
         noise = (_DEFAULT_NOISE_DEG if math.isnan(heading) else scale * heading, scale * rate)
     bias = min(math.degrees(steering.bias), 0.3 * math.degrees(steering.rudder))
@@ -386,7 +392,7 @@ def _build_autopilot_config(
         "noise_r": f"{noise[1]:.3g} deg/s",
     }
     lower, upper = steering.delay
-    # three quarters up the range, as the configs that come with residnet have it
+    # at three quarters of the range, as in the configs of the repository
     lag_settings = {"lag": f"{lower + 0.75 * (upper - lower):.3g} s"} if upper > 0 else {}
     further_conditions = {
         "weak": {**main_conditions, "effect": [0.55, 0.55], "time": [1.6, 1.6]},
@@ -400,7 +406,7 @@ def _build_autopilot_config(
         "task": "autopilot",
         "name": output_file.stem,
         "description": f"Heading autopilot of a vessel from {steering.source}",
-        # found from wherever a run is exported
+        # absolute, so that an export from any folder finds it
         "vessel": str(vessel_file.resolve()),
         "rudder": f"{math.degrees(steering.rudder):.4g} deg",
         "pace": pace,

@@ -1,6 +1,6 @@
-"""Training of document 004's autopilot in a run: a perceptron learns what each rudder angle brings.
+"""Training of the predictor of document 004: a perceptron learns responses to rudder angles.
 
-Sections 6.1.1, 6.1.2, 6.2.1, 6.2.2.
+Source: sections 6.1.1, 6.1.2, 6.2.1 and 6.2.2.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from residnet.training.trainer import EpochTraining, run_epochs
 
 
 class RudderResponses(NamedTuple):
-    """The simulated changes [S, 2, C] that each of C rudder angles brings to states [S, nx].
+    """States [S, nx] and their simulated changes [S, 2, C] for each of C rudder angles.
 
-    Changes are of heading [rad] and yaw rate [rad/s].
+    The changes are those of heading [rad] and yaw rate [rad/s].
     """
 
     x: Tensor
@@ -50,21 +50,24 @@ def simulate_rudder_responses(
     states: int,
     seed: int,
 ) -> RudderResponses:
-    """Return the data of section 6.1.1: random states, simulated under all rudder angles.
+    """Return the data of section 6.1.1: random states, simulated with all rudder angles.
 
-    The states are those that the vessel comes through under random angles, since few combinations
-    of its velocities can occur, scattered a little beyond.
+    States are sampled from simulations with random angles, since most combinations of velocities
+    do not occur. Added noise covers their neighbourhood.
 
     Args:
-        vessel: in calm water.
+        vessel: vessel in calm water.
+        exact_predictor: simulation of the changes.
         rudder: angles [C] in rad.
+        settings: settings of the training.
+        states: number of states.
+        seed: seed of the random numbers.
     """
     generator = torch.Generator().manual_seed(seed)
     dt = min(settings.hold / 10.0, 0.25)
     steps = math.ceil(settings.wander / dt)
     x, w = vessel.straight_course(torch.ones(states, dtype=torch.float64))
-    # each angle is held for a random time: an angle that was drawn at a step stays until the next
-    # drawing
+    # a Poisson process of changes: an angle applies from its switching step to the next one
     is_switch = torch.rand(states, steps, generator=generator) < dt / settings.hold
     is_switch[:, 0] = True
     last_switch = torch.where(is_switch, torch.arange(steps), 0).cummax(1).values
@@ -88,10 +91,13 @@ def simulate_rudder_responses(
 
 @final
 class PredictorFit(EpochTraining):
-    """A training by least squares on the changes of heading and yaw rate, each over its spread.
+    """Least-squares training on the changes of heading and yaw rate, scaled by their spread.
 
     Args:
-        predictor: trained network, float64.
+        predictor: network to train, float64.
+        validation_set: states that are not used in training.
+        settings: settings of the training.
+        seed: seed of the batches.
     """
 
     def __init__(
@@ -124,10 +130,7 @@ class PredictorFit(EpochTraining):
         return (self.predictor.predict_changes(answers.x) - answers.change) / self.predictor.scale
 
     def compute_validation_score(self) -> tuple[nn.Module, float]:
-        """Return the predictor and its error on fresh states, as a share of the spread.
-
-        The error is the root of the mean square.
-        """
+        """Return the predictor and its RMS error on the validation states, relative to the spread."""
         with torch.no_grad():
             return self.predictor, float(
                 self._scaled_errors(self.validation_set).square().mean().sqrt()
@@ -142,20 +145,24 @@ def train_predictor(
     seed: int,
     folder: Path,
 ) -> dict[str, Any]:
-    """Train the predictor and leave the weights that validated best in it.
+    """Train the predictor; it then has the weights of the best validation score.
 
-    `checkpoints/<name>/last.ckpt` is resumed where it exists.
+    The training resumes from `checkpoints/<name>/last.ckpt` if it exists.
 
     Args:
-        config: of the controller and of the training.
+        name: name of the controller.
+        predictor: network to train.
+        config: config of the controller and its training.
         task: the vessel in calm water and the limit of its rudder.
+        seed: seed of states and batches.
+        folder: folder of the run.
 
     Returns:
-        The curve by epoch, the best score, the number of parameters, and on states kept back the
-        roots of the mean squared errors of heading [rad] and yaw rate [rad/s] at the horizon's end.
+        The curve by epoch, the best score, the number of parameters, and the root mean square
+        errors of heading [rad] and yaw rate [rad/s] at the end of the horizon on validation states.
 
     Raises:
-        FitError: where no epoch gave a finite error.
+        FitError: if no epoch has a finite error.
     """
     settings = config.training
     exact_predictor = config.build_exact_predictor(task)
@@ -188,18 +195,20 @@ def train_predictor(
 def train_or_resume_controller(
     name: str, config: PredictiveConfig, task: ControlTask, seed: int, folder: RunFolder
 ) -> tuple[Policy, dict[str, Any]]:
-    """Train a controller, or take up the one that an interrupted run has trained.
+    """Train a controller, or load the one that an interrupted run has trained.
 
     Args:
-        config: how it predicts and how it is trained.
+        name: name of the controller.
+        config: config of the controller and its training.
         task: the vessel in calm water and the limit of its rudder.
         seed: seed of the weights, the states and the batches.
+        folder: folder of the run.
 
     Returns:
         The controller, and notes on its config and on the errors of its predictions.
 
     Raises:
-        FitError: where training fails.
+        FitError: if training fails.
     """
     torch.manual_seed(seed)
     spec = config.predictor_spec(task)
@@ -228,7 +237,7 @@ def load_predictive_controller(
     """Return the controller that a finished run has trained.
 
     Raises:
-        UsageError: where the run lacks it.
+        UsageError: if the run has no such controller.
     """
     network = config.predictor_spec(task).build()
     if RunModelStore(folder).restore_module(name, network) is None:

@@ -1,4 +1,4 @@
-"""Settings of the task `fit`: what is identified, from which logs, and what the run writes."""
+"""Settings of the task `fit`: the models, their logs, and the outputs of the run."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
 
         Raises:
             UsageError: if the run has no such refitted baseline, or no input steers.
-            DataError: if no candidate trial stays within the limits.
+            DataError: if no candidate trial is within the limits.
         """
         next_trials: NextTrials = self.call_executor("plan_trial", run, model, trial_limits)
         return next_trials
