@@ -88,7 +88,11 @@ LINE = contender("line", "baseline", 0.4, faults=FAULT)
             "baseline",
             WITHIN,
         ),
-        ([baseline(0.5, 0.05), contender("mlp", "network", 0.5 * math.exp(-0.05))], "mlp", "errs"),
+        (
+            [baseline(0.5, 0.05), contender("mlp", "network", 0.5 * math.exp(-0.05))],
+            "mlp",
+            "smallest",
+        ),
         # constant velocity where nothing beats it, or all others diverge
         (
             [baseline(1.2), contender("mlp", "network", 1.1)],

@@ -87,7 +87,11 @@ def test_the_first_sentence_compares_with_zero_and_the_baseline() -> None:
     assert first.startswith(
         "On test data model mlp is 60 % better than constant velocity (paired 95 % interval"
     )
-    for part in ("-0.4 to -0.2)", "20 % better than the baseline", "zero: the data cannot tell"):
+    for part in (
+        "-0.4 to -0.2)",
+        "20 % better than the baseline",
+        "zero: the difference is not significant",
+    ):
         assert part in first
     worse = write_verdict(
         evidence(error=0.608, rows_by_model={"constant_velocity": row(0.506), "mlp": row(0.608)})

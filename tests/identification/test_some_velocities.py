@@ -208,7 +208,7 @@ def test_scales_are_of_the_velocities_of_the_model() -> None:
         1.0,
     ]
     for part, key, value, told in (
-        ("evaluation", "scales", {"u": 0.3, "v": 0.1, "r": 0.1}, "give one of each"),
+        ("evaluation", "scales", {"u": 0.3, "v": 0.1, "r": 0.1}, "needs one scale for each"),
         ("signals", "velocities", ["r", "u"], "in this order"),
         ("signals", "exogenous", ["wind_speed", "wind_dir"], "wind needs u, v, r"),
     ):

@@ -178,8 +178,8 @@ def test_settings_say_the_recipe_and_nothing_of_its_parts() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"baseline": {"kind": "still"}}, "leave 'baseline' out"),
-        ({"heads": {"ridge": {"kind": "ridge"}}}, "leave 'heads' out"),
+        ({"baseline": {"kind": "still"}}, "remove 'baseline'"),
+        ({"heads": {"ridge": {"kind": "ridge"}}}, "remove 'heads'"),
         ({"recipe": "standart"}, "standard"),
         ({"recipe": None}, "baseline"),
         ({"signals": {"inputs": ["left"], "pairs": [["left", "rigth"]]}}, "rigth"),

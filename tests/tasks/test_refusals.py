@@ -230,4 +230,4 @@ def test_a_log_for_judging_is_as_long_as_a_window(
     said = command("check", file)
     assert said.code == 1
     assert name in said.err
-    assert "no window of a protocol" in said.err
+    assert "too short for a window of any protocol" in said.err

@@ -139,7 +139,7 @@ def test_inputs_that_steer_are_known_by_unit_or_side(
     assert float(shares["n_port"].steer) > 0 > float(shares["n_stbd"].steer)
     short = {"low": spec.low[:4], "high": spec.high[:4]}
     single = spec.model_copy(update={"signals": SignalsConfig(inputs=("n",)), **short})
-    with pytest.raises(UsageError, match="known to steer"):
+    with pytest.raises(UsageError, match="recognised as a steering input"):
         infer_input_shares(single)
 
 
@@ -147,5 +147,5 @@ def test_manoeuvres_too_short_to_tell_anything_are_refused(
     known: tuple[FittedModel, RefitUncertainty, torch.Tensor],
 ) -> None:
     short = ConstantInput(name="short", drive=1.0, steer=0.0, duration=1.0)
-    with pytest.raises(DataError, match="cannot fly them"):
+    with pytest.raises(DataError, match="cannot simulate them"):
         planned(known, TrialLimits(time=8.0, count=1), PredictionGoal([short], 1.0, {}))

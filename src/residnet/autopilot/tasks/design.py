@@ -154,10 +154,10 @@ _DEFAULT_PUSH_DEG = 0.5
 _TRAINING_SETTINGS = {"epochs": 12, "batch": 192, "quiet": 0.25}
 """Training of the policy, chosen on random vessels.
 
-After six epochs one of ten policies oscillated and one overshot; after twelve none did, and the
-cost was 13 to 14 % below that of the best law, instead of 9 to 13 %. Of ten further policies one
-still oscillated with a share of 0.1 of simulations without a change of heading (`quiet`), none with
-0.25.
+After six epochs one of ten policies oscillated and one overshot; after twelve the costs of these
+two were 13 to 14 % below that of the best law, instead of 9 to 13 %. Of ten further policies one
+still oscillated with a share of 0.1 of simulations without noise and disturbances (`quiet`), none
+with 0.25.
 """
 _REFERENCE_TIME_STEP = 0.02
 """Step in s of the vessel of document 004, which `pace` multiplies."""

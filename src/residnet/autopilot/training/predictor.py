@@ -130,7 +130,7 @@ class PredictorFit(EpochTraining):
         return (self.predictor.predict_changes(answers.x) - answers.change) / self.predictor.scale
 
     def compute_validation_score(self) -> tuple[nn.Module, float]:
-        """Return the predictor and its RMS error on the validation states, relative to the spread."""
+        """Return the predictor and its RMS error on validation states, relative to the spread."""
         with torch.no_grad():
             return self.predictor, float(
                 self._scaled_errors(self.validation_set).square().mean().sqrt()
