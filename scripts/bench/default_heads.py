@@ -446,14 +446,18 @@ def compare_heads(
 def main() -> None:
     """Print a table of the models of each vessel."""
     args = bench.options(
-        __doc__, vessels=["ship_1"], logs=30, heads=["plsr"], seeds=[0], noise=1.0, csv=None
+        __doc__,
+        vessels=list(DEFAULT_VESSELS),
+        logs=30,
+        heads=["plsr", "mlp", "lstm"],
+        seeds=[0],
+        noise=1.0,
+        csv=None,
     )
-    vessels = args.vessels or DEFAULT_VESSELS
-    heads = args.heads or ("plsr", "mlp", "lstm")
     tables = []
-    for vessel in vessels:
-        for seed in args.seeds or (0,):
-            tables.append(compare_heads(vessel, args.logs, heads, seed, args.noise))
+    for vessel in args.vessels:
+        for seed in args.seeds:
+            tables.append(compare_heads(vessel, args.logs, args.heads, seed, args.noise))
             print(tables[-1].round(3).to_string(index=False), flush=True)
     if args.csv is not None:
         pd.concat(tables).to_csv(Path(args.csv), index=False)

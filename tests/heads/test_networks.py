@@ -31,7 +31,9 @@ from residnet.preprocessing.windows import WindowStore
 
 def built(**config: object) -> LstmHead:
     torch.manual_seed(0)
-    head = LstmConfig.model_validate({"kind": "lstm", "hidden_size": 12, **config}).build(NAMES)
+    head = LstmConfig.model_validate(
+        {"kind": "lstm", "hidden_size": 12, "readout": 0, **config}
+    ).build(NAMES)
     assert isinstance(head, LstmHead)
     head.calibrate(made())
     return head.double().eval()
@@ -97,7 +99,9 @@ def test_a_softsign_cell_equals_numpy() -> None:
 
 def test_the_documents_network_has_axes_of_their_own() -> None:
     """4 * 100 * (4 + 100 + 1) + 101 = 42,101 for each of surge, sway, yaw (correction W4)."""
-    config = LstmConfig(hidden_size=100, per_axis=True, features=("u", "v", "r", "tau_n"))
+    config = LstmConfig(
+        hidden_size=100, readout=0, per_axis=True, features=("u", "v", "r", "tau_n")
+    )
     head: Any = config.build(NAMES)
     counts = [sum(p.numel() for p in network.parameters()) for network in head.networks]
     assert counts == [42_101] * 3
@@ -297,9 +301,11 @@ SCENES = {
 TURNED = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 MIRRORED: dict[str, Any] = {
     "mlp": MlpConfig(mirror=True, hidden=(9, 7)),
-    "lstm": LstmConfig(mirror=True, hidden_size=6),
+    "lstm": LstmConfig(mirror=True, hidden_size=6, readout=0),
     "readout": LstmConfig(mirror=True, hidden_size=5, readout=4, memory=("v", "r")),
-    "per axis": LstmConfig(mirror=True, hidden_size=4, per_axis=True, activation="softsign"),
+    "per axis": LstmConfig(
+        mirror=True, hidden_size=4, readout=0, per_axis=True, activation="softsign"
+    ),
 }
 
 

@@ -475,10 +475,11 @@ def test_tensorboard_shows_axes_rate_settings_and_a_free_run(
 HEADS = {
     "mlp": MlpConfig(hidden=(6,)),
     "mirrored mlp": MlpConfig(hidden=(6,), mirror=True),
-    "lstm": LstmConfig(hidden_size=4),
+    "lstm": LstmConfig(hidden_size=4, readout=0),
+    "lstm with readout": LstmConfig(hidden_size=4, readout=5),
     "lstm of commands": LstmConfig(hidden_size=4, memory=("tau_x",), readout=5),
     "lstm per axis": LstmConfig(
-        hidden_size=4, activation="softsign", per_axis=True, restoring=True
+        hidden_size=4, readout=0, activation="softsign", per_axis=True, restoring=True
     ),
 }
 SETTINGS: dict[str, Any] = {

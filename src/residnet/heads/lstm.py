@@ -41,8 +41,8 @@ class LstmConfig(FeatureConfig):
     """
 
     kind: Literal["lstm"] = "lstm"
-    hidden_size: int = Field(default=100, ge=1, le=10_000)
-    readout: int = Field(default=0, ge=0, le=10_000)
+    hidden_size: int = Field(default=32, ge=1, le=10_000)
+    readout: int = Field(default=32, ge=0, le=10_000)
     memory: tuple[str, ...] = ()
     activation: Literal["tanh", "softsign"] = "tanh"
     dropout: float = Field(default=0.0, ge=0, lt=1)

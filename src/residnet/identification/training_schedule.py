@@ -99,11 +99,12 @@ _WINDOW_SAMPLES = 32
 _MAX_WASHOUT_SAMPLES = 32
 """Largest number of samples that fill the memory at the start of a teacher-forced window."""
 _ONE_STEP_BATCH = 64
-_SHORT_HORIZON_SAMPLES = 40
-_LONG_HORIZON_SAMPLES = 120
-"""Samples of the rollouts of the two free-run stages, unless free runs are shorter."""
-_FREE_RUN_EPOCHS = 3
-"""Epochs of each free-run stage."""
+_FREE_RUN_STAGES = (
+    # samples of a rollout, epochs, batch, learning rate at the beginning, final share of it
+    (40, 2, 64, 1e-3, 0.9),
+    (200, 4, 32, 1e-3, 0.05),
+)
+"""Free-run stages. Rollouts are at most as long as the free runs of the protocol."""
 
 
 def _schedule_network(
@@ -136,18 +137,13 @@ def _schedule_network(
         "multi_step": [
             {
                 "horizon": min(n_horizon, max_horizon_samples) * dt,
-                "epochs": _FREE_RUN_EPOCHS,
+                "epochs": epochs,
                 "batch": batch,
                 "learning_rate": learning_rate,
                 "final": final_rate_share,
             }
-            # one cosine over both stages
-            for n_horizon, batch, learning_rate, final_rate_share in (
-                (_SHORT_HORIZON_SAMPLES, 96, 1e-3, 0.5),
-                (_LONG_HORIZON_SAMPLES, 32, 5e-4, 0.1),
-            )
+            for n_horizon, epochs, batch, learning_rate, final_rate_share in _FREE_RUN_STAGES
         ],
         "weight_decay": 0.001,
-        "patience": _FREE_RUN_EPOCHS,
         "require_improvement": True,
     }

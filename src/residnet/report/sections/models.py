@@ -446,9 +446,13 @@ def learning_figure(run: RunFiles) -> Figure | None:
                 epoch[stage_starts] - 0.5,
                 np.zeros(len(stage_starts)),
             )
-        multi_step_stages = ((run.resolved_config.get("training") or {}).get(model) or {}).get(
-            "multi_step"
-        ) or []
+        # runs of earlier versions have the settings in their config only
+        training = (
+            run.fit_notes(model).get("training")
+            or (run.resolved_config.get("training") or {}).get(model)
+            or {}
+        )
+        multi_step_stages = training.get("multi_step") or []
         stage_labels = {
             k + 1: f"{stage_config['horizon']:g} s"
             for k, stage_config in enumerate(multi_step_stages)
