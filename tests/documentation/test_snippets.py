@@ -7,6 +7,7 @@ demo and with less training, but for those that `NOT_RUN` names.
 from __future__ import annotations
 
 import ast
+import json
 import os
 import re
 import runpy
@@ -22,6 +23,7 @@ import pandas as pd
 import pytest
 import readability
 import yaml
+from tiny import call
 from typer.main import get_command
 
 import residnet
@@ -95,6 +97,23 @@ def test_yaml_is_read(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert fragment(block.text).task == "fit"
     else:
         assert load_config(path, [], VesselConfig).build().n_commands > 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_the_short_config_of_the_readme_is_complete(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    block = next(b for b in BLOCKS if b.page == "README.md" and b.kind == "yaml")
+    (tmp_path / "short.yaml").write_text(block.text)
+    words = (
+        ("run", "short.yaml", "-s", "effort=0.05") if command == "run" else ("check", "short.yaml")
+    )
+    assert call(monkeypatch, *words) == 0
+    if command == "run":
+        rows = json.loads((tmp_path / "runs" / "my_boat" / "metrics.json").read_text())["rows"]
+        assert {"plsr", "mlp", "lstm"} <= {row["model"] for row in rows}
 
 
 def fragment(text: str) -> Any:
