@@ -143,7 +143,7 @@ def test_a_memory_of_chosen_features_ignores_the_others() -> None:
     [
         ({"axis_features": {"u": ["u"], "v": ["v"], "r": ["r"]}}, "needs per_axis"),
         ({"per_axis": True, "axis_features": {"u": ["u"]}}, "all of u, v, r"),
-        ({"memory": [NAMES[-1]]}, "readout"),
+        ({"memory": [NAMES[-1]], "readout": 0}, "readout"),
     ],
 )
 def test_wrong_configs(config: dict[str, object], message: str) -> None:
