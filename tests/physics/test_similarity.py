@@ -57,7 +57,9 @@ def test_prime_systems_have_the_units_of_sname() -> None:
     ship = mariner()
     force = dimension_of_unit("N")
     assert force is not None
-    length, speed, density = ship.length, ship.speed, ship.density
+    length = ship.length
+    speed = ship.speed
+    density = ship.density
     prime_i = ship.reference_scales("prime_i")
     prime_ii = ship.reference_scales("prime_ii")
     bis = ship.reference_scales("bis")

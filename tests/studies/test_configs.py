@@ -17,7 +17,7 @@ TRIAL = "halvorsen2019/standard_model"
 FAST = "rows={key: head.evolution.crossover, values: [0.1, 0.9]}"
 REFUSED: tuple[tuple[str, tuple[str, ...], str], ...] = (
     (FERRY, ("true=wam_v_cal",), "actuators push in surge, sway and yaw"),
-    (FERRY, ("models.lag_ridge.on=nothing",), "no model before it"),
+    (FERRY, ("models.lag_ridge.on=nothing",), "no preceding model"),
     (FERRY, ("models.lag_ridge.terms=[u_dott]",), "u_dott"),
     (FERRY, ("course.interval=0.05",), "whole number of steps"),
     (SEA, ("models.ridge.lag=true",), "set force to 'commanded'"),
@@ -25,7 +25,7 @@ REFUSED: tuple[tuple[str, tuple[str, ...], str], ...] = (
     (SEA, ("models.ridge.terms=[u_dott]",), "u_dott"),
     (SEA, ("models.zero={fit: {kind: ols}}",), "cannot name a model"),
     (SEA, ("believed=nomoto_mariner",), "a believed hull needs"),
-    (SEA, ("models.ols.fit.order=3",), "belongs to kind plsr"),
+    (SEA, ("models.ols.fit.order=3",), "an option of kind plsr"),
     (SEA, ("validation.gap=0",), "at least one step"),
     (SEA, ("prepare.hold=mean",), "leave it out"),
     (GRID, ("rows.key=head.evolution.populaton",), "did you mean 'population'"),

@@ -211,7 +211,7 @@ def test_a_model_that_is_not_determined_is_set_aside_and_said(tmp_path: Path) ->
     settings = config(tmp_path, ridge=RIDGE, earth={**RIDGE, "earth": True})
     _, results = studied(settings)
     assert list(results["models"]) == ["ridge"]
-    said = "model earth: a force constant in earth axes does not show"
+    said = "model earth: a constant force in earth axes is not identifiable"
     assert results["failed"]["earth"].startswith(said)
     titles = [section.title for section in settings.build_sections(results, tmp_path / "run")]
     assert "Not determined by these logs" in titles

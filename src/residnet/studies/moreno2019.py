@@ -1,8 +1,8 @@
-"""Document 001 (Moreno-Salinas et al. 2019): what its study adds to the report of a fit.
+"""Document 001 (Moreno-Salinas et al. 2019): additional section in the report of a fit.
 
 The document prints root mean square errors of u, v, r in free runs over whole records on training,
-validation and test data (Tables 2 and 3). Here they have intervals by moving blocks, and outputs
-tuned together and each for itself are compared on the same records.
+validation and test data (Tables 2 and 3). Here they have moving-block
+intervals, and joint and separate tuning of the outputs are compared on the same records.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from residnet.studies.study import plot_time_series
 
 _PROTOCOL = "record"
 _OPTIONAL_MODEL = "gptips"
-"""The model that a run without the extra gp lacks."""
+"""Model that requires the extra gp."""
 _SPLITS = ("train", "validation", "test")
 _COMPARED_PAIRS = {"rbf_joint": "rbf_each", "p1_joint": "p1_each", "p2_joint": "p2_each"}
 _MODEL_LABELS = {
     "baseline": "Blanke",
-    "rbf_joint": "RBF, together",
-    "rbf_each": "RBF, each for itself",
-    "p1_joint": "polynomial p = 1, together",
-    "p1_each": "polynomial p = 1, each for itself",
-    "p2_joint": "polynomial p = 2, together",
-    "p2_each": "polynomial p = 2, each for itself",
+    "rbf_joint": "RBF, joint tuning",
+    "rbf_each": "RBF, separate tuning",
+    "p1_joint": "polynomial p = 1, joint tuning",
+    "p1_each": "polynomial p = 1, separate tuning",
+    "p2_joint": "polynomial p = 2, joint tuning",
+    "p2_each": "polynomial p = 2, separate tuning",
     "symbolic": "symbolic regression, sparse",
     _OPTIONAL_MODEL: "symbolic regression, GPTIPS settings",
-    "constant_velocity": "velocities held",
+    "constant_velocity": "constant velocity",
 }
 _PLOTTED_MODELS = {"baseline": ORANGE, "rbf_joint": BLUE, "p2_joint": VERMILLION}
 _AXES = {"u": ("u m/s", 1.0, 4), "v": ("v m/s", 1.0, 4), "r": ("r deg/s", DEGREES_PER_RADIAN, 3)}
@@ -61,7 +61,7 @@ def sections(files: RunFiles) -> list[Section]:
     """Write study.json, draw Figures 5, 6 and 8 and return the study's section of the report.
 
     Raises:
-        UsageError: where the run lacks the free runs over whole records.
+        UsageError: if the run lacks free runs over whole records.
     """
     names = [model for model in _MODEL_LABELS if model in files.model_kinds]
     records = {
@@ -115,9 +115,8 @@ def sections(files: RunFiles) -> list[Section]:
             ("split", "split"),
             *(_velocity_column(f"{name} %", i, 100.0, 0) for i, name in enumerate(_AXES)),
         ],
-        caption="Change of the mean square error from outputs tuned each for itself to outputs"
-        " tuned together, paired sample by sample, with 95 % intervals. Negative: together is"
-        " better.",
+        caption="Change of the mean square error from separate to joint tuning of the outputs,"
+        " paired by sample, with 95 % intervals. Negative values: joint tuning is better.",
     )
     folder = files.path / "figures" / "moreno2019"
     figures = [_record_figure(records["test"]), *grid_figures(files.fit_notes("rbf_joint"))]
@@ -127,8 +126,8 @@ def sections(files: RunFiles) -> list[Section]:
         *(write_figure(folder, figure) for figure in figures),
         Text(
             [
-                "The equations that the document prints, in their likeliest reading; Delta is the"
-                " voltage of its motor, so that they cannot be evaluated on another ship:",
+                "The equations of the document, in their most likely reading. Delta is the voltage"
+                " of its motor, so that they cannot be evaluated on another ship:",
                 *published_values["equations"],
             ]
         ),
@@ -191,8 +190,8 @@ def _difference_row(
 ) -> dict[str, Any]:
     """Return the relative difference of the mean square errors of two models, with its interval.
 
-    Both are taken over the same samples; the difference is a share of the other model's error, and
-    negative where the first model is better.
+    Both are taken over the same samples. The difference is relative to the error of the reference;
+    it is negative if the first model is better.
     """
     row: dict[str, Any] = {"model": model, "to": reference_model, "split": split}
     for axis, name in enumerate(_AXES):
@@ -236,8 +235,8 @@ GridErrors = dict[tuple[float, float], float]
 def grid_errors(notes: Mapping[str, Any]) -> tuple[GridErrors, GridErrors]:
     """Return the validation and the one-step error by penalty and width of the radial kernel.
 
-    Pairs count that all outputs share. One-step errors are cross-validated, each axis over its
-    least.
+    Only grid points with equal values for all outputs are used. One-step errors are
+    cross-validated and relative to the smallest one of each axis.
     """
     validation_errors: GridErrors = {}
     for entry in notes.get("free_run_choice") or []:
@@ -261,7 +260,7 @@ def grid_errors(notes: Mapping[str, Any]) -> tuple[GridErrors, GridErrors]:
 
 
 def grid_figures(notes: Mapping[str, Any]) -> list[Figure]:
-    """Return Figures 5 and 6, the errors over penalty and width; none where they are not kept."""
+    """Return Figures 5 and 6, the errors over penalty and width; empty if the notes lack them."""
     error_grids = grid_errors(notes)
     if not error_grids[0]:
         return []
@@ -306,9 +305,9 @@ def grid_figures(notes: Mapping[str, Any]) -> list[Figure]:
                 str(5 + parameter_index),
                 f"Figure {5 + parameter_index} of document 001: error over {parameter_text}",
                 "Left: free runs over the validation record, mean of the normalised errors of u, v,"
-                " r. Right: cross-validated one-step error on the training records, each axis over"
-                " its least, mean of the axes. All three outputs have the same penalty and width"
-                " here.",
+                " r. Right: cross-validated one-step error on the training records, relative to"
+                " the smallest one of each axis, mean of the axes. All three outputs have"
+                " the same penalty and width here.",
                 styles,
                 panels,
                 [Case("", panels_shown)],

@@ -19,7 +19,7 @@ from residnet.runs.folder import RunFolder
 from residnet.runs.task import ExportWriters, SummaryMetric, Task, TaskOutcome
 
 StudyResults = Mapping[str, Any]
-"""What a study found, as its file in the run folder holds it."""
+"""Results of a study, as in its file in the run folder."""
 
 
 class StudyTask(Task):
@@ -29,15 +29,15 @@ class StudyTask(Task):
 
     @abstractmethod
     def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
-        """Carry the study out; return its results in terms of JSON, and its pictures.
+        """Run the study; return its results as JSON values, and its figures.
 
         Raises:
-            ResidnetError: where the input does not allow it.
+            ResidnetError: if the input is unsuitable.
         """
 
     @abstractmethod
     def summarize(self, results: StudyResults) -> list[str]:
-        """Return the sentences that sum the results up."""
+        """Return sentences that summarise the results."""
 
     @abstractmethod
     def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
@@ -48,7 +48,7 @@ class StudyTask(Task):
         """Return the sections of the report, with published figures next to the computed ones."""
 
     def exports(self, folder: RunFolder) -> ExportWriters:
-        """Return what writes each export of the study, by its name: none."""
+        """Return the functions that write the exports of the study by name; empty by default."""
         return {}
 
     @final
@@ -57,7 +57,7 @@ class StudyTask(Task):
         folder.write_json(folder.path / self.results_file, results)
         for figure in figures:
             write_figure(folder.figures, figure)
-        # as a reader of the file sees them
+        # read back, so that summary and report use identical values
         stored_results = read_json(folder.path / self.results_file)
         return TaskOutcome(
             self.summarize(stored_results),
@@ -79,7 +79,7 @@ def published_cell(value: float | None, published: float | None, digits: int = 4
         value: computed number; None if unavailable.
         published: published number; None if the document has none.
     """
-    # the document's number keeps the digits that it is printed with
+    # not `format_number`: the published number keeps the digits of the document
     note = "" if published is None else f"published {format_minus_signs(f'{published:.{digits}g}')}"
     return Cell(format_number(value, digits), note)
 
@@ -121,7 +121,7 @@ def join_numbers(values: Sequence[float], digits: int = 3) -> str:
 
 
 def format_notes(notes: Mapping[str, Any]) -> str:
-    """Return what an estimator chose in one line, such as "penalty 0.1; order 3/3/1"."""
+    """Return the choices of an estimator in one line, for example "penalty 0.1; order 3/3/1"."""
 
     def format_value(value: Any) -> str:
         if isinstance(value, dict):
@@ -136,7 +136,7 @@ def format_notes(notes: Mapping[str, Any]) -> str:
 def find_figures(run: Path, *prefixes: str) -> list[Figure]:
     """Return the figures of a run by prefixes of their names.
 
-    The order is that of the prefixes, then alphabetical.
+    Figures are sorted by prefix, then by name.
     """
     stored = read_figures(run / "figures")
     return [figure for prefix in prefixes for figure in stored if figure.name.startswith(prefix)]
@@ -154,14 +154,18 @@ def plot_time_series(
     x_label: str = "time [s]",
     shared_traces: Mapping[str, Curve] | None = None,
 ) -> Figure:
-    """Return a figure of one panel beneath the other, each with one column of all paths over time.
+    """Return a figure with one panel per column, below each other, with all paths over time.
 
     Args:
-        styles: of the paths and of what all panels share, by name.
+        name: name of the figure.
+        title_and_caption: its title and caption.
+        styles: styles of the paths and shared traces by name.
         t: time [T].
         paths: columns [T, n] by name.
         units: label of each column with its unit, and the factor to that unit.
-        shared_traces: curves of all panels by name.
+        height: height of a panel in pixels.
+        x_label: label of the time axis.
+        shared_traces: curves by name that are drawn in all panels.
     """
     panel_traces = [
         dict(shared_traces or {}) | {key: (t, factor * path[:, i]) for key, path in paths.items()}

@@ -1,4 +1,4 @@
-"""Document 003 (Woo et al. 2018): what configs/studies/woo2018/woo2018.yaml adds to a fit's report.
+"""Document 003 (Woo et al. 2018): section in the report of configs/studies/woo2018/woo2018.yaml.
 
 The document shows the steady states of constant manoeuvres (Figure 9) and single runs: simplified
 steering models in a zigzag (13), surge in an acceleration-deceleration test (14), sway and yaw rate
@@ -60,11 +60,11 @@ _CHANNELS = {
     "v": (1, "sway velocity v", "m/s", 1.0),
     "r": (2, "yaw rate r", "deg/s", DEGREES_PER_RADIAN),
 }
-"""Column, name, shown unit and factor to it from SI of each velocity."""
+"""Column, name, displayed unit and factor from SI of each velocity."""
 _MANOEUVRE_GROUPS = {"u": "speed", "v": "steering", "r": "steering"}
-"""Group of manoeuvres that each velocity is judged on, as in Figures 16 and 17."""
+"""Group of manoeuvres for the errors of each velocity, as in Figures 16 and 17."""
 _DRIVING_FORCES = {"u": ("tau_x", "N"), "v": ("tau_n", "N m"), "r": ("tau_n", "N m")}
-"""What drives each steady state (32)."""
+"""Force of each steady state (32), with its unit."""
 _CAPTION = "Unseen manoeuvres unless it says otherwise; simulated WAM-V with sensor noise."
 _RATIO_CAPTION = (
     "Left: root mean square errors with 95 % intervals over manoeuvres. Right: each unseen run's"
@@ -76,18 +76,18 @@ def sections(files: RunFiles) -> list[Section]:
     """Write study.json, draw the figures of document 003 and return the section of the report.
 
     Raises:
-        UsageError: where the run lacks a kind of manoeuvre.
+        UsageError: if the run lacks a kind of manoeuvre.
     """
     figures = [
         write_figure(files.path / "figures" / "woo2018", figure) for figure in build_figures(files)
     ]
     explanation = Text(
         "The runs are simulated, with 126 manoeuvres as in the document. Its vessel and its logs"
-        " are not public: its figures are comparable in kind and not in size. Beside the document's"
-        " manoeuvres stand further acceleration tests that no fit sees, so that surge is judged on"
-        " more than two. The plant's own terms are among the candidates of closed-form heads;"
+        " are not public, so that its figures can be compared qualitatively only. Further"
+        " acceleration tests, which no fit uses, are added to the test data, since the document has"
+        " only two. The terms of the plant are among the candidates of closed-form heads;"
         " configs/studies/woo2018/outside_terms.yaml compares networks and closed forms on a plant"
-        " whose terms none of them has."
+        " with other terms."
     )
     changes = {model: error_changes(files, model) for model in _LEARNED_MODELS}
     content = {"schema": "residnet.woo2018/1", "changes": changes}
@@ -115,9 +115,9 @@ def sections(files: RunFiles) -> list[Section]:
 
 
 def error_changes(files: RunFiles, model: str) -> dict[str, float | None]:
-    """Return how a model changes the error of the linear one on unseen manoeuvres, by velocity.
+    """Return the change of the error to the linear model on unseen manoeuvres, by velocity.
 
-    A change is the ratio of root mean square errors less one; None where a row is absent.
+    A change is the ratio of root mean square errors minus one; None if a row is missing.
     """
     changes: dict[str, float | None] = {}
     for channel, group in _MANOEUVRE_GROUPS.items():
@@ -139,8 +139,9 @@ def steady_state_table(files: RunFiles) -> Table:
     published_constraints = load_published("woo2018")["steady"]
     table = Table(
         ["steady state", "Phi", "95 % interval", "bias", "95 % interval", "unit"],
-        caption="Steady states of the constant manoeuvres as x = Phi tau + bias (32), beside those"
-        " of Table 1 as corrected (W12, W13). The vessels differ: sizes alone compare.",
+        caption="Steady states of the constant manoeuvres as x = Phi tau + bias (32), next to those"
+        " of Table 1 with corrections W12 and W13. The vessels differ, so that only orders of"
+        " magnitude can be compared.",
     )
     for state, (_, _, unit, factor) in _CHANNELS.items():
         cells: list[Any] = []
@@ -158,7 +159,7 @@ def build_figures(files: RunFiles) -> list[Figure]:
     """Return Figures 9 and 13 to 18, named by their numbers.
 
     Raises:
-        UsageError: where the run lacks a kind of manoeuvre.
+        UsageError: if the run lacks a kind of manoeuvre.
     """
     test_windows = [
         window for window in files.read_split_windows("test") if window.protocol == PROTOCOL
@@ -321,7 +322,7 @@ def _error_figure(
             positions = np.arange(len(models)) + offset
             values = [factor * row["rmse"][channel] if row else np.nan for row in rows]
             bar_traces[split] = bar_outlines(positions, values, 0.38)
-            # too few manoeuvres have no interval
+            # there is no interval for too few manoeuvres
             for position, row in zip(positions, rows, strict=True):
                 if row and row["rmse_ci95"][channel]:
                     lower, upper = row["rmse_ci95"][channel]

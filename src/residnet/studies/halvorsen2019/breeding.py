@@ -30,13 +30,13 @@ CHANNELS = ("x", "u", "tau_x")
 MASS = 10.0
 DAMPING = 13.0
 STIFFNESS = 5.0
-"""The system m x_ddot + d x_dot + k x = tau (4.1) in kg, kg/s and N/m (section 5.3, (5.13)); that
-of (4.3) is another one: 20 kg, 10 kg/s, 12 N/m (correction H24).
+"""The system m x_ddot + d x_dot + k x = tau (4.1) in kg, kg/s and N/m (section 5.3, (5.13)); the
+system of (4.3) has other values: 20 kg, 10 kg/s, 12 N/m (correction H24).
 """
 TRUE_COEFFICIENTS = {"tau_x": 1.0 / MASS, "u": -DAMPING / MASS, "x": -STIFFNESS / MASS}
 """True coefficients of u_dot (4.2) by term."""
 _MIN_PLOTTED_ERROR = 1e-34
-"""Least error in the picture, in (m/s^2)^2: what rounding leaves is less."""
+"""Smallest plotted error, in (m/s^2)^2, on the logarithmic axis; rounding errors are smaller."""
 _PUBLISHED_RUNS = 10
 """Number of runs of each combination in Tables 5.2 and 5.3."""
 
@@ -50,10 +50,9 @@ class RecordConfig(Config):
         length: length of the record in s.
         step: time between samples in s; the force is held over a step.
         period: period of the square wave in s; 6 pi s in the document.
-        test_period: period in s of the square wave of the record that equations are scored on.
-        delay: how much later than recorded the force acts, in s (section 5.3.4).
-        corrected: how much later the record is told that the force acted, in s: the correction that
-            Listing 5.1 tries.
+        test_period: period in s of the square wave of the test record.
+        delay: delay of the acting force relative to the recorded one, in s (section 5.3.4).
+        corrected: delay that is applied to the recorded force as a correction, in s (Listing 5.1).
     """
 
     length: Seconds = Field(default=50.0, gt=0)
@@ -77,7 +76,7 @@ class RecordConfig(Config):
 
         t = self.step * np.arange(round(self.length / self.step))
         nominal_force = np.where(np.mod(t, period) < period / 2, 1.0, -1.0)
-        # later than recorded, with its first value before
+        # delayed by whole steps; the first value fills the beginning
         force, recorded_force = (
             np.concatenate((np.full(steps, nominal_force[0]), nominal_force))[: len(nominal_force)]
             for steps in (round(seconds / self.step) for seconds in (self.delay, self.corrected))
@@ -87,6 +86,7 @@ class RecordConfig(Config):
             [0.0, 1.0, 0.0],
             [TRUE_COEFFICIENTS["x"], TRUE_COEFFICIENTS["u"], TRUE_COEFFICIENTS["tau_x"]],
         ]
+        # exact discretisation for a force that is constant over a step (zero-order hold)
         transition = expm(continuous_matrix * self.step)[:2]
         state = np.zeros((len(t), 2))
         for i in range(1, len(t)):
@@ -126,7 +126,7 @@ class StudyAxis(Config):
     """One setting of the study and the values that it takes.
 
     Attributes:
-        key: dotted key of the study, such as `head.evolution.population`.
+        key: dotted key of the setting, for example `head.evolution.population`.
         values: values of the setting, in the order of the table.
     """
 
@@ -161,7 +161,7 @@ class BreedingTaskConfig(StudyTask, SearchConfig):
         threshold: mean square error in (m/s^2)^2 on the test record below which an equation counts
             as found (section 5.2.2).
         published: number of runs in which the document finds the equation, one row for each row of
-            the table; combinations with null are left out.
+            the table; combinations with null are skipped.
         published_error: mean square errors that the document prints, in (m/s^2)^2, likewise.
     """
 
@@ -181,9 +181,8 @@ class BreedingTaskConfig(StudyTask, SearchConfig):
             table = getattr(self, name)
             if table is not None and [len(row) for row in table] != [n_columns] * n_rows:
                 raise ValueError(
-                    f"{name}: expected {n_rows} rows of {n_columns} numbers, as rows and columns"
-                    f" have"
-                    " values"
+                    f"{name}: expected {n_rows} rows of {n_columns} numbers, one for each value"
+                    " of rows and columns"
                 )
         for row, column in self.combinations():
             try:
@@ -205,7 +204,7 @@ class BreedingTaskConfig(StudyTask, SearchConfig):
         """Return the settings of one combination.
 
         Raises:
-            ConfigError: where a key of the two settings does not exist, or a value is not allowed.
+            ConfigError: if a key of the two settings does not exist, or a value is not allowed.
         """
         config_parts = {
             name: getattr(self, name).model_dump() for name in SearchConfig.model_fields
@@ -302,9 +301,9 @@ class BreedingTaskConfig(StudyTask, SearchConfig):
             is_secondary=True,
             paragraphs=[
                 f"Each cell shows in how many of {self.repeats} runs the mean square error on the"
-                f" test record is below {self.threshold:g} (m/s^2)^2. In small print stand the"
-                " document's number of ten runs, in how many runs the terms are the true ones, and"
-                " the mean of the mean square errors.",
+                f" test record is below {self.threshold:g} (m/s^2)^2. Small print: the"
+                " number in the document (of ten runs), the number of runs with exactly the true"
+                " terms, and the mean of the mean square errors.",
                 f"Rows: {self.rows.key}. Columns: {self.columns.key}.",
             ],
         )
@@ -371,15 +370,15 @@ def run_search_trial(settings: SearchConfig, seed: int) -> tuple[float, dict[str
     """Search the equation of u_dot once.
 
     Args:
-        settings: of the search.
+        settings: settings of the search.
         seed: seed of the noise and of the search.
 
     Returns:
         Mean square error on the test record without noise in (m/s^2)^2, and coefficients by term.
 
     Raises:
-        FitError: where the data do not determine an equation.
-        UsageError: where DEAP is not installed.
+        FitError: if the data do not determine an equation.
+        UsageError: if DEAP is not installed.
     """
     record = settings.record
     head = settings.head

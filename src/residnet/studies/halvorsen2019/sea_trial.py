@@ -92,7 +92,7 @@ STANDARD = "standard"
 SEPARATE = "separate"
 PLANT = "plant"
 SAMPLE_SETS = (*SPEED_REGIMES, ALL)
-"""Sets of samples that a model is fitted to and judged on."""
+"""Sets of samples for fits and evaluations."""
 Published = dict[str, tuple[float, float, float, float, float, float]]
 """Numbers of the document by acceleration."""
 SET_NAMES = {
@@ -102,19 +102,19 @@ SET_NAMES = {
     ALL: "all phases",
 }
 _LEAST_SAMPLES = 500
-"""Number of samples below which a phase is neither fitted nor judged."""
+"""Smallest number of samples of a phase for a fit and an evaluation."""
 _STANDARD_PARAMETERS = (4.0, 8.0, 8.0)
 """Number of parameters of the standard model in surge, sway and yaw."""
 _EXCERPT_SECONDS = 60.0
-"""Length in s of the stretch of accelerations that is shown."""
+"""Length in s of the plotted part of the accelerations."""
 _PLOTTED_CUTOFFS = (0.025, 0.05, 0.1, 0.2)
-"""Cut-offs of the filter that are drawn side by side."""
+"""Cut-off frequencies of the plotted filters."""
 _ACCELERATION_ROWS = (("u' [m/s²]", 1.0), ("v' [m/s²]", 1.0), ("r' [deg/s²]", DEGREES_PER_RADIAN))
 _UNITS = dict(zip(ACCELERATION_NAMES, ("m/s^2", "m/s^2", "rad/s^2"), strict=True))
 _SIMULATION_STEP = 0.04
 """Time step of the simulation in s, finer than the grid; its motion is sampled unevenly."""
 _SAME_COST = 1e-6
-"""Costs that differ by a smaller share count as the same minimum."""
+"""Relative difference below which two costs belong to the same minimum."""
 
 
 class ProgrammeConfig(Config):
@@ -127,8 +127,8 @@ class ProgrammeConfig(Config):
         heading: heading change in rad at which a zigzag is reversed.
         zigzag: duration of a zigzag in s.
         hold: time in s for which a speed of the straight run is held.
-        courses: courses in rad on which the programme is sailed; two opposite ones cancel a steady
-            drift, as in the document.
+        courses: courses in rad of the programme; two opposite ones cancel a constant drift, as in
+            the document.
     """
 
     drives: tuple[float, ...] = Field(default=(0.35, 0.45, 0.55, 0.7, 0.85, 1.0), min_length=2)
@@ -139,7 +139,7 @@ class ProgrammeConfig(Config):
     courses: tuple[Radians, ...] = Field(default=(0.0, float(np.pi)), min_length=1)
 
     def build_manoeuvres(self) -> list[Manoeuvre]:
-        """Return the manoeuvres of one course in the order in which they are sailed."""
+        """Return the manoeuvres of one course in their order in time."""
         levels = (*self.drives, *reversed(self.drives[:-1]))
         times = tuple(self.hold * i for i in range(len(levels)))
         straight_run = AccelerationDeceleration(
@@ -161,7 +161,7 @@ class ProgrammeConfig(Config):
 
 
 class PreparationConfig(Config):
-    """How a log with uneven time steps becomes velocities and accelerations (section 7.3.1).
+    """Preparation of velocities and accelerations from a log with uneven steps (section 7.3.1).
 
     Attributes:
         interval: shortest and longest time between two samples of the log, in s.
@@ -169,12 +169,12 @@ class PreparationConfig(Config):
         cutoff: cut-off frequency of the Butterworth filter as a share of the Nyquist frequency
             (correction H27).
         order: order of the filter, which is run forward and backward.
-        filter_inputs: filter commands and forces as the velocities. The document filters the
-            velocities alone; its equations then learn the filter, too, and leave less of the
-            measured acceleration than the vessel's own equations.
-        margin: time in s that is cut off at both ends of a log, where the filter has one side only.
-        stretch: length in s of the stretches that train or validate as a whole.
-        validate_every: number of stretches of which the last one validates.
+        filter_inputs: whether commands and forces are filtered like the velocities. The document
+            filters only the velocities; equations then also learn the filter and have smaller
+            errors than the true equations of the vessel.
+        margin: time in s that is removed at both ends of a log, where the filter is one-sided.
+        stretch: length in s of the segments that are used as a whole for training or validation.
+        validate_every: the last of so many segments is for validation.
     """
 
     interval: tuple[Seconds, Seconds] = (0.03, 0.08)
@@ -201,10 +201,10 @@ class SeaTrialConfig(Config):
 
     Attributes:
         vessel: vessel of kind `load_odin` with water jets, by name or file.
-        programme: manoeuvres that are sailed.
+        programme: manoeuvres of the trial.
         disturbance: waves and other forces.
         noise: noise of the measured velocities.
-        preparation: how the logs become samples.
+        preparation: preparation of the samples from the logs.
         seed: seed of the sea, the noise and the times of the samples.
     """
 
@@ -226,10 +226,10 @@ class SeaTrialConfig(Config):
 
 
 def load_odin(name: str) -> AccelerationHullConfig:
-    """Return a vessel whose accelerations are known as terms and which has water jets.
+    """Return a vessel with accelerations as sums of terms and with water jets.
 
     Raises:
-        ConfigError: where the vessel is of another kind.
+        ConfigError: if the vessel is of another kind.
     """
     vessel = load_vessel(name)
     if (
@@ -237,19 +237,19 @@ def load_odin(name: str) -> AccelerationHullConfig:
         or vessel.build().actuators.command_names != CONTROLS
     ):
         raise ConfigError(
-            f"vessel '{name}': the sea trial needs a vessel of kind 'odin' with water jets, such as"
-            " odin_jets"
+            f"vessel '{name}': the sea trial needs a vessel of kind 'odin' with water jets, for"
+            " example odin_jets"
         )
     return vessel
 
 
 class EquationConfig(Config):
-    """An equation of the accelerations that is found from the data alone.
+    """An equation of the accelerations that is identified from data only.
 
     Attributes:
         inputs: inputs of the equation: `forces` of the water jets by their known thrust, or
             `controls`, which are motor speed and nozzle angle.
-        head: how the equation is found.
+        head: settings of the identification.
     """
 
     inputs: Literal["forces", "controls"]
@@ -265,7 +265,7 @@ class EquationConfig(Config):
         """Build the head for the channels of a trial.
 
         Raises:
-            ConfigError: where its terms name a channel that is not among its inputs.
+            ConfigError: if its terms use a channel that is not among its inputs.
         """
         features = (*VELOCITY_NAMES, *(FORCES if self.inputs == "forces" else CONTROLS))
         return self.head.model_copy(update={"features": features}).build(CHANNELS)

@@ -21,13 +21,13 @@ from residnet.regression.equation_rows import effective_correlation_length
 from residnet.studies import load_published
 
 _RANK_TOLERANCE = 1e-6
-"""Singular values below this share of the largest mark directions that the data leave open."""
+"""Singular values below this share of the largest belong to undetermined directions."""
 _MIN_DETERMINANT = 1e-3
-"""Least determinant of the sway and yaw inertia, as a share of the product of typical inertias."""
+"""Smallest determinant of the sway and yaw inertia, relative to the product of typical values."""
 _MAX_OPEN_COMPONENT = 0.1
-"""A parameter with a larger component in an open direction counts as undetermined."""
+"""A parameter with a larger component in an undetermined direction counts as undetermined."""
 _MAX_OPEN_COMBINATION = 1e-3
-"""A combination with a larger share in the open directions has no finite standard error."""
+"""A combination with a larger share in undetermined directions has no standard error."""
 
 
 _MASS = 5e3
@@ -82,7 +82,7 @@ class StandardFitConfig(Config):
         starts: number of starting points: the document's original values, and random ones around
             them within the bounds.
         seed: seed of the random starting points.
-        thin: every how many samples one is fitted.
+        thin: stride of the samples that are used in the fit.
     """
 
     mass: float = Field(default=4935.14, gt=0)
@@ -98,7 +98,7 @@ class StandardFitConfig(Config):
         return self
 
     def starting_points(self) -> list[np.ndarray]:
-        """Return the values [14] that the searches start from, inside the bounds."""
+        """Return the starting points [14] of the searches, inside the bounds."""
         generator = np.random.default_rng([self.seed, 14])
         start = np.array(
             [load_published("halvorsen2019")["start"][name] for name in STANDARD_PARAMETER_NAMES]
@@ -134,6 +134,7 @@ def standard_accelerations(
     n = tau[:, 2] - sway_momentum * u + surge_momentum * v + n_v * v + (n_r + n_rr * np.abs(r)) * r
     sway_inertia = mass - y_vdot
     yaw_inertia = i_z - n_rdot
+    # a lower limit keeps the search finite when it passes a singular mass matrix
     determinant = max(
         sway_inertia * yaw_inertia - y_rdot * n_vdot, _MIN_DETERMINANT * mass * _INERTIA
     )
@@ -202,10 +203,11 @@ def fit_standard_model(
     ]
     best_solution = min(solutions, key=lambda answer: float(answer.cost))
     if not np.isfinite(best_solution.cost):
-        raise FitError("the standard model's fit does not stay finite")
+        raise FitError("the fit of the standard model has no finite error")
     values = best_solution.x * SCALE
     is_at_bound = np.minimum(values - LOWER, UPPER - values) <= 1e-6 * SCALE
-    # a bound fixes what the data leave open: what the data determine is judged without bounds
+    # identifiability is assessed without the bounds, since an active bound fixes a parameter that
+    # the data do not determine
     jacobian = np.asarray(best_solution.jac)
     errors = best_solution.fun.reshape(-1, 3)
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
@@ -221,7 +223,7 @@ def fit_standard_model(
     covariance[np.ix_(~is_at_bound, ~is_at_bound)] = bread @ meat @ bread
 
     def sum_standard_error(factors: Mapping[str, float]) -> float | None:
-        """Return the standard error of a sum of parameters; None where the data leave it open."""
+        """Return the standard error of a sum of parameters; None if undetermined."""
         combination = (
             np.array([factors.get(name, 0.0) for name in STANDARD_PARAMETER_NAMES]) * SCALE
         )
@@ -255,7 +257,7 @@ def fit_standard_model(
 def true_parameters(vessel: AccelerationHullConfig, mass: float) -> dict[str, float]:
     """Return the true parameters of a vessel whose accelerations are known as terms.
 
-    Terms that the standard model does not have are left out. The result is exact for a vessel
+    Terms that are not in the standard model are ignored. The result is exact for a vessel
     without added mass and with the Coriolis terms v r and -u r, as in document 000.
     """
     gain = [1.0 / parameter.value for parameter in (vessel.gains.x, vessel.gains.y, vessel.gains.n)]

@@ -75,10 +75,11 @@ from residnet.studies.study import (
 _MAX_RESIDUAL_GROWTH = 4.0
 _MIN_VARIANCE_SHARE = 0.02
 _MIN_SEGMENT_SHARE = 0.5
-"""Criteria of an invalid model on one axis; chosen by hand.
+"""Criteria for an invalid model on one axis.
 
-Largest growth of the mean square residual, in the whole log and in a share of its segments (one
-gust or wake is no evidence), and smallest share of the force's variance.
+Growth of the mean square residual, smallest share of the variance of the force, and share of
+segments in which both are exceeded. The share of segments excludes a single event such as a gust or
+a wake.
 """
 
 
@@ -120,17 +121,19 @@ def _verdict_text(comparison: StudyResults) -> str:
         for values in (comparison["growth"], [100 * value for value in comparison["share"]])
     )
     sentence = (
-        "still fits" if comparison["fits"] else "no longer fits: identify it again from this log"
+        "is still valid"
+        if comparison["fits"]
+        else "is no longer valid: identify it again from this log"
     )
     return (
-        f"{sentence} (residual {growth} times what it was, {share} % of the force's variance;"
+        f"{sentence} (residual {growth} times the previous one, {share} % of the force's variance;"
         " surge/sway/yaw)"
     )
 
 
 _BELIEVED_NAME = "believed"
 _DIVERGENCE_FACTOR = 3.0
-"""Velocities of a free run in largest velocities of the true ferry from which it has diverged."""
+"""A free run has diverged above this multiple of the largest velocities of the true ferry."""
 
 
 class PublishedFigures(Config):
@@ -187,16 +190,16 @@ _FREE_RUN_TRIALS: Mapping[str, Any] = {
 
 
 class FerryModelConfig(ResidualModelConfig):
-    """One model of the ferry's residual force; with `lag`, its feed-forward is led by the lag.
+    """One model of the residual force; with `lag`, its feed-forward compensates the thruster lag.
 
     Attributes:
         smooth: estimate the motion from all noisy measurements together before the fit
-            (`residnet.preprocessing.motion`). Null does so where the noise is known and the model
+            (`residnet.preprocessing.motion`). Null for yes if the noise is known and the model
             searches its settings.
         on: name of the model whose remaining residual this one explains (3.26); empty for the
             believed hull.
-        fly: fly the course, and the crossing where there is one, with this model as feed-forward.
-        published: figures that the document prints for this model.
+        fly: simulate the course, and the crossing if there is one, with this feed-forward.
+        published: published figures of this model.
     """
 
     smooth: bool | None = None
@@ -211,18 +214,19 @@ class FerryStudyConfig(StudyTask, ComputingTask):
 
     Attributes:
         task: `ferry_study`.
-        believed: vessel whose hull the controller believes in, by name or file.
-        true: vessel that is simulated, by name or file.
-        course: waypoints and reference filter; its first half identifies, the second tests.
+        believed: vessel with the hull model of the controller, by name or file.
+        true: simulated vessel, by name or file.
+        course: waypoints and reference filter; the first half is for identification, the second
+            for tests.
         loop: controller and sampling.
-        crossing: an operational crossing that is flown too; null for none.
-        noise: noise on what is measured; null for none.
-        disturbance: force that is constant in earth axes.
-        feed_forward_alone: fly the course without feedback too (Table 4.8).
-        models: residual models by name; a model stands after the one that it builds on.
-        published: figures that the document prints for the believed model.
-        later: vessel that the true one has become later, by name or file; the models that fly are
-            judged on its log and identified again where they no longer fit. Null for none.
+        crossing: an operational crossing that is also simulated; null for none.
+        noise: measurement noise; null for none.
+        disturbance: constant force in earth axes.
+        feed_forward_alone: whether the course is also simulated without feedback (Table 4.8).
+        models: residual models by name; a model must follow the one given by `on`.
+        published: published figures of the believed model.
+        later: the true vessel after a change, by name or file; feed-forward models are checked on
+            its log and identified again if they are no longer valid. Null for none.
         seed: seed of the noise.
     """
 
@@ -249,10 +253,12 @@ class FerryStudyConfig(StudyTask, ComputingTask):
         previous_names: list[str] = []
         for name, model in self.models.items():
             if name == _BELIEVED_NAME:
-                raise ValueError("'believed' cannot name a model: it is the controller's own")
+                raise ValueError(
+                    "'believed' is reserved for the model of the controller; use another name"
+                )
             if model.on and model.on not in previous_names:
                 raise ValueError(
-                    f"models.{name}.on: no model before it is named"
+                    f"models.{name}.on: no preceding model is named"
                     f" '{model.on}'{suggest_name(model.on, previous_names)}"
                 )
             base_model = self.models.get(model.on)
@@ -260,14 +266,14 @@ class FerryStudyConfig(StudyTask, ComputingTask):
                 base_model.searches_settings or bool(base_model.lag) != bool(model.lag)
             ):
                 raise ValueError(
-                    f"models.{name}.on: '{model.on}' and it must both be with lag or without; say"
-                    " which of both by 'lag'"
+                    f"models.{name}.on: '{model.on}' and it must both have a lag or none; set 'lag'"
+                    " of both"
                 )
             previous_names.append(name)
         if len(self.course.waypoints) < 4:
             raise ValueError(
-                "course: at least four waypoints; half of them identify, segment by segment, and"
-                " half test"
+                "course: at least four waypoints, since half of the segments are for"
+                " identification and half for tests"
             )
         try:
             for plant_name in (self.true, self.later or self.true):
@@ -281,7 +287,7 @@ class FerryStudyConfig(StudyTask, ComputingTask):
         return self.seed
 
     def build_loop(self, true: str) -> FerrySimulation:
-        """Return the loop with one vessel as the true one."""
+        """Return the closed loop with the given true vessel."""
         return FerrySimulation(
             true, self.believed, self.loop, self.noise, self.disturbance, self.seed
         )
@@ -295,7 +301,7 @@ class FerryStudyConfig(StudyTask, ComputingTask):
         }
 
     def export_model(self, request: ExportRequest) -> Path:
-        """Write the feed-forward of a model; `selected` leaves the least of the residual force."""
+        """Write the feed-forward of a model; `selected` is the model with the smallest residual."""
         run = request.run
         results = read_json(request.run.path / self.results_file)
         name = find_best_model(results) if request.model == "selected" else request.model
@@ -332,9 +338,9 @@ class FerryStudyConfig(StudyTask, ComputingTask):
             if position_errors:
                 closest_model = min(position_errors, key=position_errors.__getitem__)
                 change_text = (
-                    "falls"
+                    "decreases"
                     if position_errors[closest_model] < believed_error
-                    else "does NOT fall: it goes"
+                    else "does NOT decrease: it changes"
                 )
                 sentences.append(
                     f"With {closest_model} as feed-forward, the mean position error in the"
@@ -343,7 +349,7 @@ class FerryStudyConfig(StudyTask, ComputingTask):
                     f" {format_number(position_errors[closest_model])} m."
                 )
         return sentences + [
-            f"On the vessel as it is later, {name} {update['text']}."
+            f"On the changed vessel, {name} {update['text']}."
             for name, update in results["later"].items()
         ]
 
@@ -382,7 +388,7 @@ class FerryStudyConfig(StudyTask, ComputingTask):
                 )
         if results["later"]:
             sections_written.append(
-                Section("The vessel as it is later", [_update_table(results["later"])])
+                Section("The changed vessel", [_update_table(results["later"])])
             )
         sections_written.append(Section("Forward in time", [_free_run_table(results["forward"])]))
         # Table 4.11
@@ -404,13 +410,13 @@ def identify_model(
     """Fit one model on the training samples.
 
     Raises:
-        FitError: where the data do not determine the model.
+        FitError: if the data do not determine the model.
     """
     return fit_model(config, smooth_for_fit(config, record), base)
 
 
 def smooth_for_fit(config: FerryModelConfig, record: ForceRecord) -> ForceRecord:
-    """Return the record as a model is identified from it."""
+    """Return the record for the identification of a model, smoothed if its config says so."""
     should_smooth = config.searches_settings if config.smooth is None else config.smooth
     return record.smooth() if should_smooth and any(record.noise) else record
 
@@ -464,10 +470,10 @@ def build_record(run: FerryRun, interval: float, noise: MotionNoise | None) -> F
 
 
 def run_ferry_study(config: FerryStudyConfig) -> FerryStudy:
-    """Fly with the believed model, identify residual models, and fly with these.
+    """Simulate with the believed model, identify residual models, and simulate with these.
 
     Raises:
-        ResidnetError: where a model cannot be identified or flown.
+        ResidnetError: if a model cannot be identified or simulated.
     """
     ferry = config.build_loop(config.true)
     believed = ForceModel(ferry.believed_hull)
@@ -482,7 +488,8 @@ def run_ferry_study(config: FerryStudyConfig) -> FerryStudy:
             model, record, models[model.on].force if model.on else believed
         )
     whole_record = replace(record, is_training=torch.ones_like(record.is_training))
-    # what a half chose and the other judged leaves with the coefficients of both
+    # exported models keep the hyperparameters selected on one half and tested on the other; their
+    # coefficients are fitted to the whole course
     whole_course_models = {
         name: refit_with_settings(
             model, models[name], smooth_for_fit(model, whole_record), believed
@@ -569,7 +576,7 @@ def forward_runs(
     """
     trials = SimulatedTrials(vessel=config.true, **_FREE_RUN_TRIALS)
     logs = [flight.true_log for flight in simulate_trials(trials.draw_manoeuvres(), trials)]
-    # one that ended early shows no free run
+    # logs that ended early have another length and cannot be part of the batch
     logs = [log for log in logs if len(log) == max(map(len, logs))]
     thrusters = load_force_vessel(config.true)[1]
     x, commands = (
@@ -622,8 +629,8 @@ def write_results(
         if forward[name]["diverged"]:
             refusals[name] = (
                 f"model {name}: it diverges in {forward[name]['diverged']} of"
-                f" {forward[name]['runs']} free runs beside the true ferry, so its equations are"
-                " not written; take a model with fewer terms or with lag"
+                f" {forward[name]['runs']} free runs in which the true ferry is bounded, so"
+                " that its equations are not written; use a model with fewer terms or with lag"
             )
         else:
             text = to_baseline_yaml(model_equations, f"run {config.name}, model {name}")
@@ -762,7 +769,7 @@ def list_feed_forward_objections(name: str, results: StudyResults) -> list[str]:
 
 
 def find_best_model(results: StudyResults) -> str:
-    """Return the model that leaves the least of the residual."""
+    """Return the model with the smallest remaining residual."""
     models: StudyResults = results["models"]
     return min(models, key=lambda name: float(sum(models[name]["share_left"])))
 
@@ -813,7 +820,7 @@ def _residual_table(config: FerryStudyConfig, results: StudyResults) -> Table:
 def _tracking_tables(
     config: FerryStudyConfig, runs: Mapping[str, StudyResults], run_kind: str
 ) -> list[Block]:
-    """Return how well a course is followed and with which forces.
+    """Return tables of tracking errors and forces on a course.
 
     Tables 4.4, 4.8, 4.10, 4.12 and 4.13 of the document; Tables 4.3 and 4.9.
     """
@@ -881,7 +888,8 @@ def _free_run_table(rows: Mapping[str, StudyResults]) -> Table:
             ("diverged", lambda row: Cell(f"{row['diverged']} of {row['runs']}")),
         ],
         caption="Root mean square errors of free runs from the commanded forces, over the runs that"
-        " did not diverge. A model that explains the force may still be no model of motion.",
+        " did not diverge. A model that explains the force does not necessarily predict the"
+        " motion.",
     )
 
 
@@ -899,5 +907,5 @@ def _update_table(updates: Mapping[str, StudyResults]) -> Table:
             ("after the update m", "after.position_mae", format_short),
             ("on the new log", "text"),
         ],
-        caption="A model that no longer fits is identified again from the log of one course.",
+        caption="A model that is no longer valid is identified again from the log of one course.",
     )

@@ -1,4 +1,4 @@
-"""A ferry in closed loop: the true plant, a controller that believes in a model, and its log.
+"""A ferry in closed loop: the true plant, a controller with a believed model, and the log.
 
 Source: document 002, chapter 4.
 """
@@ -53,9 +53,9 @@ from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
 _MIN_COMPILED_STEPS = 2500
-"""Steps of a flight that take about as long as compiling it does."""
+"""Number of steps of a simulation from which compilation pays."""
 FeedForwardModel = tuple[ForceModel, ActuatorLag | None]
-"""A model as feed-forward, and the lag of the thrusters that it leads."""
+"""A model as feed-forward, and the thruster lag that it compensates; None for none."""
 
 
 class LoopConfig(Config):
@@ -146,7 +146,7 @@ def measured(x: Tensor, noise: Tensor) -> Tensor:
 
 @final
 class NoisyLoop(Source):
-    """A closed loop that sees noise [B, 6] on pose and velocities, which is behind its inputs."""
+    """A closed loop whose last six inputs are the noise [B, 6] of measured pose and velocities."""
 
     def __init__(self, loop: Source) -> None:
         super().__init__()
@@ -163,7 +163,7 @@ class NoisyLoop(Source):
 
 @dataclass(frozen=True)
 class FerryRun:
-    """One simulated run, sampled as its log is; SI units, forces in N, N, N m.
+    """One simulated run at the sample interval of its log; SI units, forces in N, N, N m.
 
     Attributes:
         t: time [N] in s.
@@ -205,8 +205,8 @@ def load_force_vessel(name: str) -> tuple[HullPlant, ForceActuators]:
         if isinstance(plant.actuators, ForceActuators):
             return plant, plant.actuators
     raise ConfigError(
-        f"vessel '{name}': this study needs a hull whose actuators push in surge, sway and yaw"
-        " alike (kind forces or azimuth_thrusters)"
+        f"vessel '{name}': this study needs a hull with actuators for surge, sway and yaw"
+        " (kind forces or azimuth_thrusters)"
     )
 
 
@@ -215,7 +215,11 @@ class FerrySimulation:
     """Closed loop of plant, believed hull model and controller.
 
     Args:
+        plant_name: true vessel by name or file.
+        believed_name: vessel with the hull model of the controller, by name or file.
+        loop: controller and sampling.
         noise: measurement noise; None for none.
+        disturbance: constant force in earth axes.
         seed: seed of the noise.
 
     Raises:
@@ -239,9 +243,8 @@ class FerrySimulation:
         self.believed_hull = load_force_vessel(believed_name)[0].hull
         if not self.thrusters.state_names:
             raise ConfigError(
-                f"vessel '{plant_name}': its forces follow at once; the study is about thrusters"
-                f" that"
-                " lag, give actuators.response"
+                f"vessel '{plant_name}': its forces have no lag, which this study identifies; set"
+                " actuators.response"
             )
         if disturbance == Disturbance():
             self.plant.without_environment()
@@ -253,14 +256,21 @@ class FerrySimulation:
         *,
         feedback: bool = True,
     ) -> list[FerryRun]:
-        """Fly a course or a crossing with each model as feed-forward, all in one batch.
+        """Simulate a course or a crossing with each model as feed-forward, all in one batch.
+
+        Args:
+            path: the course or crossing.
+            feeds: models with their lags.
+            feedback: whether the feedback acts.
 
         Raises:
-            DataError: where the closed loop is unstable.
+            DataError: if the closed loop is unstable.
         """
         gains = self.loop
         step = self.loop.step
         lags = [lag for _, lag in feeds]
+        # all gains are multiples of the frequencies, so that zero frequencies switch the feedback
+        # off
         if not feedback:
             gains = gains.model_copy(update={"frequency": (0.0, 0.0, 0.0)})
         pid = gains.build_pid(self.believed_hull.mass)
@@ -309,8 +319,8 @@ class FerrySimulation:
             states = states[:, :-1]
             if not bool(torch.isfinite(states).all()):
                 raise DataError(
-                    "the ferry left all bounds in closed loop: with these gains and models the loop"
-                    " is unstable"
+                    "the states of the ferry are not finite: with these gains and models the closed"
+                    " loop is unstable"
                 )
             measured_states = measured(states, noise[..., MOTION])
             if isinstance(path, CrossingConfig):

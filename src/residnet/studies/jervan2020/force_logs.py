@@ -30,20 +30,20 @@ from residnet.studies.jervan2020.residual import AXES, ForceRecord
 
 _ChannelTriple = tuple[str, str, str]
 _MIN_LOGS_FOR_FOLDS = 3
-"""Number of logs from which on whole logs are left out instead of stretches of time."""
+"""Number of logs from which whole logs are folds, instead of segments."""
 _MIN_LOGS_FOR_INTERVALS = 5
-"""Number of logs from which on intervals resample logs instead of segments."""
+"""Number of logs from which the bootstrap resamples logs instead of segments."""
 _MIN_SEGMENTS = 5
-"""Least number of segments for intervals."""
+"""Smallest number of segments for confidence intervals."""
 
 
 class ForceLogsConfig(Config):
-    """Measured logs; `validation` says which part of them tests.
+    """Files of the measured logs; `validation` defines the test data.
 
     Attributes:
         reader: format of the logs and their channel map.
-        root: folder that the patterns start from.
-        logs: file names or patterns such as `nlp*.csv`.
+        root: folder of the patterns.
+        logs: file names or patterns, for example `nlp*.csv`.
     """
 
     reader: ReaderConfig
@@ -51,10 +51,10 @@ class ForceLogsConfig(Config):
     logs: tuple[str, ...] = Field(min_length=1)
 
     def find_paths(self) -> list[Path]:
-        """Return the paths of all logs, each once.
+        """Return the paths of all logs without duplicates.
 
         Raises:
-            ConfigError: where the folder is not there or a pattern matches nothing.
+            ConfigError: if the folder does not exist or a pattern has no match.
         """
         if not self.root.is_dir():
             raise ConfigError(f"data: root {self.root} is not a folder; correct `root`")
@@ -123,16 +123,19 @@ class MeasuredForceLogs:
         """Return the record without a fold for training, and the samples [N] of the fold.
 
         Args:
-            gap: time in s around the fold that is left out of training too.
+            fold_index: index of the test fold.
+            gap: time in s around the fold that is excluded from training, since neighbouring
+                samples are correlated.
 
         Raises:
-            DataError: where either has no samples.
+            DataError: if training or test data are empty.
         """
         inside_fold = self.fold_index == fold_index
         gap_samples = round(gap / self.record.dt)
         fold_flags = inside_fold.to(torch.float64)[None, None].split(
             list(self.record.run_lengths), dim=-1
         )
+        # dilation of the fold by the gap on both sides, within each log
         is_near_fold = torch.cat(
             [
                 torch.nn.functional.max_pool1d(log_flags, 2 * gap_samples + 1, 1, gap_samples)[0, 0]
@@ -143,8 +146,8 @@ class MeasuredForceLogs:
         train = self.usable & ~is_near_fold
         test = self.usable & inside_fold
         for problem, samples in (
-            ("nothing left to fit to beside", train),
-            ("no sample to judge on in", test),
+            ("no training sample remains outside of", train),
+            ("no test sample in", test),
         ):
             if not bool(samples.any()):
                 raise DataError(
@@ -154,9 +157,10 @@ class MeasuredForceLogs:
         return replace(self.record, is_training=train), test
 
     def usable_segments(self) -> list[Tensor]:
-        """Return the indices of the good samples of each segment.
+        """Return the indices of the usable samples of each segment.
 
-        A segment with less than half of the largest number of good samples is left out.
+        Segments with less than half of the largest number of usable samples are omitted, since
+        bootstrap blocks must have similar sizes.
         """
         segments = [
             ((self.record.fold == number) & self.usable).nonzero()[:, 0]
@@ -193,21 +197,21 @@ def read_force_logs(
     """Read, mask, smooth and differentiate all logs.
 
     Raises:
-        ResidnetError: where a log cannot be read or holds no usable samples.
+        ResidnetError: if a log cannot be read or has no usable samples.
     """
     import pandas as pd
 
     reader = data.reader.build()
     paths = assign_log_names(data.find_paths())
     raw_logs = [reader.read(path).replace(name=name) for path, name in paths.items()]
-    # a model would be fitted to the very samples that judge it
+    # a copy of a log in another file would be in training and test data
     check_leaks({log.name: [log] for log in raw_logs})
     columns = (*channels.commanded, *channels.actual, *(channels.acceleration or ()))
     logs = [prepare_log(log, "all", columns, preparation) for log in raw_logs]
     names = [log.log.name for log in logs]
     lengths = [len(log) for log in logs]
     step = preparation.grid.step
-    # whole logs are folds where there are enough; no segment reaches across logs
+    # folds are whole logs if there are enough; segments never extend over two logs
     uses_log_folds = len(logs) >= _MIN_LOGS_FOR_FOLDS
     fold_parts = []
     segments = []
@@ -217,8 +221,8 @@ def read_force_logs(
     for log_index, (log, name, length) in enumerate(zip(logs, names, lengths, strict=True)):
         if not log.trainable.any():
             raise DataError(
-                f"log {name}: no stretch is as long as the derivative's window; leave it out or"
-                " shorten prepare.derivative"
+                f"log {name}: no part without a gap is as long as the window of the derivative;"
+                " remove the log or shorten prepare.derivative"
             )
         sample_index = torch.arange(length)
         n_folds = min(validation.folds, len(logs)) if uses_log_folds else validation.folds

@@ -1,8 +1,8 @@
-"""Residual forces of a known hull: how both studies of document 002 (Jervan 2020) identify them.
+"""Residual forces of a known hull and their identification, for both studies of document 002.
 
-The residual is the force that the hull does not explain: tau - F(nu_dot, nu) (3.19), (3.20). It is
-regressed on basis functions of the motion (chapters 3 and 4); a model runs forward in time by
-(3.22).
+The residual is the force that the hull model does not explain: tau - F(nu_dot, nu) (3.19), (3.20).
+It is regressed on basis functions of the motion (chapters 3 and 4); a model runs forward in time by
+(3.22) (Jervan 2020).
 """
 
 from __future__ import annotations
@@ -64,15 +64,15 @@ from residnet.studies.study import StudyResults, find_figures, format_notes
 AXES = ("surge", "sway", "yaw")
 _FORCE_NAMES = ("surge force", "sway force", "yaw moment")
 _PENALTIES = tuple(10.0**k for k in range(-10, 1))
-"""Ridge penalties tried where none is given, in units of a standardised column's energy."""
+"""Ridge penalties of the search, relative to the squared norm of a standardised column."""
 _RANK_TOLERANCE = 1e-7
-"""Regressors with singular values below this share of the largest count as dependent."""
+"""Singular values of regressors below this share of the largest count as zero."""
 _MIN_EARTH_FORCE_RMS = 0.02
-"""Least root mean square that turning must leave of a unit force fixed in earth axes."""
+"""Smallest root mean square of a unit force in earth axes after the projection (turns needed)."""
 _MIRROR_SIGNS = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-"""Signs of surge, sway and yaw in the mirror."""
+"""Signs of surge, sway and yaw under reflection of port and starboard."""
 _SURFACE_LIMITS = (6.3, 316.0)
-"""Shares in % that the axis of a surface analysis shows; single models lie orders above."""
+"""Limits in % of the axis of a surface analysis; errors of single models are orders above."""
 
 
 @dataclass(frozen=True)
@@ -149,17 +149,17 @@ _ESTIMATORS: Mapping[str, Estimator] = {
 
 @final
 class RegressionConfig(Config):
-    """A way to find the coefficients of a residual force.
+    """Estimator of the coefficients of a residual force.
 
     Attributes:
-        kind: `plsr`, of the three axes together; `surface`, PLSR of each axis by itself, chosen by
+        kind: `plsr`, PLSR of the three axes together; `surface`, PLSR of each axis separately with
             surface analysis (document 002 section 4.5.1); `ols`, ordinary least squares; `ridge`,
-            `lasso` or `elastic_net`, with the penalty of the least error over left-out folds.
-        order: number of latent variables of `plsr`; null takes the least error over left-out folds.
-        choose: how `surface` chooses. `test_errors`, the document's own: the least error on the
-            test half, which then also judges it; `simplest`: cross-validation over the folds of the
-            first half and the one-standard-error rule; `lowest_error`: cross-validation and its
-            bare minimum.
+            `lasso` or `elastic_net` with the penalty of the smallest cross-validation error.
+        order: number of latent variables of `plsr`; null for the smallest cross-validation error.
+        choose: selection rule of `surface`. `test`, as in the document: smallest error on the test
+            half, whose error is then no independent evidence; `simplest`: cross-validation over the
+            folds of the first half with the one-standard-error rule; `least`: minimum of the
+            cross-validation error.
     """
 
     kind: Literal["plsr", "surface", "ols", "ridge", "lasso", "elastic_net"]
@@ -174,13 +174,13 @@ class RegressionConfig(Config):
                 and getattr(self, key) != type(self).model_fields[key].default
             ):
                 raise ValueError(
-                    f"{key}: belongs to kind {required_kind}; leave it out of {self.kind}"
+                    f"{key}: an option of kind {required_kind}; remove it for {self.kind}"
                 )
         return self
 
     @property
     def searches_order(self) -> bool:
-        """Whether it searches its order."""
+        """Whether the order is selected by cross-validation."""
         return self.kind == "plsr" and self.order is None
 
     def fit(self, data: ForceRegressionData) -> RegressionFit:
@@ -206,7 +206,7 @@ class RegressionConfig(Config):
         if self.kind == "ridge":
             notes = {"penalty": notes["penalty"][0]}
         if notes.get("order") == 0:
-            raise FitError("PLSR: nothing in the residual varies with the basis functions")
+            raise FitError("PLSR: the residual does not depend on the basis functions")
         orders = _errors_by_order(data) if self.kind == "plsr" else {}
         return RegressionFit(
             coefficients,
@@ -218,7 +218,7 @@ class RegressionConfig(Config):
 
 
 def _errors_by_order(data: ForceRegressionData) -> dict[str, Tensor]:
-    """Return the mean square errors [A, 3] of a PLSR over its order, on folds left out and test."""
+    """Return the mean square errors [A, 3] of a PLSR by order, in cross-validation and on test."""
     e, f, mean_x, mean_y, std_y = data.standardised
     folds = data.fold.unique()
     nan_errors = torch.full_like(f, torch.nan).repeat(e.shape[1], 1, 1)
@@ -247,7 +247,7 @@ def _error_by_order(e: Tensor, f: Tensor, x: Tensor, y: Tensor) -> Tensor:
     orders = e.shape[1]
     path = pls_path(centred.T @ centred, centred.T @ (f - mean_f), orders)
     if len(path) < orders:
-        # what is left explains nothing: higher orders change no more
+        # the path ends when the remaining covariance is zero: higher orders are equal to the last
         last = path[-1:] if len(path) else torch.zeros(1, orders, f.shape[1], dtype=e.dtype)
         path = torch.cat((path, last.expand(orders - len(path), -1, -1)))
     return y - mean_f - (x - mean_e) @ path
@@ -262,6 +262,7 @@ def _fit_by_surface_analysis(data: ForceRegressionData, rule: str) -> Regression
         if data.test is None:
             raise FitError("surface: choose 'test' needs the test half")
         x, y = torch.cat((x, data.test[0])), torch.cat((y, data.test[1]))
+        # fitted on the first half (group 0), errors on the test half (group 1), as in the document
         groups = (torch.arange(len(x)) >= len(data.x)).long()
         estimator = SurfacePLSR("least", test_groups=[1])
     surface = estimator.error_surface(x, y, groups)
@@ -553,10 +554,10 @@ def estimate_earth_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
     Args:
         x: basis functions [N, J].
         y: residual [N, 3] in N, N, N m.
-        unit_forces: what a unit force to north and to east adds to the residual [N, 3, 2].
+        unit_forces: residual of a unit force to the north and to the east [N, 3, 2].
 
     Raises:
-        FitError: where the vessel hardly turned, so that a constant in body axes explains as much.
+        FitError: if the vessel turned too little to separate it from a constant in body axes.
     """
     scaled = (x - x.mean(0)) / x.std(0).clamp(min=1e-300)
     centred = torch.cat((torch.ones_like(x[:, :1]), scaled), dim=-1)
@@ -568,14 +569,14 @@ def estimate_earth_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
         return projected
 
     weight = project_out(y).std(0).clamp(min=1e-9)
-    # a moment is none of its doing
+    # surge and sway only: a constant force has no moment about the origin of the model
     design = torch.cat([project_out(unit_forces[:, a]) / weight[a] for a in range(2)])
     target = torch.cat([project_out(y[:, a]) / weight[a] for a in range(2)])
     sensitivity = float(torch.linalg.svdvals(design * weight[:2].mean())[-1]) / len(y) ** 0.5
     if sensitivity < _MIN_EARTH_FORCE_RMS:
         raise FitError(
-            "a force constant in earth axes does not show: the vessel kept its heading; give a run"
-            " that turns, or leave earth out"
+            "a constant force in earth axes is not identifiable, because the heading hardly"
+            " changed; use a run with turns, or remove `earth`"
         )
     solution: Tensor = torch.linalg.lstsq(design, target[:, None]).solution
     return solution[:, 0]
@@ -592,8 +593,7 @@ def _coefficients_by_term(rows: Sequence[Mapping[str, float]]) -> dict[str, Tens
 def derive_forward_equations(believed: str, model: ForceModel, label: str) -> HullEquations:
     """Return the accelerations of a force-space model as sums of terms.
 
-    They are nu_dot = (M + A)^-1 (tau - C nu - D nu - b), in the form that the baseline `believed`
-    takes.
+    They are nu_dot = (M + A)^-1 (tau - C nu - D nu - b), in the form of the baseline `believed`.
 
     Args:
         believed: vessel of the known hull, by name or file.
@@ -601,8 +601,8 @@ def derive_forward_equations(believed: str, model: ForceModel, label: str) -> Hu
         label: name of the model in error messages.
 
     Raises:
-        ConfigError: where a basis function is not affine in nu_dot.
-        FitError: where the augmented mass cannot be inverted safely.
+        ConfigError: if a basis function is not affine in nu_dot.
+        FitError: if the augmented mass matrix is ill-conditioned.
     """
     augmented_mass = model.hull.mass
     zero_force = torch.zeros(3, dtype=torch.float64)
@@ -667,7 +667,7 @@ def missing_coefficients(plant_name: str, believed: str) -> dict[str, list[float
     for key in dict.fromkeys((*believed_coefficients, *plant_coefficients)):
         plant_value = plant_coefficients.get(key, zero)
         difference = plant_value - believed_coefficients.get(key, zero)
-        # equal coefficients differ by rounding alone
+        # the tolerance removes differences due to rounding
         is_different = difference.abs() > 1e-9 * (1 + plant_value.abs())
         if bool(is_different.any()):
             missing[key] = torch.where(is_different, difference, zero).tolist()
@@ -764,7 +764,7 @@ def model_sections(
 def model_figures(
     name: str, config: ResidualModelConfig, fit: RegressionFit, unmodelled: Sequence[float]
 ) -> list[Figure]:
-    """Return the weights of a model, and the errors that its order or surface was chosen from.
+    """Return figures of the weights of a model, and of the errors for the choice of its order.
 
     Figures 4.6, 4.20, 4.22 and 4.25 of the document.
 
@@ -809,10 +809,11 @@ def _order_figure(
     unmodelled: Sequence[float],
     chosen_order: int,
 ) -> Figure:
-    """Return the error that is left over the order of a PLSR.
+    """Return a figure of the remaining error of a PLSR by order.
 
     Args:
-        errors_by_samples: mean square error by order and axis [A, 3], by the samples that it is of.
+        name: name of the model.
+        errors_by_samples: mean square error by order and axis [A, 3], by set of samples.
         unmodelled: mean square of the residual of each axis.
         chosen_order: order of the model.
     """
