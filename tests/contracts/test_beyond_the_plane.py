@@ -419,7 +419,7 @@ def test_a_monitor_tells_stiffness_from_damping(
     watch = ChangeDetector(
         spec, model, logs(SystemChange("none", "", "", 1.0), 24, 0), MonitorConfig()
     )
-    assert list(watch.innovation_columns_) == [*live.active_states, "heading"]
+    assert list(watch.innovation_columns) == [*live.active_states, "heading"]
     for cause in names:
         watcher = OnlineChangeDetector(watch)
         (known,) = (one for one in watch.hypotheses if one.name == cause)

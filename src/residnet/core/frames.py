@@ -104,6 +104,8 @@ def compose_rotation(angles: Tensor, rotation_vector: Tensor) -> Tensor:
     """
     import torch
 
+    # quaternion of the Euler angles (zyx): c and s are cosine and sine of the halves of roll (f),
+    # pitch (t) and heading (p)
     half_angles = 0.5 * angles
     cf, ct, cp = half_angles.cos().unbind(-1)
     sf, st, sp = half_angles.sin().unbind(-1)
@@ -117,17 +119,21 @@ def compose_rotation(angles: Tensor, rotation_vector: Tensor) -> Tensor:
     bx, by, bz = (
         rotation_vector * (torch.sin(0.5 * rotation_angle) / rotation_angle).unsqueeze(-1)
     ).unbind(-1)
+    # quaternion product: a rotation about body axes multiplies from the right
     w, x, y, z = (
         w * cos_half_rotation - x * bx - y * by - z * bz,
         w * bx + x * cos_half_rotation + y * bz - z * by,
         w * by - x * bz + y * cos_half_rotation + z * bx,
         w * bz + x * by - y * bx + z * cos_half_rotation,
     )
+    # normalised, because rounding errors accumulate over the steps of a simulation
     inverse_norm = torch.rsqrt(w * w + x * x + y * y + z * z)
     w = w * inverse_norm
     x = x * inverse_norm
     y = y * inverse_norm
     z = z * inverse_norm
+    # Euler angles from elements of the rotation matrix; the pitch from atan2, because asin has an
+    # infinite slope at 90 deg
     sin_roll_component = 2.0 * (y * z + w * x)
     cos_roll_component = 1.0 - 2.0 * (x * x + y * y)
     horizontal_norm = torch.sqrt(

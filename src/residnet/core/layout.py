@@ -112,17 +112,20 @@ def _depth_follows_motion(channels: Mapping[str, np.ndarray]) -> bool:
     height do not correlate.
     """
     z = np.asarray(channels["z"])
-    is_finite = {
+    state_values = {
         name: channels.get(name, np.zeros(z.size)) for name in SIX_DOF_LAYOUT.dynamic_states
     }
-    phi = is_finite["phi"]
-    theta = is_finite["theta"]
+    phi = state_values["phi"]
+    theta = state_values["theta"]
     if channels.keys() >= {"x", "y"} and not channels.keys() >= {"u", "v"}:
+        # without velocities: the path is inclined by the pitch angle, positive nose up
         distance = np.hypot(*(np.diff(channels[name], prepend=np.nan) for name in ("x", "y")))
         depth_rate = -distance * np.tan(theta)
     else:
-        cross_flow_down = is_finite["v"] * np.sin(phi) + is_finite["w"] * np.cos(phi)
-        depth_rate = cross_flow_down * np.cos(theta) - is_finite["u"] * np.sin(theta)
+        # third row of the rotation from body axes to NED (Fossen 2021, eq. (2.31))
+        cross_flow_down = state_values["v"] * np.sin(phi) + state_values["w"] * np.cos(phi)
+        depth_rate = cross_flow_down * np.cos(theta) - state_values["u"] * np.sin(theta)
+    # changes over spans instead of single samples, in which the noise of the depth dominates
     span_samples = max(1, z.size // _N_DEPTH_SPANS)
     predicted_change = np.cumsum(np.nan_to_num(depth_rate))
     predicted_change = predicted_change[span_samples:] - predicted_change[:-span_samples]

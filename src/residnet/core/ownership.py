@@ -139,13 +139,13 @@ class Manifest:
     """The record of the files that residnet wrote into a folder and the folders below it.
 
     Args:
-        folder: that the names are relative to.
-        name: of the manifest file.
+        folder: folder of the relative names.
+        name: name of the manifest file.
 
     Attributes:
-        folder: as given.
-        path: the manifest file.
-        journal: lines that are not merged into it yet.
+        folder: folder of the relative names.
+        path: path of the manifest file.
+        journal: path of the journal, whose lines are not merged into the manifest yet.
     """
 
     def __init__(self, folder: Path, name: str = RUN_MANIFEST) -> None:
@@ -186,10 +186,10 @@ class Manifest:
         return digests
 
     def start_recording(self) -> None:
-        """Let everything that is written below the folder from now on be recorded here.
+        """Record all files that are written below the folder from now on.
 
         Raises:
-            UsageError: if the manifest is damaged or somebody else's, or cannot be written.
+            UsageError: if the manifest is damaged, has another format, or cannot be written.
         """
         self.read()
         self._append("")
@@ -198,8 +198,8 @@ class Manifest:
         """Append to the journal that residnet writes a file; to be called before it is in place.
 
         Args:
-            path: of the file, inside of the folder.
-            digest: SHA-256 of its contents; None while it grows.
+            path: path of the file, inside of the folder.
+            digest: SHA-256 of its contents; None for a file that is still growing.
 
         Raises:
             UsageError: if the journal cannot be written.
@@ -220,7 +220,7 @@ class Manifest:
         """Check that a file may be written: it does not exist, or is owned.
 
         Raises:
-            UsageError: if it is the user's, was edited, or lies behind a symbolic link.
+            UsageError: if residnet did not write it, it was edited, or a symbolic link leads to it.
         """
         require_inside(self.folder, path)
         if not os.path.lexists(path):
@@ -234,10 +234,10 @@ class Manifest:
         """Check that recorded files may be written again: each is unchanged or deleted.
 
         Args:
-            names: of files, and of folders whose recorded files are checked.
+            names: names of files, and of folders whose recorded files are checked.
 
         Raises:
-            UsageError: if a file was edited, or lies behind a symbolic link.
+            UsageError: if a file was edited, or a symbolic link leads to it.
         """
         for name in names:
             require_inside(self.folder, self.folder / name)
@@ -338,7 +338,7 @@ class Manifest:
         """Check that each recorded file is there, is a regular file and has its SHA-256.
 
         Args:
-            skipped: first parts of the names of files that are not looked at.
+            skipped: first parts of the names of files that are not checked.
 
         Raises:
             UsageError: if a file is missing, a link or a device, cut off, edited or from elsewhere.
@@ -358,8 +358,8 @@ class Manifest:
                 ) from error
             if digest not in versions:
                 raise UsageError(
-                    f"{path}: its SHA-256 is not the one in {self.path.name}, so it is cut off,"
-                    " edited or from elsewhere; restore the folder or run it again"
+                    f"{path}: its SHA-256 is not the one in {self.path.name}, so it is incomplete,"
+                    " edited or from another run; restore the folder or run it again"
                 )
 
     def _append(self, line: str) -> None:
@@ -388,7 +388,7 @@ class Manifest:
             mode = path.lstat().st_mode
             if versions is None or not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
                 return False
-            # a lock may be a link; to delete it does not touch what it points to
+            # a lock file may be a link; its deletion does not affect the target
             return None in versions or (stat.S_ISREG(mode) and sha256(path) in versions)
         except FileNotFoundError:
             return False
@@ -469,10 +469,10 @@ def find_manifest(path: Path) -> Manifest:
 def require_replaceable(path: Path) -> None:
     """Check that a file may be written: it does not exist, or residnet wrote it and it is the same.
 
-    To be called before the work whose result the file will hold.
+    Call it before a long computation, so that its result can be written.
 
     Raises:
-        UsageError: if it is the user's, was edited, or lies behind a symbolic link.
+        UsageError: if residnet did not write it, it was edited, or a symbolic link leads to it.
     """
     find_manifest(path).require_replaceable(path)
 
@@ -482,7 +482,7 @@ def record_folder(folder: Path) -> Iterator[Manifest]:
     """Record each file that is written below a folder within the context in its `checksums.json`.
 
     Raises:
-        UsageError: if the manifest is damaged or somebody else's, or cannot be written.
+        UsageError: if the manifest is damaged, has another format, or cannot be written.
     """
     manifest = Manifest(folder)
     manifest.start_recording()

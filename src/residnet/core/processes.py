@@ -18,7 +18,7 @@ from typing import Any
 from residnet.core.errors import FitError
 from residnet.core.trust import is_trusted, set_trusted
 
-# parameter numbers of `mallopt` in malloc.h of the GNU C library
+# parameter numbers of `mallopt` in malloc.h of the GNU C library, which Python does not define
 _TRIM_THRESHOLD = -1
 _MMAP_THRESHOLD = -3
 _MAX_KEPT_BYTES = 128 << 20

@@ -44,6 +44,7 @@ class FileRecord(Record):
         try:
             return cls.model_validate(content)
         except ValidationError as error:
+            # one fault per message is enough: the file was damaged or written by another version
             first_error = error.errors(include_url=False)[0]
             key = ".".join(map(str, first_error["loc"])) or "its contents"
             raise DataError(

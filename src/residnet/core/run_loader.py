@@ -101,7 +101,7 @@ def require_trustworthy(run: Path) -> None:
 
     Raises:
         UsageError: if the manifest is missing, if an entry is no regular file or too large, or if a
-            file that may be read is not listed, missing, cut off, edited or from elsewhere.
+            file that may be read is not listed, missing, incomplete, edited or from another run.
     """
     try:
         files = [*files_of_run(run)]
@@ -130,12 +130,12 @@ def require_listed(run: Path, name: str) -> None:
     A model has a manifest of its own inside of its run.
 
     Raises:
-        UsageError: if it does not.
+        UsageError: if the manifest does not list it.
     """
     path = run / name
     manifest = find_run_manifest(path)
     if manifest is None or not manifest.folder.is_relative_to(run):
-        # not a run folder: what opens one has checked that there is a manifest
+        # not a run folder: `require_trustworthy` has checked the manifest of a run
         return
     if path.relative_to(manifest.folder).as_posix() not in manifest.read():
         raise _unlisted(path, run)
@@ -277,7 +277,7 @@ def name_damaged_key(run: Path) -> Iterator[None]:
     except Exception as error:
         last = _last_key.get()
         if last is None:
-            # nothing was read from the folder, so its files are not at fault
+            # no file of the folder was read, so that the error has another cause
             raise
         file, key = last
         first_line = next(iter(str(error).splitlines()), "")

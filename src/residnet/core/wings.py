@@ -2,8 +2,8 @@
 
 A wing, such as `residnet.autopilot`, is a folder with a file entry_points.toml. The file declares
 the wing's parts in the groups and the syntax that another package uses in its pyproject.toml, each
-as `module:name`. A part is imported when it is first used. Nothing heavy is imported here, because
-`residnet --help` lists the commands of the wings.
+as `module:name`. A part is imported when it is first used. This module imports no large
+package, because `residnet --help` lists the commands of the wings.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def read_wing_entry_points() -> Mapping[str, Mapping[str, str]]:
     """Read the entry points of all wings without importing any of them.
 
     Returns:
-        By group, such as `residnet.tasks`, each name with its `module:name`.
+        Names with their `module:name` by group, for example `residnet.tasks`.
     """
     wing_entry_points: dict[str, dict[str, str]] = {}
     for file in sorted(Path(residnet.__file__).parent.glob(f"*/{ENTRY_POINTS_FILE}")):

@@ -413,15 +413,15 @@ def _normalized_error_quantile(
 ) -> np.ndarray:
     """Return the quantile [c] of the ratios of errors to the half widths of a band."""
     names = [run.log for run in errors_of_runs]
-    run_weights_ = compute_run_weights(names)
+    run_weights = compute_run_weights(names)
     normalized_errors = [run.error / run.half_widths(band) for run in errors_of_runs]
     coverage = np.array([np.nanmean(ratio <= 1.0) for ratio in normalized_errors])
     # correction for the small number of independent runs, as in the calibration of a band
     corrected_level = conformal_level(
-        level, effective_sample_size(coverage, run_weights_, names, level)
+        level, effective_sample_size(coverage, run_weights, names, level)
     )
     pooled_errors = np.concatenate(normalized_errors)
-    sample_weights = np.repeat(run_weights_, [len(ratio) for ratio in normalized_errors])
+    sample_weights = np.repeat(run_weights, [len(ratio) for ratio in normalized_errors])
     return np.array(
         [
             weighted_quantile(pooled_errors[:, i], sample_weights, corrected_level)

@@ -123,9 +123,9 @@ def evaluate_splits(
         first_window = last_window
         evaluation = evaluations[split]
         logs = splits[split]
-        free_run_ = FreeRun(name, split, windows, predictions_of_run)
-        evaluation.free_runs.append(free_run_)
-        protocol_evaluation = ProtocolEvaluation(free_run_, models, logs, scales)
+        free_run = FreeRun(name, split, windows, predictions_of_run)
+        evaluation.free_runs.append(free_run)
+        protocol_evaluation = ProtocolEvaluation(free_run, models, logs, scales)
         evaluation.rows.extend(protocol_evaluation.build_rows(config.groups))
         evaluation.limits_by_protocol[name] = protocol_evaluation.build_limits(dt)
     return evaluations
@@ -333,14 +333,14 @@ class IdentifiedModels(Mapping[str, FittedModel]):
             divergences = [
                 (
                     n_diverged,
-                    f"{n_diverged} of its {len(free_run_.windows)} {split} windows diverged"
-                    f" ({free_run_.protocol})",
+                    f"{n_diverged} of its {len(free_run.windows)} {split} windows diverged"
+                    f" ({free_run.protocol})",
                 )
                 for split, validation_runs in checked_runs.items()
-                for free_run_ in validation_runs
+                for free_run in validation_runs
                 if (
                     n_diverged := sum(
-                        item.has_diverged for item in free_run_.predictions[fitted_model.name]
+                        item.has_diverged for item in free_run.predictions[fitted_model.name]
                     )
                 )
             ]

@@ -401,7 +401,7 @@ class GroupScores:
         """Return the sums of values [G, ...] over the groups of each log [K, ...]."""
         log_indices = dict.fromkeys(self.log_index.tolist())
         return np.stack(
-            [values[self.log_index == log_index_].sum(axis=0) for log_index_ in log_indices]
+            [values[self.log_index == log_index].sum(axis=0) for log_index in log_indices]
         )
 
 
@@ -728,7 +728,7 @@ class ChangeDetector:
         self.model = model.to(torch.float64).eval()
         self.config = config
         self.hypotheses = make_fault_hypotheses(spec.signals)
-        self.innovation_columns_ = innovation_columns(spec.signals.dof)
+        self.innovation_columns = innovation_columns(spec.signals.dof)
         self.nuisance_changes = make_nuisance_changes()
         nuisance_precisions = [_CURRENT_STD**-2] * 2 + [_PUSH_STD**-2] * 2
         self.nuisance_precision = np.diag(nuisance_precisions)
@@ -737,9 +737,9 @@ class ChangeDetector:
         self.window_steps = round(config.window / spec.dt)
         self.n_warmup = count_warmup_samples(model)
         indexed_groups = [
-            (k, group_windows_)
+            (k, windows_of_group)
             for k, log_of_group in enumerate(clean_windows)
-            for group_windows_ in self.group_windows(log_of_group)
+            for windows_of_group in self.group_windows(log_of_group)
         ]
         if len(indexed_groups) < _MIN_GROUPS:
             raise DataError(
@@ -750,21 +750,21 @@ class ChangeDetector:
         max_states = np.max(
             [
                 np.abs(window.y).max(axis=0)
-                for _, group_windows_ in indexed_groups
-                for window in group_windows_
+                for _, windows_of_group in indexed_groups
+                for window in windows_of_group
             ],
             axis=0,
         )
         max_states[HEADING] = _MAX_HEADING_INNOVATION
         self.divergence_limits = (
-            _DIVERGENCE_FACTOR * max_states[[*self.innovation_columns_.values()]]
+            _DIVERGENCE_FACTOR * max_states[[*self.innovation_columns.values()]]
         )
         self.part_counts = (
             [1, _N_WINDOW_PARTS] if self.window_steps >= _MIN_PART_STEPS * _N_WINDOW_PARTS else [1]
         )
         innovations_by_group = [
-            [self.compute_innovations(group_windows_, parts) for parts in self.part_counts]
-            for _, group_windows_ in indexed_groups
+            [self.compute_innovations(windows_of_group, parts) for parts in self.part_counts]
+            for _, windows_of_group in indexed_groups
         ]
         has_diverged = np.concatenate(
             [(group[0][0] == 0.0).all(axis=1) for group in innovations_by_group]
@@ -856,7 +856,7 @@ class ChangeDetector:
             innovation, effects = map(np.concatenate, zip(*innovations_of_look, strict=True))
             bias_by_look.append(
                 estimate_model_bias(
-                    innovation, effects, self.hypotheses, len(self.innovation_columns_)
+                    innovation, effects, self.hypotheses, len(self.innovation_columns)
                 )
             )
         return bias_by_look
@@ -956,7 +956,7 @@ class ChangeDetector:
         Args:
             model_bias: mean sizes on clean logs for this division of windows [Q, 4].
         """
-        bias_by_column = np.tile(model_bias, effects.shape[2] // len(self.innovation_columns_))
+        bias_by_column = np.tile(model_bias, effects.shape[2] // len(self.innovation_columns))
         return np.asarray((effects[:, : len(self.hypotheses)] * bias_by_column).sum(axis=1))
 
     def _compute_score_sums(
@@ -1016,9 +1016,9 @@ class ChangeDetector:
             np.sum([group_sums.squared_innovations for group_sums in sums_by_group], axis=0)
             / n_windows
         )
-        mean_squares = squares.reshape(-1, len(self.innovation_columns_)).mean(axis=0)
+        mean_squares = squares.reshape(-1, len(self.innovation_columns)).mean(axis=0)
         innovation_rms = dict(
-            zip(self.innovation_columns_, np.sqrt(mean_squares).tolist(), strict=True)
+            zip(self.innovation_columns, np.sqrt(mean_squares).tolist(), strict=True)
         )
         return MonitorVerdict(is_alarm, self.threshold, hypotheses, innovation_rms)
 

@@ -719,11 +719,7 @@ def choose_window_length(usable_durations: Sequence[float], correlation_time: fl
 def make_protocols(window_duration: float) -> dict[str, Any]:
     """Return two protocols: free runs of a length, and of at most 0.4 times this length."""
     short_length = max(
-        (
-            window_length_
-            for window_length_ in _WINDOW_LENGTHS
-            if window_length_ <= 0.4 * window_duration
-        ),
+        (length for length in _WINDOW_LENGTHS if length <= 0.4 * window_duration),
         default=0.5 * window_duration,
     )
     first_start = min(5.0, 0.1 * window_duration)

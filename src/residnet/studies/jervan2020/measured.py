@@ -77,7 +77,7 @@ from residnet.studies.study import (
 )
 
 _REFERENCE_MODELS = {"zero": "no force at all", "believed": "the believed model alone"}
-"""What needs no regression."""
+"""Models without a regression, with which all others are compared."""
 _FORCE_UNITS = tuple((label, 1.0) for label in ("surge [N]", "sway [N]", "yaw [N m]"))
 _ACCELERATION_UNITS = tuple(
     (label, 1.0) for label in ("surge [m/s²]", "sway [m/s²]", "yaw [rad/s²]")
@@ -88,10 +88,10 @@ class MeasuredModelConfig(ResidualModelConfig):
     """One regression of the residual of measured forces.
 
     Attributes:
-        lag: as there, but never searched: an actual force has none.
+        lag: as in the base class, but not searched, since an actual force has no lag.
         force: force that the model explains: the actual or the commanded one.
-        published: mean square of the residual on the document's own test half, without and with
-            this model, in N^2, N^2, (N m)^2; from other trials, with the ferry as it was then.
+        published: published mean square residuals on the test half of the document, without and
+            with this model, in N^2, N^2, (N m)^2; from other trials.
     """
 
     lag: bool = False
@@ -100,10 +100,10 @@ class MeasuredModelConfig(ResidualModelConfig):
 
     @property
     def evaluation_force(self) -> Literal["actual", "commanded"]:
-        """The force that judges the model.
+        """The force on which the model is evaluated.
 
-        A lag alone could make the residual of a command small: a model with lag is judged on the
-        actual force.
+        A model with lag is evaluated on the actual force, because a fitted lag alone could make the
+        residual of the command small.
         """
         return "actual" if self.lag else self.force
 
@@ -111,12 +111,12 @@ class MeasuredModelConfig(ResidualModelConfig):
     def _check_combination(self) -> MeasuredModelConfig:
         if self.lag and self.force != "commanded":
             raise ValueError(
-                "lag: forces lag behind commands; set force to 'commanded', or leave lag out"
+                "lag: only commanded forces have a lag; set force to 'commanded', or remove lag"
             )
         if self.fit.choose == "test":
             raise ValueError(
-                "fit.choose: 'test' lets the samples that judge a model choose it; take simplest or"
-                " least"
+                "fit.choose: with 'test' a model is selected on the samples of its evaluation; use"
+                " simplest or least"
             )
         return self
 
@@ -127,11 +127,11 @@ class ForceResidualConfig(StudyTask, ComputingTask):
 
     Attributes:
         task: `force_residual`.
-        believed: vessel whose hull is the known part, by name or file.
+        believed: vessel with the known hull, by name or file.
         data: the measured logs.
-        prepare: time grid, masks, and how velocities are smoothed and differentiated.
+        prepare: time grid, masks, smoothing and differentiation of the velocities.
         channels: names of the channels of force and acceleration.
-        validation: how the models are cross-validated.
+        validation: settings of the cross-validation.
         models: regressions by name.
     """
 
@@ -149,16 +149,16 @@ class ForceResidualConfig(StudyTask, ComputingTask):
     def _check_combination(self) -> ForceResidualConfig:
         if reserved_names := sorted(set(_REFERENCE_MODELS) & set(self.models)):
             raise ValueError(
-                f"'{reserved_names[0]}' cannot name a model: it stands beside all of them"
+                f"'{reserved_names[0]}' is reserved for a reference model; use another name"
             )
         if self.prepare.hold != "start":
-            raise ValueError("prepare.hold: nothing runs forward here, leave it out")
+            raise ValueError("prepare.hold: not used here, because nothing is simulated; remove it")
         if (
             self.validation.gap < self.prepare.grid.step
             or self.validation.segment < 10 * self.prepare.grid.step
         ):
             raise ValueError(
-                "validation: gap holds at least one step of the grid, segment at least ten"
+                "validation: gap must be at least one step of the grid, segment at least ten"
             )
         try:
             self.believed_hull()
@@ -170,7 +170,7 @@ class ForceResidualConfig(StudyTask, ComputingTask):
         """Return the known hull.
 
         Raises:
-            ConfigError: where the vessel is no hull by matrices.
+            ConfigError: if the vessel has no hull model with matrices.
         """
         config = load_vessel(self.believed)
         vessel = config.build() if isinstance(config, HullConfig) else None
@@ -206,13 +206,12 @@ class ForceResidualConfig(StudyTask, ComputingTask):
         return figures
 
     def summarize(self, results: StudyResults) -> list[str]:
-        """Return the sentences that say for each force whether a regression gained anything."""
+        """Return sentences on the improvement by regressions for each force."""
         sentences: list[str] = []
         for force, rows in _rows_by_force(results).items():
             if results["intervals"] is None:
                 sentences.append(
-                    f"{force.capitalize()} force: there are too few segments to say whether one"
-                    " model is better than another."
+                    f"{force.capitalize()} force: there are too few segments to compare models."
                 )
                 continue
             believed = rows["believed"]
@@ -275,7 +274,7 @@ class CrossValidatedModel(NamedTuple):
     Attributes:
         error: residual [N, 3] in N, N, N m on the test folds; NaN for unused samples.
         folds: hyperparameters selected in each fold.
-        fit: coefficients fitted to all good samples, for display only.
+        fit: coefficients fitted to all usable samples, for display only.
         not_forward: reason why it cannot run forward in time; empty if it can.
     """
 
@@ -286,12 +285,12 @@ class CrossValidatedModel(NamedTuple):
 
 
 def run_force_study(config: ForceResidualConfig) -> tuple[dict[str, Any], list[Figure]]:
-    """Read the logs, fit and judge every model; return what force_residual.json holds, and figures.
+    """Read the logs, fit and evaluate all models; return the results for JSON, and figures.
 
-    A model that the logs do not determine is set aside with the reason.
+    A model that the logs do not determine is listed with the reason instead.
 
     Raises:
-        ResidnetError: where a log cannot be used or no model is determined.
+        ResidnetError: if a log cannot be used or no model is determined.
     """
     measured = config.read_logs()
     believed = ForceModel(config.believed_hull())
