@@ -146,11 +146,11 @@ def test_the_verdict_begins_with_the_cheapest_policy() -> None:
     assert list_policy_objections("b", rows) == []
     rows += [{**row, "protocol": "beyond_waves", "cost": {"mean": 9.0}} for row in rows[1:]]
     rows[-1]["cost"]["mean"] = 8.0
-    costly = "Do not use 'b' there: under 'waves' a flight costs 9 s, with law 8 s."
+    costly = "Do not use 'b' there: under 'waves' the mean cost is 9 s, with law 8 s."
     assert cost_sentences(rows)[1] == costly
     rows[2]["cost"]["mean"] = 6.0
     assert list_policy_objections("b", rows) == [
-        "under its conditions a flight costs 6.1 s, with law 6 s"
+        "under its conditions the mean cost is 6.1 s, with law 6 s"
     ]
 
 
@@ -164,9 +164,12 @@ def test_the_verdict_tells_a_policy_that_keeps_swinging() -> None:
         {"protocol": "conditions", "model": row["model"], "kind": row["kind"], "cost": {"mean": 6}}
         for row in rows
     ]
-    said = "'a' keeps swinging in 1 of 100 flights without noise, its command by up to 40 deg; "
-    assert cost_sentences(rows)[1] == said + "not so pd."
-    assert describe_limit_cycles("lqr", rows)[0].endswith("not so pd.")
+    said = (
+        "'a' has a limit cycle in 1 of 100 simulations without noise, with a peak-to-peak command"
+        " of up to 40 deg; "
+    )
+    assert cost_sentences(rows)[1] == said + "none with pd."
+    assert describe_limit_cycles("lqr", rows)[0].endswith("none with pd.")
     assert describe_limit_cycles("pd", rows) == []
     rows[2]["cycling"] = 1
-    assert describe_limit_cycles("a", rows) == [said + "each tuned law does so too."]
+    assert describe_limit_cycles("a", rows) == [said + "so has each tuned law."]

@@ -199,7 +199,7 @@ def test_circles_of_acceptance_are_entered_and_a_current_keeps_farther_off(
 
 
 def test_what_no_course_can_do_is_refused(vessel: SteeredPlant) -> None:
-    with pytest.raises(ConfigError, match="begins within every circle"):
+    with pytest.raises(ConfigError, match="start is within all circles"):
         plan_of(vessel, "enter", buoys=(buoy(0.0, 0.0), buoy(1.5, 0.0)))
     with pytest.raises(ConfigError, match=r"buoy|mark"):
         plan_of(vessel, buoys=(BUOYS[0], buoy(52, 20, "starboard"), BUOYS[2]))

@@ -119,7 +119,7 @@ def test_planes_that_are_reversed_and_a_vessel_that_nothing_rights_are_refused(
     neutral = write_yaml(tmp_path / "neutral.yaml", content)
     for name, axis, seconds, said in (
         ("remus_100", DEPTH._replace(side=1.0), 8.0, "check the sign"),
-        (str(neutral), DEPTH, 20.0, "nothing rights it"),
+        (str(neutral), DEPTH, 20.0, "without a restoring moment"),
     ):
         torpedo = SteeredPlant(load_vessel(name).build(), axis=axis)
         with pytest.raises(FitError, match=said):

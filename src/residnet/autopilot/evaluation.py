@@ -42,8 +42,8 @@ METRIC_UNITS = {
     "travel": "rad",
     "energy": "rad^2 s",
 }
-"""Of a row, with units: last entry into the band, overshoot, integral of the absolute error, travel
-of the rudder command, integral of its square.
+"""Metrics of a row with units: last entry into the band, overshoot, integral of the absolute error,
+travel of the rudder command, integral of its square.
 """
 
 
@@ -100,10 +100,10 @@ def describe_limit_cycles(model: str, rows: Sequence[Mapping[str, Any]]) -> list
         if row["kind"] == "classical" and not row["cycling"]
     ]
     return [
-        f"'{model}' keeps swinging in {policy_row['cycling']} of {policy_row['n']} flights without"
-        " noise, its"
-        f" command by up to {math.degrees(policy_row['rudder_swing']['max']):.3g} deg; "
-        + (f"not so {', '.join(steady_laws)}." if steady_laws else "each tuned law does so too.")
+        f"'{model}' has a limit cycle in {policy_row['cycling']} of {policy_row['n']} simulations"
+        " without noise, with a peak-to-peak"
+        f" command of up to {math.degrees(policy_row['rudder_swing']['max']):.3g} deg; "
+        + (f"none with {', '.join(steady_laws)}." if steady_laws else "so has each tuned law.")
     ]
 
 
@@ -121,11 +121,11 @@ def _describe_cheaper_law(
         return []
     policy_cost = costs[model][1]
     cheapest_law = min(laws, key=laws.__getitem__)
-    # a policy that learned nothing flies as the law that it began with, but for rounding
+    # a policy without any improvement equals its initial law up to rounding
     if policy_cost <= laws[cheapest_law] or math.isclose(policy_cost, laws[cheapest_law]):
         return []
     return [
-        f"{condition_text} a flight costs {policy_cost:.4g} s, with {cheapest_law}"
+        f"{condition_text} the mean cost is {policy_cost:.4g} s, with {cheapest_law}"
         f" {laws[cheapest_law]:.4g} s"
     ]
 
@@ -360,7 +360,7 @@ def evaluate_limit_cycles(
         _SWING_TOLERANCE * steadiness_limits.limits_for(trajectories.axis)[0],
         _SWING_TOLERANCE * steadiness_limits.rudder_swing,
     )
-    # what is no number is not within its limit
+    # NaN fails the comparison and counts as a limit cycle
     is_steady = (heading_swing <= tolerances[0]) & (rudder_swing <= tolerances[1])
     swings = {"heading_swing": heading_swing, "rudder_swing": rudder_swing}
     row = _build_row(controller, model_kind, "quiet", swings)
@@ -372,14 +372,16 @@ class TrackingMetrics:
     """Metrics of a closed-loop simulation of motion control; SI, angles in rad.
 
     Attributes:
-        position_mae, position_mse: of the distance to the desired position in m, m^2 (4.6).
-        heading_mae, heading_mse: of the wrapped heading error in rad, rad^2 (4.7).
+        position_mae, position_mse: mean and mean square distance to the desired position in m, m^2
+            (4.6).
+        heading_mae, heading_mse: mean absolute and mean square of the wrapped heading error in rad,
+            rad^2 (4.7).
         tau: mean |tau| commanded in surge, sway, yaw.
         feedback: mean |tau_FB| in surge, sway, yaw.
-        motion_mse: of the velocities and accelerations against the desired ones in (m/s)^2,
+        motion_mse: mean square errors of velocities and accelerations in (m/s)^2,
             (m/s)^2, (rad/s)^2 and per second squared (Table 4.8).
         energy: integral of |tau' nu| in J, surge and sway, then yaw.
-        power: the same per second in W (Table 4.13).
+        power: `energy` per second in W (Table 4.13).
         iaew: integral of |e| times integral of power (3.18), position [m s J] and heading [rad s
             J].
     """

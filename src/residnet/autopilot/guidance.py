@@ -71,7 +71,8 @@ class WheelOver(nn.Module):
         angles, corner_distances, tracks = _switching_turns(nomoto, limit)
         max_miss = share * acceptance
         radius = nomoto.speed / (nomoto.gain * limit)
-        # an arc without lag, then the lag
+        # upper bound: an arc without lag that passes the corner at `max_miss`, plus the way of the
+        # lag
         max_distance = math.sqrt(max_miss * (2.0 * radius + max_miss)) + nomoto.speed * nomoto.time
         distance = np.linspace(0.0, max_distance, _DISTANCES)
         miss_distance = np.stack(
@@ -81,6 +82,7 @@ class WheelOver(nn.Module):
             (distance <= corner_distances[:, None]) & (miss_distance <= max_miss), distance, 0.0
         ).max(axis=1)
         course_changes = np.linspace(0.0, math.pi, _ANGLES)
+        # the rudder needs limit / rate from amidships, on average at half of its angle
         rudder_distance = 0.0 if rate is None else 0.5 * nomoto.speed * limit / rate
         self.register_buffer(
             "table",
@@ -120,7 +122,8 @@ def _switching_turns(
     )[:, None]
     yaw_rate_at_reversal = max_yaw_rate * (1.0 - np.exp(-hold_times / time_constant))
     share = np.linspace(0.0, 1.0, _SAMPLES)[None, :]
-    # over, then back until the yaw has stopped
+    # closed-form solution: full rudder for the hold time, then counter-rudder for
+    # T log(1 + r / r_max), after which the yaw rate is zero
     hold_phase = hold_times * share
     reversal_phase = time_constant * np.log1p(yaw_rate_at_reversal / max_yaw_rate) * share[:, 1:]
     heading_at_reversal = max_yaw_rate * hold_times - time_constant * yaw_rate_at_reversal
@@ -144,6 +147,7 @@ def _switching_turns(
     track = np.concatenate((np.zeros((len(increments), 1, 2)), increments.cumsum(axis=1)), axis=1)
     final_heading = heading[:, -1]
     sine = np.sin(final_heading)
+    # intersection of initial and final track; there is none for parallel tracks
     corner_distance = np.where(
         sine > 1e-9,
         track[:, -1, 0] - track[:, -1, 1] * np.cos(final_heading) / np.maximum(sine, 1e-9),
@@ -254,6 +258,8 @@ class WaypointGuidance(Reference):
         if self.wheel_over is not None:
             change = self.leg_geometry(x, leg_number + 1, s)[0] - direction
             switch_distance = self.wheel_over(wrap_angle(change))
+            # predicted cross-track error at the end of the wheel-over distance with the present
+            # heading
             offset_at_corner = (
                 error.abs() + switch_distance * torch.sin(x[:, self.psi] - direction).abs()
             )
@@ -335,10 +341,12 @@ class DriftEstimate(nn.Module):
             s: memory [B, 2].
         """
         steering_error = error + self.distance * self.cross_component(direction, s)
+        # the denominator reduces the integration at large errors (anti-windup), as in the source
         drift_increment = self.dt * self.gain * error / (self.distance**2 + steering_error.square())
         s = s + drift_increment.unsqueeze(-1) * torch.stack(
             (-torch.sin(direction), torch.cos(direction)), dim=-1
         )
+        # the limit excludes currents that the vessel cannot counteract
         return s / (s.square().sum(dim=-1, keepdim=True).sqrt() / self.max_drift).clamp(min=1.0)
 
 

@@ -129,7 +129,7 @@ class ReferenceFilter(Reference):
         return torch.cat((pose(x), torch.zeros_like(x[:, :1]).expand(-1, 6)), dim=-1)
 
     def waypoint_at(self, k: int) -> Tensor:
-        """Return the waypoint [B or 1, 3] that is given at step k."""
+        """Return the waypoint [B or 1, 3] at step k."""
         return self.waypoints[:, min(k // self.steps_per_waypoint, self.n_waypoints - 1)]
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -151,9 +151,9 @@ class ReferenceFilter(Reference):
 def to_body_derivatives(
     psi: Tensor, pose_rate: Tensor, pose_acceleration: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return nu and nu_dot [..., 3] of a pose's first and second derivative [..., 3] in the earth.
+    """Return nu and nu_dot [..., 3] in body axes from the derivatives [..., 3] of a pose in NED.
 
-    A vector fixed in the earth turns by -r in the body (correction J7).
+    A vector that is constant in NED rotates at -r in body axes (correction J7).
     """
     u, v = to_body(pose_rate[..., 0], pose_rate[..., 1], psi)
     surge_acceleration, sway_acceleration = to_body(
@@ -202,12 +202,12 @@ class HullFeedForward(FeedForward):
 
 
 class MotionPIDConfig(Config):
-    """Gains on surge, sway and yaw; all zero leaves the feed-forward alone.
+    """PID gains of surge, sway and yaw; with zero gains only the feed-forward acts.
 
     Attributes:
-        proportional: in N/m, N/m, N m/rad.
-        integral: in N/(m s), N/(m s), N m/(rad s).
-        derivative: in N s/m, N s/m, N m s/rad.
+        proportional: gains in N/m, N/m, N m/rad.
+        integral: gains in N/(m s), N/(m s), N m/(rad s).
+        derivative: gains in N s/m, N s/m, N m s/rad.
     """
 
     kind: Literal["motion_pid"] = "motion_pid"
@@ -226,9 +226,9 @@ class MotionPID(Policy):
 
     e = R^T(psi) (eta_d - eta) with its heading wrapped (2.9)-(2.14).
 
-    Reference [B, 9]: eta_d, nu_d, nu_dot_d, as `ReferenceFilter` gives it. The memory [B, 3] is I,
-    the sum of e dt of the steps before. There is one config for all rows, or one for each row of
-    the batch.
+    Reference [B, 9]: eta_d, nu_d, nu_dot_d, see `ReferenceFilter`. The memory [B, 3] is I, the sum
+    of e dt over the previous steps. There is one config for all rows, or one for each row of the
+    batch.
     """
 
     def __init__(
@@ -286,24 +286,24 @@ class AllocatedPolicy(Policy):
 
 
 _DIFFERENCE_STEP = 0.05
-"""Seconds between the points that the force's derivatives are taken from; the reference itself is
-known analytically there.
+"""Step in s of the differences that give the derivatives of the force; the motion at these points
+is known analytically, so that there is no noise.
 """
 _RECOVERY_RATIO = 0.7
-"""How fast a miss of the needed force is made up for, in units of the lag's own frequency: the
-command's peaks grow with it.
+"""Rate at which an error of the force is corrected, relative to the frequency of the lag; peaks of
+the command increase with it.
 """
 
 
 class ActuatorLag(Config):
-    """The lag of forces behind commands: tau'' + 2 zeta omega tau' + omega^2 tau = omega^2 tau_c.
+    """Second-order lag of forces: tau'' + 2 zeta omega tau' + omega^2 tau = omega^2 tau_c.
 
     tau_c is taken at t - delay (document 002 eq. (4.3)).
 
     Attributes:
         frequency: omega in rad/s.
         damping: zeta, dimensionless.
-        delay: in s.
+        delay: dead time in s.
     """
 
     frequency: RadiansPerSecond = Field(gt=0)
@@ -321,10 +321,7 @@ class PoseDerivatives(NamedTuple):
     snap: Tensor
 
     def extrapolate(self, h: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return heading [...], nu_d and nu_dot_d [..., 3] in body axes h seconds later.
-
-        They follow the Taylor series.
-        """
+        """Return heading [...], nu_d and nu_dot_d [..., 3] after h seconds by Taylor series."""
         pose = self.pose + h * (
             self.rate + h / 2 * (self.acceleration + h / 3 * (self.jerk + h / 4 * self.snap))
         )
@@ -339,8 +336,8 @@ def filter_derivatives(
 ) -> PoseDerivatives:
     """Return the desired pose and its derivatives up to the snap, from the filter's memory.
 
-    The third-order filter (2.15) has memory [..., 9] and a target [..., 3] that moves by
-    `target_rate`.
+    The third-order filter (2.15) has memory [..., 9] and a target [..., 3] with the rate
+    `target_rate`. Its differential equation gives the jerk, and its derivative the snap.
     """
     w = torch.tensor(config.frequency, dtype=memory.dtype)
     d = 2.0 * torch.tensor(config.damping, dtype=memory.dtype) + 1.0
@@ -355,13 +352,13 @@ def filter_derivatives(
 def required_force(
     model: ForceModel, motion: PoseDerivatives, lag: ActuatorLag | None, hold_time: float
 ) -> Tensor:
-    """Return the force that a model needs when a command given now takes effect, [..., 9].
-
-    Its first and second derivatives follow.
+    """Return the required force, with first and second derivative, when a command acts, [..., 9].
 
     Args:
-        lag: of the actuators; None commands the force itself, now and without derivatives.
-        hold_time: seconds that a command is held; on average it comes late by half of them.
+        model: model of the vessel.
+        motion: desired motion with its derivatives.
+        lag: lag of the actuators; None for the present force without derivatives.
+        hold_time: time in s for which a command is constant; its mean delay is half of it.
     """
 
     def force_at(h: float) -> Tensor:
@@ -389,21 +386,21 @@ def required_force(
 
 @final
 class LagCompensatedPID(Policy):
-    """PID on a reference that brings along what a model needs, led by the lag of the actuators.
+    """PID with feed-forward of the required force, which compensates the lag of the actuators.
 
     Reference [B, 18]: eta_d, nu_d, nu_dot_d, then `required_force`. Memory [B, 15]: the integral of
     the PID, then of each axis the predicted force of the actuators, its rate, and the integral and
     double integral of the difference from the required force.
 
     The command is tau_p + 2 zeta / omega tau_p' + (tau'' + k1 e' + k2 e + k3 I + k4 II) / omega^2,
-    e the miss: where the desired jerk jumps, the needed force has a corner that no command follows,
-    and the vessel would be left with a wrong velocity that the PID takes a minute to mend; the
-    integrals make up for it within seconds.
+    with the error e of the force. At a jump of the desired jerk the required force has a corner
+    that the actuators cannot follow. The resulting velocity error would take the PID a minute to
+    correct; the integrals I and II of e correct it within seconds.
 
     Args:
         feedback: the PID, without feed-forward.
-        lags: of each row's actuators as its model has it; None commands the needed force itself.
-        dt: step in s.
+        lags: lag of the actuators in the model of each row; None for no compensation.
+        dt: time step in s.
     """
 
     def __init__(self, feedback: MotionPID, lags: Sequence[ActuatorLag | None], dt: float) -> None:
@@ -421,6 +418,7 @@ class LagCompensatedPID(Policy):
             [[0.0, 1.0, 0.0], [-(w**2), -2 * z * w, w**2], [0.0, 0.0, 0.0]]
             for w, z in ((lag.frequency, lag.damping) for lag in effective_lags)
         ]
+        # exact discretisation of the lag for a command that is constant over a step
         step_matrix = torch.linalg.matrix_exp(torch.tensor(lag_matrices, dtype=torch.float64) * dt)
         self.register_buffer("lag", torch.tensor(lag_table, dtype=torch.float64), persistent=False)
         self.register_buffer("step", step_matrix, persistent=False)
@@ -437,6 +435,7 @@ class LagCompensatedPID(Policy):
         error = target_force - force
         is_lagged, frequency, damping = self.lag.split(1, dim=1)
         k1, k2, k3, k4 = (
+            # coefficients of (s + a)^4: four equal poles of the error dynamics
             factor * (_RECOVERY_RATIO * frequency) ** power
             for factor, power in ((4.0, 1), (6.0, 2), (4.0, 3), (1.0, 4))
         )

@@ -71,6 +71,8 @@ def refine_turns(
     distinct: dict[tuple[int, ...], tuple[RouteProblem, RouteSolution]] = {}
     for candidate in candidates:
         if candidate[1].time < _MAX_TIME_RATIO * candidates[0][1].time:
+            # one course per sequence of turns, since the refinement changes lengths but not the
+            # sequence
             distinct.setdefault(candidate[0].route.turn_signs, candidate)
     for problem, solution in list(distinct.values())[:_MAX_REFINED_COURSES]:
         yield _refine_course_turns(turns, problem, solution, turn_maker)
@@ -90,6 +92,7 @@ def _refine_course_turns(
         values = solution.z * route.units
         spacing = angle_spacing / (turn_maker.nomoto.gain * np.abs(rudder))
         hold_times = np.maximum(values[2::2], 2.0 * spacing + 0.1 * turn_maker.dt)
+        # five hold times about the present one: enough for a cubic spline, and few simulations
         hold_grid = hold_times[:, None] + spacing[:, None] * np.arange(-2, 3)
         turn_tables, middle_turns = simulate_following_turns(
             turn_maker, hold_grid, rudder, initial_states, turns.min_radius
@@ -206,8 +209,8 @@ def find_quickest_course(
         for distance, buoy in zip(start_distances, request.buoys, strict=True)
     ):
         raise ConfigError(
-            "no course to plan: it begins within every circle that it is to enter; move a buoy or"
-            " the start"
+            "no course to plan: the start is within all circles that are to be entered; move a buoy"
+            " or the start"
         )
     reasons: list[tuple[float, int, str]] = []
     course = _find_course(request, step, extension_length, turn_maker, reasons)
@@ -299,7 +302,8 @@ def _select_valid_routes(
     feasible = [candidate for candidate in solutions if candidate[1].max_violation <= max_violation]
     if valid or not feasible:
         return valid
-    # the soft constraints hold the side of buoys that the route passes before or after their turn
+    # the side on which a buoy is passed before or after its own turn is a soft constraint, which
+    # may be violated slightly
     problem, solution = min(feasible, key=lambda candidate: candidate[1].time)
     solution = problem.solve_with_hard_penalty(solution.z)
     return [(problem, solution)] if _passes_check(request, problem, solution, step, reasons) else []

@@ -260,7 +260,7 @@ class _Poses:
             return
         step = 2.0 * math.pi / _ANGLES
         pose_index = np.arange(_ANGLES)
-        # round a buoy to starboard the place on the circle moves with growing angle
+        # in a turn to starboard the angle of the position on the circle increases
         steps_on_arc = (self.turn_sign * (pose_index[None, :] - pose_index[:, None])) % _ANGLES
         cost_via_entry = self.cost[self.arc][:, None] + self.arc_radius * step * steps_on_arc
         best_entry = cost_via_entry.argmin(axis=0)
@@ -410,7 +410,7 @@ class RouteSearch:
         arrival_points, arrival_lengths = self._path_ends(target, is_departure=False)
         radii = self.radii
         if is_first and len(radii):
-            # a circle in which the course begins is left first
+            # circles that contain the start are ignored on the first part of the course
             radii = np.where(np.abs(self.centres - self.start) < radii, 0.0, radii)
         is_clear = (
             (np.abs(target.positions[:, None] - self.centres) >= radii).all(axis=1)
@@ -424,7 +424,7 @@ class RouteSearch:
             reachable = np.flatnonzero(is_clear)
             if len(usable) == 0 or len(reachable) == 0:
                 continue
-            # straight parts before the first and behind the last turn
+            # straight parts before the first and after the last turn
             path_starts = departure_points[usable] + self.turn_room.lead_in * np.exp(
                 1j * source.headings[usable]
             )

@@ -115,10 +115,13 @@ class TurnMaker:
         """
         n, k = hold_times.shape
         x = np.stack(initial_states)
+        # turns are tabulated from the origin with heading north and moved to their place by the
+        # planner
         x[:, list(self.pose_columns)] = 0.0
         largest = float(np.abs(rudder).max())
         rudder_phase = self._simulate_phase(x, rudder, float(hold_times.max()), 2.0 * largest)
         rows = np.repeat(np.arange(n), k)
+        # one simulation per hold time from here on; the first phase is shared by all hold times
         counter_rudder_phase = self._simulate_phase(
             _evaluate_rows(rudder_phase, hold_times.ravel(), rows),
             -rudder[rows],
@@ -169,7 +172,8 @@ class TurnMaker:
         remaining_time = max(duration, 3.0 * self.dt)
         if self.vessel.rate is not None:
             rudder_travel_time = rudder_change / self.vessel.rate
-            # the rudder is constant within a step and lags by half a step on average
+            # the rudder is constant within a step and lags by half a step on average, which changes
+            # the heading by up to K delta dt / 2
             short_step = min(self.dt, 4.0 * _STEP_TOLERANCE / (self.nomoto.gain * rudder_change))
             count = math.ceil(min(1.1 * rudder_travel_time, remaining_time) / short_step)
             step_plan = [(short_step, count)]
@@ -202,6 +206,7 @@ class TurnMaker:
         stop_times = []
         for row, initial_yaw_rate in enumerate(turn_signs * countered.c[-1, 0, :, column]):
             yaw = PPoly(countered.c[:, :, row, column], countered.x)
+            # the root of the spline is continuous in the hold time, unlike the nearest time step
             roots = yaw.roots(extrapolate=False) if initial_yaw_rate > 0 else np.zeros(1)
             stop_times.append(float(roots[0]) if len(roots) else float(countered.x[-1]))
         return np.array(stop_times)
@@ -211,6 +216,7 @@ def _evaluate_rows(states: CubicSpline, times: Array, rows: NDArray[np.intp]) ->
     """Evaluate the spline of M rows at one time [M] in s each; returns states [M, nx]."""
     interval = np.clip(np.searchsorted(states.x, times, side="right") - 1, 0, len(states.x) - 2)
     time_in_interval = (times - states.x[interval])[:, None]
+    # `polyval` evaluates each row with its own coefficients, which `PPoly` cannot
     row_states: Array = np.asarray(
         np.polyval(states.c[:, interval, rows], time_in_interval), dtype=np.float64
     )
@@ -236,6 +242,7 @@ def choose_time_step(vessel: SteeredVessel, nomoto: NomotoModel, rudder: float) 
     hold_times = nomoto.time * np.array([[0.5, 1.5, 3.0]])
     radius = nomoto.speed / (nomoto.gain * rudder)
     dt = _STEP_SEARCH[0] * nomoto.time
+    # the first step has no coarser simulation to compare with
     previous_ends = None
     for _ in range(_STEP_SEARCH[1]):
         turn_maker = TurnMaker(vessel, nomoto, dt)
@@ -299,7 +306,7 @@ def simulate_steady_turn(
     first_step = steps - max(steps // 10, 1)
     distance = float((track[first_step + 1 :] - track[first_step:-1]).norm(dim=-1).sum())
     heading_change = float((psi[-1] - psi[first_step]).abs())
-    # arcs are longer than their chords
+    # length of the arcs from that of their chords: factor (a / 2) / sin(a / 2) for an angle a
     half_step_angle = 0.5 * heading_change / (steps - first_step)
     distance *= half_step_angle / math.sin(half_step_angle)
     elapsed = (steps - first_step) * dt
@@ -407,6 +414,7 @@ class TurnTable:
 
         Line, arc and line approximate the end positions of the turns by least squares.
         """
+        # short turns are dominated by the start-up, and beyond 300 deg legs do not occur
         is_usable = (self.angles > math.radians(20.0)) & (self.angles < math.radians(300.0))
         turn_rotation = np.exp(1j * self.angles[is_usable])
         usable_ends = self.end_positions[is_usable]
@@ -537,6 +545,8 @@ def simulate_turns(turn_maker: TurnMaker, rudder: Array, radius: float) -> TurnT
                 lateral_shift,
                 abs(float(course[-1]) - headings[k, -1]),
             )
+            # a cubic weight leaves the start of the turn and its slope and curvature there
+            # unchanged
             points[k] += share**3 * (leg_origin - points[k, -1])
             headings[k] += share**3 * (course[-1] - headings[k, -1])
         zero_row = np.zeros((1, POINTS))
@@ -583,6 +593,7 @@ def simulate_following_turns(
         track, course = middle_turn.leg_at(np.linspace(0.0, settling_time, 80))
         positions = (track - track[0]) @ (1.0, 1j) * np.exp(-1j * course[0])
         leg = np.stack((positions.real, positions.imag, course - course[0]), axis=-1)
+        # tables hold turns to starboard; turns to port are mirrored
         if angle < 0:
             points = points.conj()
             headings = -headings
@@ -629,6 +640,7 @@ def _hold_times(share: Array, rudder: float, nomoto: NomotoModel) -> Array:
         nomoto: K and T of the vessel.
     """
     max_hold_time = _MAX_TURN_ANGLE / (nomoto.gain * rudder) + math.log(2.0) * nomoto.time
+    # a finer grid for short turns, whose shape changes more with the hold time
     return share**1.3 * max_hold_time
 
 
@@ -809,6 +821,7 @@ class Route:
 
     def __post_init__(self) -> None:
         self.units = np.ones(2 + 2 * len(self.turn_signs))
+        # variables of order one, so that one trust radius applies to all of them
         self.units[1::2] = self.turns.min_radius
         self.units[2::2] = self.turns.min_radius / self.turns.speed
 
@@ -821,6 +834,7 @@ class Route:
             table = self.turns.tables[turn.table]
             _, lead_in, lead_out = table.fitted_arc
             z[2 + 2 * k] = table.hold_time(turn.angle)
+            # small turns need less straight length; 0.8 rad is where the full length is needed
             room_share = min(turn.angle / 0.8, 1.0)
             legs[k] -= room_share * lead_in
             legs[k + 1] -= room_share * lead_out
@@ -916,6 +930,7 @@ class Route:
         )
         d_shift = np.zeros(n_variables, complex)
         d_rotation = np.zeros(n_variables)
+        # each variable moves all later parts of the route as a rigid body
         rotation_pivot = np.full(n_variables, self.start)
         d_rotation[0] = 1.0
         d_shift[1] = leg_directions[0]

@@ -231,12 +231,13 @@ class RatedBangBangHeading(Policy):
         error = wrap_angle(reference - x[:, self.psi : self.psi + 1])
         yaw_rate = x[:, self.r : self.r + 1]
         rudder_angle = x[:, self.delta : self.delta + 1]
-        # this step goes by as it is: the rudder answers at its end
+        # the rudder responds at the end of this step: the state is predicted to that time
         steady = self.gain * rudder_angle
         next_yaw_rate = steady + (yaw_rate - steady) * math.exp(-self.dt / self.time)
         error = error - steady * self.dt - self.time * (yaw_rate - next_yaw_rate)
         yaw_rate = next_yaw_rate
-        # the way that the vessel will have turned once the rudder is amidships
+        # direction of the turn after the rudder has been moved amidships, in which braking is
+        # computed
         centred_yaw_rate = self._ramp_rudder(
             yaw_rate, rudder_angle, torch.zeros_like(rudder_angle)
         )[0]
@@ -247,6 +248,7 @@ class RatedBangBangHeading(Policy):
         rudder = turn_direction * rudder_angle
         lower = torch.zeros_like(r)
         upper = torch.full_like(r, 20.0 * self.limit)
+        # bisection with a fixed number of steps works on batches and can be traced
         for _ in range(_N_BISECTIONS):
             trial_effort = 0.5 * (lower + upper)
             is_turning = self._simulate_braking(r, rudder, trial_effort)[0] > 0
@@ -458,8 +460,8 @@ class ProximateTimeOptimalLaw(HeadingLaw):
         predicted_error = error
         predicted_rate = r
         if self.swing_time > 0.0:
-            # the rudder answers its own angle with a gain above one, within its rate: a gradient
-            # through that would grow from step to step and say nothing of the flight
+            # the command depends on the rudder angle with a gain above one, which only the rate
+            # limit keeps stable: gradients through this loop would grow from step to step
             predicted_error, predicted_rate = predict_centred_rudder(
                 error, r, rudder_share.detach(), force, decay, self.swing_time
             )

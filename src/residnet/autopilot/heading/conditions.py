@@ -121,6 +121,7 @@ class ConditionsConfig(Config):
 
     @model_validator(mode="after")
     def _check_ranges(self) -> ConditionsConfig:
+        # limits that keep a simulation meaningful, beyond the types of the fields
         ranges = {
             "effect": (*self.effect, 1e-6, 10.0),
             "time": (*self.time, 1e-6, 10.0),
@@ -131,7 +132,9 @@ class ConditionsConfig(Config):
         if self.depth is not None:
             ranges["depth.change"] = (*self.depth.change, 1e-3, 1e4)
             if self.waves > 0:
-                raise ValueError("waves: they move the heading that is measured, and no depth")
+                raise ValueError(
+                    "waves: they affect the measured heading only; set them to zero with `depth`"
+                )
         check_steps(self.hold + self.duration, self.dt)
         if self.wind is not None:
             ranges["wind"] = (*self.wind, 0.0, 60.0)
@@ -188,6 +191,7 @@ class ConditionsConfig(Config):
 
         hold_steps = round(self.hold / dt)
         steps = hold_steps + round(self.duration / dt)
+        # white noise of equal spectral density: the variance is proportional to 1 / dt
         scale = share * math.sqrt(self.dt / dt)
         noise_levels = [self.noise_psi, self.noise_r]
         noise_levels = noise_levels if self.depth is None else [self.depth.noise, *noise_levels]
@@ -212,7 +216,7 @@ class ConditionsConfig(Config):
             n_counted=steps - hold_steps,
         )
         if self.waves > 0:
-            # drawn last, so that all else is the same with waves and without
+            # drawn last, so that all other random numbers are the same with and without waves
             noise_level = sample_uniform(0.0, share * self.waves)
             period = sample_uniform(*self.wave_period)
             noise += noise_level[:, None, None] * sample_wave_motion(period, steps, dt, generator)
@@ -270,11 +274,12 @@ def sample_wave_motion(period: Tensor, steps: int, dt: float, generator: torch.G
         generator: random generator of the phases.
     """
     band_edges = torch.linspace(0.7, 1.8, _N_WAVE_COMPONENTS + 1)
-    # somewhere within its band each, so that the sum does not repeat itself
+    # a random frequency within each band: equally spaced frequencies would give a periodic motion
     band_fraction = torch.rand(len(period), _N_WAVE_COMPONENTS, generator=generator)
     ratio = band_edges[:-1] + band_fraction * torch.diff(band_edges)
     density = JonswapSpectrumConfig().spectral_density(ratio.numpy(), 1.0, 2.0 * math.pi)
     power = torch.from_numpy(density).float()
+    # a sine has the variance a^2 / 2; the sum of all variances is one
     amplitude = (2.0 * power / power.sum(1, keepdim=True)).sqrt()
     omega = ratio * (2.0 * math.pi / period[:, None])
     phase = 2.0 * math.pi * torch.rand(len(period), _N_WAVE_COMPONENTS, generator=generator)
@@ -297,6 +302,7 @@ def sample_gauss_markov(rows: int, steps: int, step: float, generator: torch.Gen
 
     decay_factor = math.exp(-step)
     white_noise = torch.randn(rows, steps, generator=generator, dtype=torch.float64).numpy()
+    # the first sample has unit variance, so that the process is stationary from the start
     white_noise[:, 1:] *= math.sqrt(1.0 - decay_factor * decay_factor)
     return torch.from_numpy(lfilter([1.0], [1.0, -decay_factor], white_noise, axis=1)).float()
 

@@ -116,16 +116,19 @@ class OddGRUCell(nn.Module):
         nn.init.normal_(self.gates.weight, std=1.0 / math.sqrt(n_joint))
         nn.init.zeros_(self.gates.bias)
         nn.init.normal_(self.candidate.weight, std=1.0 / math.sqrt(n_joint))
+        # a zero output at first, so that training starts from the control law alone
         nn.init.zeros_(self.out.weight)
         self.units = units
         self.trained_at = dt
 
     def forward(self, features: Tensor, memory: Tensor, dt: float) -> tuple[Tensor, Tensor]:
         """Return the output [B, 1] and the memory [B, units] after a step of dt seconds."""
+        # gates of absolute values do not change under a reflection, so that the cell is odd
         magnitudes = torch.cat((features, memory), dim=1).abs()
         update, reset = torch.sigmoid(self.gates(magnitudes)).chunk(2, dim=1)
         retention = (1.0 - update).clamp(min=1e-6)
         if dt != self.trained_at:
+            # exponential decay: n steps of dt retain as much as one step of n dt
             retention = retention.pow(dt / self.trained_at)
         candidate = torch.tanh(self.candidate(torch.cat((features, reset * memory), dim=1)))
         memory = candidate + retention * (memory - candidate)
@@ -238,12 +241,14 @@ class HeadingObserver(nn.Module):
         zero_innovation = torch.zeros_like(r_innovation)
         heading_innovation = torch.where(is_lost, zero_innovation, heading_innovation)
         r_innovation = torch.where(is_lost, zero_innovation, r_innovation)
+        # exact gains of a first-order filter, below one for any time step
         filter_gains = [1.0 - torch.exp(-self.dt * rate) for rate in constants[:2]]
         rate_correction = (
             filter_gains[1] * r_innovation + self.dt * constants[3] * heading_innovation
         )
         heading = heading + filter_gains[0] * heading_innovation
         yaw_rate = yaw_rate + rate_correction
+        # from T r_dot = K d with K ~ speed and T ~ 1 / speed
         rudder_per_rate = self.time / (self.gain * ratio.square())
         disturbance = (disturbance + constants[2] * rudder_per_rate * rate_correction).clamp(
             -self.limit, self.limit
@@ -278,6 +283,8 @@ class HeadingObserver(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Predict heading and yaw rate [B, 1] for the time when all pending commands have acted."""
         time_constant = self.time / ratio
+        # each pending command acts for one step, then its effect decays until the end of the dead
+        # time
         step_response = 1.0 - torch.exp(-self.dt / time_constant)
         remaining_decay = torch.exp(-self.remaining_lag / time_constant)
         steady_rates = self.gain * ratio * (pending + disturbance)
@@ -460,9 +467,13 @@ class ObservedPolicy(HeadingPolicy):
         unlimited_share = law_share
         if self.units > 0:
             max_yaw_rate = self.gain * ratio * self.limit
+            # innovations of white noise grow with 1 / sqrt(dt), and features must have the same
+            # size as in training
             noise_scale = math.sqrt(self.dt / self.trained_at)
             features = torch.cat(
                 (
+                    # several scales of the error: saturated ones resolve small errors, the linear
+                    # one large ones
                     torch.tanh(wrap_angle(reference - psi) / self.radians_per_degree),
                     torch.tanh(error / self.radians_per_degree),
                     torch.tanh(error / (5.0 * self.radians_per_degree)),

@@ -112,33 +112,35 @@ class SteeredVessel(ABC):
         times, rates, headings = self._simulate_step_response(angle, duration, dt)
         if self.axis.value != self.axis.angle:
             last_half = np.array_split(headings, 2)[1]
-            # an angle that is righted nears its end; one that is not goes round and round
+            # with a restoring moment the angle becomes steady; without one it increases steadily
             if not np.ptp(last_half) <= abs(last_half.mean()):
                 raise FitError(
-                    f"at {angle:.3g} rad of planes the vessel is at {headings[-1]:.3g} rad after"
-                    f" {times[-1]:.3g} s and does not come to rest: nothing rights it. The planes"
-                    " hold an angle against what rights the vessel: check that its weight lies"
-                    " below its buoyancy (rigid_body.z_G, buoyancy.z_B) and its speed, or give"
-                    " turning_time more"
+                    f"at a plane angle of {angle:.3g} rad the dive angle is {headings[-1]:.3g} rad"
+                    f" after {times[-1]:.3g} s and not steady, as without a restoring moment; check"
+                    " that the centre of gravity is below that of buoyancy (rigid_body.z_G,"
+                    " buoyancy.z_B), and the speed, or increase turning_time"
                 )
             return self._estimate_restoring(angle, float(headings[-1]), speed, dt)
         while times[-1] < _MAX_DURATION_FACTOR * duration and not _is_steady(times, rates):
             times, rates, headings = self._simulate_step_response(angle, 2.0 * float(times[-1]), dt)
         if not np.isfinite(rates).all():
-            raise FitError(f"the vessel's motion does not stay finite at {angle:.3g} rad of rudder")
+            raise FitError(
+                f"the motion of the vessel is not finite at a rudder angle of {angle:.3g} rad"
+            )
         steady = float(rates[-1])
         is_first_order = steady * angle > 0 and _is_steady(times, rates)
         if is_first_order and (rates / steady).max() <= 1.0 + _MAX_OVERSHOOT:
             time = float(np.trapezoid(steady - rates, times)) / steady
+            # a ramp to the angle delays the response by half of the time of the rudder movement
             time -= 0.0 if self.rate is None else 0.5 * abs(angle) / self.rate
             if time > 0:
                 return NomotoModel(gain=steady / angle, time=time, speed=speed)
         reached_indices = np.flatnonzero(headings * np.sign(angle) >= abs(angle))
         if len(reached_indices) == 0:
             raise FitError(
-                f"at {angle:.3g} rad of rudder the vessel does not turn by as much to that side"
-                f" within {times[-1]:.3g} s; it cannot be steered (check the sign of its rudder and"
-                " the limit)"
+                f"at a rudder angle of {angle:.3g} rad the heading does not change by this angle"
+                f" within {times[-1]:.3g} s; the vessel cannot be steered (check the sign of its"
+                " rudder and the limit)"
             )
         first_switch_time = float(times[reached_indices[0]])
         response = fit_response(
@@ -159,9 +161,9 @@ class SteeredVessel(ABC):
         """
         if not (math.isfinite(final_angle) and final_angle * angle > 0):
             raise FitError(
-                f"at {angle:.3g} rad of rudder the vessel comes to rest at an angle of"
-                f" {final_angle:.3g}"
-                " rad; it cannot be steered (check the sign of the command that steers)"
+                f"at a rudder angle of {angle:.3g} rad the final angle of the vessel is"
+                f" {final_angle:.3g} rad; it cannot be steered (check the sign of the steering"
+                " command)"
             )
         restoring = angle / final_angle
         first_switch_time = 2.0 * self._longest_step(dt)
@@ -203,6 +205,8 @@ class SteeredVessel(ABC):
                     times.append(times[-1] + dt)
                     rates.append(rate_sign * float(x[0, r]))
                     headings.append(rate_sign * (float(x[0, psi]) - initial_heading))
+                # the step doubles: the beginning of the response needs short steps, its end only
+                # long ones
                 dt = min(2.0 * dt, longest_step)
         return np.array(times), np.array(rates), np.array(headings)
 
@@ -237,10 +241,9 @@ class SteeredVessel(ABC):
             while switches < _N_ZIGZAG_SWITCHES:
                 if len(rates) > _MAX_ZIGZAG_STEPS:
                     raise FitError(
-                        f"a zigzag with {abs(angle):.3g} rad of rudder does not turn the vessel"
-                        f" back within {dt * _MAX_ZIGZAG_STEPS:.3g} s; it cannot be steered with"
-                        " so little"
-                        " rudder"
+                        f"a zigzag with a rudder angle of {abs(angle):.3g} rad does not reverse the"
+                        f" turn within {dt * _MAX_ZIGZAG_STEPS:.3g} s; the vessel needs a larger"
+                        " rudder angle"
                     )
                 headings.append(self.axis.side * (float(x[0, psi]) - initial_heading))
                 if rudder_sign * headings[-1] > abs(switch_angle):
@@ -281,7 +284,8 @@ class SteeredPlant(SteeredVessel):
         self.state = plant.state_names
         self.inputs = (axis.command, *other_inputs)
         self._straight_course_state = plant.make_initial_state(1)
-        # a propeller heels what turns about all axes
+        # with six degrees of freedom the propeller torque heels the vessel on a straight course, so
+        # that its steady state must be simulated
         if (
             plant.attitude_columns
             or float(self._straight_course_state[0, self.state_column("u")]) == 0.0

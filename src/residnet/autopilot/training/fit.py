@@ -214,7 +214,7 @@ class PolicyFit(EpochTraining):
         )
         late_variance = trajectories.late_command_variance(_LATE_FRACTION)[:n_quiet]
         excess = (late_variance - free_variance).clamp(min=0.0)
-        # the nominal vessel is left out: its large changes may not be complete
+        # without the nominal vessel, whose large changes may not be complete at the evaluation
         nominal_rows = slice(n_quiet // 2, n_quiet // 2 + n_quiet // 4)
         excess = torch.cat((excess[: nominal_rows.start], excess[nominal_rows.stop :]))
         largest_excess = excess.topk(math.ceil(n_quiet / 4)).values.mean()
@@ -337,7 +337,7 @@ class HeadingChangesData(EpochDataModule):
 
 
 def _warn_not_compiled(error: ExportError) -> None:
-    log_message(f"  the flights are not compiled, training is much slower: {error}")
+    log_message(f"  the simulations are not compiled, training is much slower: {error}")
 
 
 def train_policy(
