@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import shutil
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from made_once import made_once
+from sample_package import TASKS, install
 from tiny import TINY, Command, Said, call, write_yaml
 
+from residnet.core.registry import clear_caches
 from residnet.export import vessel
 
 DEAR = (
@@ -44,6 +48,17 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
         return Said(call(monkeypatch, *words), *capsys.readouterr())
 
     return carried_out
+
+
+@pytest.fixture(scope="module")
+def example_tasks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The tasks `actuators` and `import` of examples/residnet_tasks, as if it were installed."""
+    site = install(tmp_path_factory.mktemp("site"), TASKS)
+    sys.path.insert(0, str(site))
+    clear_caches()
+    yield
+    sys.path.remove(str(site))
+    clear_caches()
 
 
 @pytest.fixture(scope="session")

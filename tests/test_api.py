@@ -20,7 +20,7 @@ from residnet.core.errors import ResidnetError
 from residnet.evaluation.metrics import build_metrics_table
 from residnet.evaluation.protocol import EvaluationConfig
 from residnet.export import vessel
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.prepare import PrepareConfig
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "fifteen_lines.py"

@@ -176,6 +176,16 @@ def test_no_circles() -> None:
     assert len(order) == len(MODULES)
 
 
+def test_a_task_package_has_a_config_that_imports_no_executor() -> None:
+    """A config names its executor by its place; only `PackageTask.executor` imports it."""
+    executors = {module for module in MODULES if module.endswith(".execute")}
+    assert {"residnet.tasks.fit.execute", "residnet.autopilot.tasks.course.execute"} <= executors
+    for executor in executors:
+        config = f"{executor.removesuffix('.execute')}.config"
+        assert config in MODULES, f"{executor} has no config beside it"
+        assert not imports(MODULES[config], at_work=True) & executors, config
+
+
 def test_lightning_is_imported_by_trainings_and_their_data_only() -> None:
     names = {"lightning", "pytorch_lightning"}
     heavy = {

@@ -45,6 +45,6 @@ def test_lists_tables_and_errors_of_files_and_tasks_import_nothing_heavy(tmp_pat
     assert loaded(f"inspect {tmp_path / 'log.csv'}") == ["pandas"]
 
 
-def test_a_check_and_errors_of_a_fit_import_torch_alone() -> None:
-    """Its models are built as they are read, so that what does not fit together is refused."""
-    assert loaded("check quickstart -s nme=3", "check quickstart") == ["torch"]
+def test_a_check_and_errors_of_a_fit_import_nothing_heavy() -> None:
+    """The parts are checked by their configs; simulated trials are replaced by dummy logs."""
+    assert loaded("check quickstart -s nme=3", "check quickstart") == []

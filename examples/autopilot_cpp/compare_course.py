@@ -64,8 +64,8 @@ def eager(run: Path, card: dict[str, Any]) -> Any:
     called one by one from Python.
     """
     from residnet.autopilot.export import GuardedCoursePolicy
-    from residnet.autopilot.tasks.course import CourseTaskConfig
-    from residnet.autopilot.tasks.course_run import (
+    from residnet.autopilot.tasks.course.config import CourseTaskConfig
+    from residnet.autopilot.tasks.course.execute import (
         load_policy,
         open_autopilot_run,
         plan_with_guidance,

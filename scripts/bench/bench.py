@@ -99,7 +99,7 @@ def scattered(vessel: str, random: np.random.Generator, folder: Path) -> str:
 def programme(vessel: str, seed: int, trials: list[dict[str, Any]], **keys: Any) -> Any:
     """Return `SimulatedTrials` of a minute at 10 Hz in noise; `keys` are further ones."""
     from residnet.core.config import validate_config
-    from residnet.manoeuvres.trials import SimulatedTrials
+    from residnet.manoeuvres.trials_config import SimulatedTrials
 
     content: dict[str, Any] = {
         "vessel": vessel,

@@ -33,7 +33,7 @@ from residnet.autopilot.heading.classical import HeadingPD
 from residnet.autopilot.heading.controllers import ControlTask
 from residnet.autopilot.heading.steering_variation import Vessels
 from residnet.autopilot.heading.vessels import SteeredPlant
-from residnet.autopilot.tasks.course_run import simulate_course
+from residnet.autopilot.tasks.course.execute import simulate_course
 from residnet.core.errors import ResidnetError
 from residnet.physics.vessel import load_vessel
 

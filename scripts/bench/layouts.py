@@ -30,7 +30,8 @@ from residnet.core.log import Log
 from residnet.io.drafting.questions import DraftNotes
 from residnet.io.drafting.tables import draft_tables
 from residnet.io.readers import ReaderConfig
-from residnet.manoeuvres.trials import SimulatedTrials, simulate_trial_logs
+from residnet.manoeuvres.trials import simulate_trial_logs
+from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.tasks.demo import DEMO_TRIALS
 
 DEG, KN = 180.0 / math.pi, 3600.0 / 1852.0

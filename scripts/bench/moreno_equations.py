@@ -19,11 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from residnet.baselines.given import EquationsConfig
+from residnet.baselines.given_config import EquationsConfig
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.rollout import Rollout
 from residnet.heads.base import ZeroHead
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.tasks.registry import load_task
 
 CONFIG = bench.CONFIGS / "studies" / "moreno2019" / "moreno2019.yaml"

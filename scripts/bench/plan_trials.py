@@ -34,10 +34,11 @@ from residnet.identification.planning import (
 )
 from residnet.identification.prepared import compute_velocity_limits, prepare_splits
 from residnet.identification.settings import FitSettings
-from residnet.manoeuvres.actuated import InputShare
+from residnet.manoeuvres.input_shares import InputShare
 from residnet.manoeuvres.trials import simulate_trial_logs
 from residnet.physics.vessel import load_vessel
-from residnet.preprocessing.prepare import PreparedLog, make_samples
+from residnet.preprocessing.prepare import PreparedLog
+from residnet.preprocessing.samples import make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.training.left_out import RefitUncertainty, estimate_refit_covariance
 

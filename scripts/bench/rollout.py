@@ -40,18 +40,21 @@ from scipy.optimize import least_squares
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, TensorDataset
 
-from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
+from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.columns import all_but_pose
 from residnet.core.processes import retain_freed_memory
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.compiled import CompiledRollout
 from residnet.engine.rollout import TRAINING_STEPS, FreeRun, Rollout, trace_rollout
 from residnet.heads.base import ZeroHead
-from residnet.heads.lstm import LstmConfig
-from residnet.physics.signals import SignalsConfig
-from residnet.preprocessing.prepare import PrepareConfig, make_samples, prepare_log
+from residnet.heads.lstm_config import LstmConfig
+from residnet.physics.signals_config import SignalsConfig
+from residnet.preprocessing.prepare import PrepareConfig, prepare_log
+from residnet.preprocessing.samples import make_samples
 from residnet.preprocessing.windows import WindowSampler, WindowStore
-from residnet.training.refit import RefitConfig, build_problem, refit, simulate
+from residnet.training.refit import build_problem, refit, simulate
+from residnet.training.refit_config import RefitConfig
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")
 _BATCH = 1_024

@@ -22,7 +22,8 @@ from residnet.core.config import load_config
 from residnet.core.log import Log
 from residnet.identification.fitter import FitStore, Fitter
 from residnet.identification.prepared import prepare_splits
-from residnet.manoeuvres.trials import ManoeuvreRun, SimulatedTrials, build_plant, simulate_trials
+from residnet.manoeuvres.trials import ManoeuvreRun, build_plant, simulate_trials
+from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.tasks.fit.config import FitConfig
 
 _DETERMINED = 2.5

@@ -47,14 +47,17 @@ from made_odin import (
     simulate,
 )  # fmt: skip
 
-from residnet.baselines.given import EquationsConfig
+from residnet.baselines.given_config import EquationsConfig
 from residnet.core.config import load_mapping
 from residnet.core.errors import ConfigError
 from residnet.core.names import ACCELERATION_NAMES, to_si
-from residnet.heads.genetic import GeneticConfig
-from residnet.heads.symbolic import SegmentedSamples, SymbolicConfig, find_best_delay
-from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term
-from residnet.regression.sparse import SparseSearchConfig, find_equation, reduce_problem
+from residnet.heads.genetic_config import GeneticConfig
+from residnet.heads.symbolic import SegmentedSamples, find_best_delay
+from residnet.heads.symbolic_config import SymbolicConfig
+from residnet.physics.term_library import TermLibrary
+from residnet.physics.terms import CandidatesConfig, parse_term
+from residnet.regression.sparse import find_equation, reduce_problem
+from residnet.regression.sparse_config import SparseSearchConfig
 
 Log = dict[str, np.ndarray]
 Signal = Callable[[np.ndarray], np.ndarray]

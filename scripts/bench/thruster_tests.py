@@ -1,4 +1,4 @@
-"""Make the tests of thrusters that configs/studies/woo2018/thrusters.yaml identifies.
+"""Make the tests of thrusters that examples/residnet_tasks/configs/thrusters.yaml identifies.
 
     python scripts/bench/thruster_tests.py [FOLDER]
 
@@ -18,11 +18,11 @@ import pandas as pd
 import torch
 
 from residnet.core.names import to_si
-from residnet.physics.actuators import Thrusters
+from residnet.physics.actuators.thrusters import Thrusters
 from residnet.physics.hull import FossenConfig
 from residnet.physics.vessel import load_vessel
 
-FOLDER = bench.CONFIGS / "studies" / "woo2018" / "thruster_tests"
+FOLDER = bench.CONFIGS.parent / "examples" / "residnet_tasks" / "configs" / "thruster_tests"
 RPM = to_si("rpm")
 SLOPE = 2800.0
 """Revolutions in rpm per unit of throttle; the document's Figure 4 saturates before full throttle.

@@ -32,7 +32,7 @@ RUNS = (
     *("simulate_wam_v", "autopilot_nomoto", "sweep_quickstart", "studies/jervan2020/case"),
     *("studies/halvorsen2019/force_equations", "studies/gouletas2020/table_6_3"),
 )
-FORMATS = ("torchscript", "onnx", "c", "casadi", "fmu", "parameters")
+FORMATS = ("torchscript", "onnx", "c", "casadi", "fmu2", "parameters")
 EXPORTED = (
     *(("quickstart", model) for model in ("baseline", "mlp", "lstm")),
     ("autopilot_conditions", "learned"),

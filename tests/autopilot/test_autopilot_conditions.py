@@ -14,8 +14,8 @@ from tiny import call, read_json, write_yaml
 
 from residnet.autopilot.evaluation import describe_limit_cycles, list_policy_objections
 from residnet.autopilot.report.heading import cost_sentences
-from residnet.autopilot.tasks.autopilot import AutopilotConfig
-from residnet.autopilot.tasks.autopilot_run import load_trained_policy
+from residnet.autopilot.tasks.autopilot.config import AutopilotConfig
+from residnet.autopilot.tasks.autopilot.execute import load_trained_policy
 from residnet.core.config import load_config
 
 pytestmark = pytest.mark.long

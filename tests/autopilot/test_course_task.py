@@ -16,7 +16,7 @@ from read_page import plain
 from tiny import Command, call, read_json, write_yaml
 from tiny_tasks import COURSE, autopilot
 
-from residnet.autopilot.tasks.course import CourseSpreadConfig
+from residnet.autopilot.tasks.course.config import CourseSpreadConfig
 
 pytestmark = pytest.mark.long
 

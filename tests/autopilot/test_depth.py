@@ -22,7 +22,7 @@ from residnet.autopilot.heading.controllers import ControlTask, DepthConfig, Dep
 from residnet.autopilot.heading.steering_variation import DEPTH, VariedPlant
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.heading.vessels import SteeredPlant
-from residnet.autopilot.tasks.autopilot import AutopilotConfig
+from residnet.autopilot.tasks.autopilot.config import AutopilotConfig
 from residnet.core.errors import ConfigError, FitError
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.engine.rollout import Rollout

@@ -12,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 
 from residnet.autopilot.heading.turning import NomotoModel
-from residnet.autopilot.tasks.autopilot import AutopilotConfig, minimum_turn_time
+from residnet.autopilot.tasks.autopilot.config import AutopilotConfig, minimum_turn_time
 from residnet.autopilot.tasks.design import draft_autopilot_config
 from residnet.core.config import load_config, load_mapping
 from residnet.core.errors import UsageError

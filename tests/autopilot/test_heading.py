@@ -26,7 +26,7 @@ from residnet.autopilot.heading.predictive import DocumentAutopilot, Predictor, 
 from residnet.autopilot.heading.steering_variation import DEPTH, HEADING
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.heading.vessels import SteeredModel, SteeredPlant
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.errors import ConfigError
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.engine.rollout import Rollout

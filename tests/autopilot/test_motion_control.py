@@ -26,7 +26,7 @@ from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import Rollout
-from residnet.physics.actuators import AzimuthThrusters
+from residnet.physics.actuators.thrusters import AzimuthThrusters
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 

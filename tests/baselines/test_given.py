@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from residnet.baselines.given import BelievedConfig, EquationsConfig
+from residnet.baselines.given_config import BelievedConfig, EquationsConfig
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.core.registry import find_vessel_files
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.vessel import load_vessel
 from residnet.tasks.fit.config import FitConfig
 

@@ -8,7 +8,7 @@ import torch
 from made_samples import sampled
 from scipy.linalg import expm
 
-from residnet.baselines.steering import LinearSteadyConfig
+from residnet.baselines.steering_config import LinearSteadyConfig
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.regression.estimator import Coefficient

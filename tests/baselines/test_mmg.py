@@ -12,7 +12,9 @@ from made_samples import sampled
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from residnet.baselines.mmg import PARAMETER_NAMES, MMGBaseline, MMGConfig, default_priors
+from residnet.baselines.mmg import MMGBaseline
+from residnet.baselines.mmg_config import MMGConfig
+from residnet.baselines.mmg_parameters import PARAMETER_NAMES, default_priors
 from residnet.core.errors import ConfigError
 
 NAMES = ("u", "v", "r", "n", "delta")

@@ -14,13 +14,13 @@ import torch
 from made_samples import sampled
 
 from residnet.baselines.regressors import RegressorBaseline
-from residnet.baselines.steering import NomotoBaselineConfig, NomotoSideslipBaselineConfig
+from residnet.baselines.steering_config import NomotoBaselineConfig, NomotoSideslipBaselineConfig
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.rollout import Rollout
 from residnet.heads.base import ZeroHead
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 
 NAMES = ("u", "v", "r", "n", "delta")
 LAGS = {"T_u": 8.0, "K_u": 0.09, "b_u": -0.02, "T": 4.0, "K": 0.3, "b": 0.01}

@@ -13,13 +13,14 @@ from made_samples import sampled
 from sklearn.linear_model import Ridge
 from sklearn.preprocessing import PolynomialFeatures
 
-from residnet.baselines.given import ZeroBaselineConfig
-from residnet.baselines.regressors import RegressorsConfig, _find_undamped_term
+from residnet.baselines.given_config import ZeroBaselineConfig
+from residnet.baselines.regressors import _find_undamped_term
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.baselines.sets import drop_equivalent_terms
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
-from residnet.physics.terms import TermLibrary
+from residnet.physics.term_library import TermLibrary
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")
 TRUTH = {

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from residnet.autopilot.heading.vessels import SteeredModel, SteeredPlant
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import ResidnetError, UsageError
 from residnet.core.frames import compose_rotation, rotation_angle_between, to_earth, to_level_axes
@@ -29,14 +29,14 @@ from residnet.core.layout import (
 )
 from residnet.core.log import Log
 from residnet.core.run_loader import accept_run
-from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import save_model
+from residnet.dynamics.time_steps import Integrator
 from residnet.engine.jacobian import StepJacobian
 from residnet.engine.rollout import Rollout, trace_rollout
 from residnet.evaluation.freerun import compute_integration_errors, integrate_pose
 from residnet.heads.linear import RidgeConfig
-from residnet.heads.recurrent import GRUEnsembleConfig
+from residnet.heads.recurrent_config import GRUEnsembleConfig
 from residnet.identification.changes import PerturbedDynamics, SystemChange, make_fault_hypotheses
 from residnet.identification.monitoring import (
     ChangeDetector,
@@ -49,19 +49,18 @@ from residnet.manoeuvres.actuated import ActuatedDynamics, PlantActuators
 from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.open_loop import ConstantInput
 from residnet.manoeuvres.trials import (
-    DisturbanceConfig,
-    SensorsConfig,
-    SimulatedTrials,
     SimulatedVessel,
     TrialEnvironment,
     simulate_manoeuvres,
     simulate_trials,
 )
+from residnet.manoeuvres.trials_config import DisturbanceConfig, SensorsConfig, SimulatedTrials
 from residnet.physics.hull import SubmergedHullConfig
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.vessel import load_vessel
 from residnet.preprocessing.motion import MotionConfig, complete_motion
-from residnet.preprocessing.prepare import PrepareConfig, make_samples, prepare_log
+from residnet.preprocessing.prepare import PrepareConfig, prepare_log
+from residnet.preprocessing.samples import make_samples
 from residnet.quality import inspect_log
 from residnet.simulators.ardupilot import ArduPilotBackend, assign_servos
 from residnet.simulators.vehicle import load_vehicle

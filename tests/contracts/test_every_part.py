@@ -15,7 +15,7 @@ import written_recorders
 from torch import Tensor
 
 from residnet.baselines import BaselineConfig
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, ResidnetError, UsageError
 from residnet.core.layout import VELOCITIES, DegreesOfFreedom
@@ -32,7 +32,7 @@ from residnet.heads.base import Features
 from residnet.heads.linear import RidgeConfig
 from residnet.io.readers import ReaderConfig
 from residnet.manoeuvres import ManoeuvreConfig
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.testing import (
     check_baseline,
     check_exporter,

@@ -75,9 +75,9 @@ def test_broken_part_raises_only_where_it_is_used() -> None:
     [
         (
             "residnet.heads.linear:PlsrConfig",
-            "not a subclass of residnet.heads.base.BaseHeadConfig",
+            "not a subclass of residnet.heads.config.BaseHeadConfig",
         ),
-        ("residnet.heads.base:BaseHeadConfig", "BaseHeadConfig lacks build"),
+        ("residnet.heads.config:BaseHeadConfig", "BaseHeadConfig lacks build"),
         ("residnet_sample.slow_water:SlowWaterConfig", "has no field `kind: Literal['odd']`"),
         ("residnet_sample.slow_water:Nothing", "AttributeError"),
         ("os", "not a subclass"),

@@ -10,19 +10,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.baselines.given import ZeroBaselineConfig
+from residnet.baselines.given_config import ZeroBaselineConfig
 from residnet.core.errors import ConfigError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.engine.rollout import Rollout
 from residnet.heads.base import ResidualHead, ZeroHead
-from residnet.manoeuvres.actuated import (
-    ActuatedDynamics,
-    GivenActuators,
-    InputShare,
-    PlantActuators,
-)
-from residnet.physics.signals import SignalsConfig
+from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators, PlantActuators
+from residnet.manoeuvres.input_shares import InputShare
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180

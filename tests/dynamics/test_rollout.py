@@ -15,14 +15,14 @@ from torch import Tensor
 
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.layout import HEADING, MOTION, POSITION
-from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import SampledDynamics
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.time_steps import Integrator
 from residnet.engine.rollout import Rollout
 from residnet.heads.base import ResidualHead, ZeroHead
-from residnet.heads.lstm import LstmConfig
-from residnet.heads.recurrent import GRUEnsembleConfig
-from residnet.physics.signals import SignalsConfig
+from residnet.heads.lstm_config import LstmConfig
+from residnet.heads.recurrent_config import GRUEnsembleConfig
+from residnet.physics.signals_config import SignalsConfig
 
 A = np.array([[-0.5, 0.0, 0.0], [0.0, -0.6, -0.4], [0.0, 0.2, -0.9]])
 B = np.array([[0.003, 0.0], [0.0, 0.0004], [0.0, 0.002]])

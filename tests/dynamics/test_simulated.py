@@ -22,8 +22,9 @@ from residnet.autopilot.heading.steering_variation import VariedPlant
 from residnet.autopilot.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError, ExportError
 from residnet.core.frames import to_body
-from residnet.dynamics.base import Dynamics, Integrator
-from residnet.dynamics.simulated import MAX_STEPS, InAmbientCurrent, PlantDynamics, check_steps
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.simulated import InAmbientCurrent, PlantDynamics
+from residnet.dynamics.time_steps import MAX_STEPS, Integrator, check_steps
 from residnet.engine import trace as lowering
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import Rollout

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 import torch
 
-from residnet.baselines.given import ZeroBaselineConfig
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.given_config import ZeroBaselineConfig
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.errors import ConfigError, UsageError
 from residnet.dynamics.store import ModelSpec, load_model, model_names, rebuild_module, save_model
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
 LOW = [-0.1, -0.2, -0.3, -4.0, -5.0]

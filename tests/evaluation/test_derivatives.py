@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.errors import UsageError
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.evaluation.derivatives import DerivativesFile, compute_derivatives
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.similarity import Particulars, estimate_added_mass
 
 SHIP = Particulars(

@@ -20,8 +20,8 @@ from residnet.evaluation import freerun
 from residnet.evaluation.freerun import Candidate, Prediction, integrate_pose, run_free_runs
 from residnet.evaluation.protocol import ManoeuvreProtocol, Window, WindowProtocol, make_windows
 from residnet.heads.base import ResidualHead, ZeroHead
-from residnet.heads.lstm import LstmConfig
-from residnet.physics.signals import SignalsConfig
+from residnet.heads.lstm_config import LstmConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.vessel import load_vessel
 from residnet.preprocessing.prepare import PreparedLog
 

@@ -10,7 +10,7 @@ import pytest
 from made_logs import made, random_states
 from scipy import stats
 
-from residnet.baselines.given import ZeroBaselineConfig
+from residnet.baselines.given_config import ZeroBaselineConfig
 from residnet.core.layout import DegreesOfFreedom
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.evaluation.freerun import Candidate, FreeRun, FreeRunErrors, Prediction
@@ -28,7 +28,7 @@ from residnet.evaluation.metrics import (
 from residnet.evaluation.protocol import Window, WindowProtocol
 from residnet.evaluation.selection import block_error_shares, make_selection_blocks
 from residnet.heads.base import ZeroHead
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.prepare import PreparedLog
 
 SIGNALS = SignalsConfig(inputs=("delta",)).build()

@@ -40,7 +40,7 @@ from residnet.evaluation.soundness import (
 )
 from residnet.heads.base import ResidualHead
 from residnet.heads.lstm import LstmHead
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
 
 STEP = 0.5

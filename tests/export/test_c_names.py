@@ -207,7 +207,7 @@ def test_what_the_tools_do_not_measure_is_estimated_and_said_so(
         assert 0.5 * measured[key] <= size[key] <= 4.0 * measured[key], key
 
 
-FORMATS = ("torchscript", "c", "casadi", "fmu")
+FORMATS = ("torchscript", "c", "casadi", "fmu2")
 KNOWN = Assessment(
     level="limited",
     verdict=("After a 40 s free run the position error is 8.6 m.", "Two logs were checked."),

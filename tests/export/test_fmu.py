@@ -1,4 +1,4 @@
-"""Co-simulation units of both versions in FMPy: valid, stepped at the model's step and at a
+"""Co-simulation units of FMI 2.0 in FMPy: valid, stepped at the model's step and at a
 multiple, and refused at other steps.
 """
 
@@ -19,6 +19,7 @@ from fmpy.fmi1 import FMICallException
 from fmpy.simulation import instantiate_fmu
 from fmpy.validation import validate_fmu
 
+from residnet.core.errors import ConfigError
 from residnet.engine.c_code import find_compiler
 from residnet.engine.rollout import Rollout
 from residnet.export import fmu, get_exporter
@@ -28,11 +29,10 @@ pytestmark = [pytest.mark.exporters, pytest.mark.usefixtures("short_parity")]
 INPUTS = {"n_port": 20.0, "n_stbd": 25.0, "wind_speed": 3.0, "wind_dir": 1.0}
 
 
-@pytest.mark.parametrize("name", ["fmu", "fmu2"])
-def test_a_unit_is_imported_and_stepped(name: str, tmp_path: Path) -> None:
+def test_a_unit_is_imported_and_stepped(tmp_path: Path) -> None:
     spec, model = built("lstm_mirror")
     file = str(tmp_path / "boat.fmu")
-    get_exporter(name).export(ExportedVessel(spec, model), Path(file))
+    get_exporter("fmu2").export(ExportedVessel(spec, model), Path(file))
     assert validate_fmu(file) == []
     model = model.double()
     x0 = torch.tensor([[0.0, 0, 0, 1, 0, 0]], dtype=torch.float64)
@@ -70,11 +70,10 @@ def test_a_unit_is_imported_and_stepped(name: str, tmp_path: Path) -> None:
 class Unit:
     """An instance of a unit, called function by function, with the messages that it logs."""
 
-    def __init__(self, name: str, folder: Path) -> None:
-        self.version = 2 if name == "fmu2" else 3
-        file = folder / f"{name}.fmu"
+    def __init__(self, folder: Path) -> None:
+        file = folder / "boat.fmu"
         if not file.is_file():
-            get_exporter(name).export(ExportedVessel(*built("plsr")), file)
+            get_exporter("fmu2").export(ExportedVessel(*built("plsr")), file)
         description = fmpy.read_model_description(str(file))
         self.references = {v.name: v.valueReference for v in description.modelVariables}
         self.messages: list[str] = []
@@ -89,30 +88,24 @@ class Unit:
         self.messages.append(given[-1].decode())
 
     def initialize(self, start: float, stop: float | None = None) -> None:
-        if self.version == 2:
-            self.unit.setupExperiment(startTime=start, stopTime=stop)
-            self.unit.enterInitializationMode()
-        else:
-            self.unit.enterInitializationMode(startTime=start, stopTime=stop)
+        self.unit.setupExperiment(startTime=start, stopTime=stop)
+        self.unit.enterInitializationMode()
 
     def set(self, name: str, value: float) -> None:
-        part = self.unit.setReal if self.version == 2 else self.unit.setFloat64
-        part([self.references[name]], [value])
+        self.unit.setReal([self.references[name]], [value])
 
     def value(self, name: str) -> float:
-        part = self.unit.getReal if self.version == 2 else self.unit.getFloat64
-        return float(part([self.references[name]])[0])
+        return float(self.unit.getReal([self.references[name]])[0])
 
     def step(self, point: float, size: float) -> None:
         self.unit.doStep(currentCommunicationPoint=point, communicationStepSize=size)
 
 
-@pytest.mark.parametrize("name", ["fmu", "fmu2"])
-def test_simulation_time_may_be_unix_time(name: str, tmp_path: Path) -> None:
+def test_simulation_time_may_be_unix_time(tmp_path: Path) -> None:
     """Steps that are differences of rounded times, as an importer computes them."""
     ends = []
     for start in (0.0, 1.764e9):
-        unit = Unit(name, tmp_path)
+        unit = Unit(tmp_path)
         unit.initialize(start, start + 200.0)
         unit.set("u_start", 1.0)
         unit.set("n_port", 20.0)
@@ -135,16 +128,15 @@ def test_simulation_time_may_be_unix_time(name: str, tmp_path: Path) -> None:
             assert why in unit.messages.pop()
     assert ends[0] == ends[1]
     # a time that does not resolve the step makes no size a multiple of it
-    unit = Unit(name, tmp_path)
+    unit = Unit(tmp_path)
     unit.initialize(1e15)
     unit.unit.exitInitializationMode()
     with pytest.raises(FMICallException):
         unit.step(1e15, 0.125)
 
 
-@pytest.mark.parametrize("name", ["fmu", "fmu2"])
-def test_calls_in_the_wrong_phase_are_refused_with_a_message(name: str, tmp_path: Path) -> None:
-    unit = Unit(name, tmp_path)
+def test_calls_in_the_wrong_phase_are_refused_with_a_message(tmp_path: Path) -> None:
+    unit = Unit(tmp_path)
     before = "no step before the initialization mode was entered and left"
     with pytest.raises(FMICallException):
         unit.step(0.0, 0.1)
@@ -183,19 +175,20 @@ def test_calls_in_the_wrong_phase_are_refused_with_a_message(name: str, tmp_path
 def test_compilers_for_other_machines_are_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("x86_64-w64-mingw32-gcc", "aarch64-linux-gnu-gcc"):
-        tool = tmp_path / name
-        tool.write_text(f'#!/bin/sh\nexec {find_compiler()} "$@"\n')
-        tool.chmod(0o755)
+    tool = tmp_path / "x86_64-w64-mingw32-gcc"
+    tool.write_text(f'#!/bin/sh\nexec {find_compiler()} "$@"\n')
+    tool.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setattr(fmu.platform, "machine", lambda: "x86_64")
     spec, model = built("plsr")
-    for name, wanted in (
-        ("fmu", {"x86_64-linux/model.so", "x86_64-windows/model.dll", "aarch64-linux/model.so"}),
-        ("fmu2", {"linux64/model.so", "win64/model.dll"}),
-    ):
-        file = tmp_path / f"{name}.fmu"
-        card = get_exporter(name).export(ExportedVessel(spec, model), file)
-        found = {one for one in zipfile.ZipFile(file).namelist() if one.startswith("binaries/")}
-        assert found == {f"binaries/{one}" for one in wanted}
-        assert set(card["binaries"]) == {one.split("/")[0] for one in wanted}
+    file = tmp_path / "boat.fmu"
+    card = get_exporter("fmu2").export(ExportedVessel(spec, model), file)
+    binaries = {one for one in zipfile.ZipFile(file).namelist() if one.startswith("binaries/")}
+    assert binaries == {"binaries/linux64/model.so", "binaries/win64/model.dll"}
+    assert set(card["binaries"]) == {"linux64", "win64"}
+
+
+@pytest.mark.parametrize("name", ["fmu", "simulink"])
+def test_a_removed_format_names_its_replacement(name: str) -> None:
+    with pytest.raises(ConfigError, match="fmu2"):
+        get_exporter(name)

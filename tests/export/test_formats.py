@@ -43,8 +43,9 @@ from residnet.export.c import (
 from residnet.export.onnx_file import OnnxModel, _translate_arctangent
 from residnet.export.torchscript import AotiModel, ScriptedModel
 from residnet.export.vessel import ExportedVessel, GuardedVesselModule
-from residnet.heads.symbolic import DelayConfig, SymbolicConfig, SymbolicHead
-from residnet.physics.signals import SignalsConfig
+from residnet.heads.symbolic import SymbolicHead
+from residnet.heads.symbolic_config import DelayConfig, SymbolicConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.testing import check_bad_inputs
 from residnet.testing.checks import (
     EXAMPLE_SIGNALS,

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from exported_models import built
 from exported_policies import DEG, DT, LIMIT, SETTINGS, SPEED, observed
 from torch import Tensor
 
@@ -28,34 +27,9 @@ from residnet.autopilot.guidance import CourseGuidance, DriftEstimate
 from residnet.autopilot.heading.controllers import DepthPolicySpec, NetworkPolicySpec
 from residnet.autopilot.heading.policies import OBSERVER_MEMORY
 from residnet.core.errors import UsageError
-from residnet.engine.rollout import Rollout
 from residnet.export import get_exporter
-from residnet.export.base import Exportable
 from residnet.export.c import compile_shared_library
-from residnet.export.vessel import ExportedVessel
 from residnet.testing.checks import assert_finite, assert_true, replace_entries
-
-SIMSTRUCT = Path(__file__).parents[1] / "support" / "simstruct"
-
-
-class SFunction:
-    """An exported S-function under a harness that does what Simulink documents."""
-
-    def __init__(self, exported: Exportable, folder: Path) -> None:
-        card = get_exporter("simulink").export(exported, folder / "Boat 2_sfun.c")
-        assert card["format"] == "simulink"
-        sources = [folder / "boat_2_sfun.c", folder / "boat_2_sfun_model.c"]
-        library = compile_shared_library(sources, folder / "boat.so", [f"-I{SIMSTRUCT}"])
-        self.library = ctypes.CDLL(str(library))
-        self.library.fly.restype = ctypes.c_double
-
-    def fly(self, given: np.ndarray, outputs: int, start: Any = ()) -> tuple[float, np.ndarray]:
-        """Return its sample time and its outputs [T, outputs] at inputs [T, n]."""
-        begin, rows = (np.ascontiguousarray(part, dtype=float) for part in (start, given))
-        out = np.zeros((len(rows), outputs))
-        at = [ctypes.c_void_p(part.ctypes.data) for part in (begin, rows, out)]
-        return self.library.fly(at[0], begin.size, len(rows), at[1], at[2]), out
-
 
 FAR = 12_000.0
 """Metres from the origin of the chart, where single precision resolves a millimetre."""
@@ -202,25 +176,6 @@ def test_a_wrong_measurement_holds_the_command_and_the_memory() -> None:
     assert not bool(module.step(y, after[:1])[2])
 
 
-def test_an_s_function_answers_as_the_policy(tmp_path: Path) -> None:
-    exported = heading()
-    made = SFunction(exported, tmp_path)
-    random = np.random.default_rng(0)
-    rows = np.tile([0.0, 3.2, 0.0, 0.3], (200, 1))
-    rows[:, :3:2] = random.normal(size=(200, 2)) * [0.2, 0.02]
-    rows[100, 0] = np.nan
-    dt, out = made.fly(rows, 2)
-    assert dt == DT
-    policy: Any = exported.build_controller(torch.float64)
-    given = torch.from_numpy(rows)
-    s = policy.initial_state(given[:1, :3])
-    for k in range(200):
-        with torch.no_grad():
-            command, s, fault = policy.step(given[k : k + 1, :3], given[k : k + 1, 3:], s)
-        assert out[k, 0] == pytest.approx(float(command), abs=1e-9)
-        assert bool(out[k, 1]) == bool(fault) == (k == 100)
-
-
 @pytest.mark.exporters
 @pytest.mark.parametrize("make", KINDS)
 @pytest.mark.parametrize("name", ["onnx", "casadi", "aoti", "c"])
@@ -240,7 +195,7 @@ def test_every_format_serves_every_policy(
         assert "int p_step(const p_real *y" in file.with_suffix(".h").read_text()
 
 
-@pytest.mark.parametrize("name", ["fmu", "parameters", "feed_forward"])
+@pytest.mark.parametrize("name", ["fmu2", "parameters", "feed_forward"])
 def test_what_is_made_of_vessels_alone_refuses_policies(name: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="policy pilot: "):
         get_exporter(name).export(heading(), tmp_path / "p")
@@ -255,26 +210,6 @@ def test_a_lost_estimate_begins_anew_and_keeps_the_push() -> None:
     _, after = made(turned, torch.full((1, 1), 2.0, dtype=torch.float64), s)
     assert float(after[0, OBSERVER_MEMORY.index("push")]) == pytest.approx(0.01)
     assert float(after[0, OBSERVER_MEMORY.index("heading")]) == pytest.approx(2.0, abs=0.01)
-
-
-@pytest.mark.usefixtures("short_parity")
-def test_a_vessel_moves_as_the_model(tmp_path: Path) -> None:
-    spec, model = built("lstm_mirror")
-    made = SFunction(ExportedVessel(spec, model), tmp_path)
-    x0 = torch.tensor([[0.0, 0, 0, 1, 0, 0]], dtype=torch.float64)
-    w = torch.tensor([20.0, 25.0, 3.0, 1.0], dtype=torch.float64).expand(1, 60, -1)
-    model = model.double()
-    with torch.no_grad():
-        states, _, _ = Rollout(model)(x0, w, model.initial_state(1).double())
-    dt, out = made.fly(w[0].numpy(), 7, x0)
-    assert dt == spec.dt
-    np.testing.assert_allclose(out[:, :6], states[0, :60].numpy(), rtol=1e-9, atol=1e-9)
-    assert not out[:, 6].any()
-    # far outside of what the training data hold
-    _, out = made.fly(1e3 * w[0].numpy(), 7, x0)
-    assert out[1:, 6].all()
-    assert np.isfinite(out).all()
-    assert made.fly(w[0].numpy(), 7)[0] == -1.0
 
 
 ROOT = Path(__file__).parents[2]

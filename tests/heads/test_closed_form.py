@@ -24,10 +24,11 @@ from residnet.core.samples import Samples
 from residnet.export.vessel import ExportedVessel
 from residnet.heads import scikit
 from residnet.heads.base import Features
-from residnet.heads.kernel import KernelConfig
+from residnet.heads.kernel_config import KernelConfig
 from residnet.heads.linear import PlsrConfig, RidgeConfig
-from residnet.heads.scikit import SklearnConfig
-from residnet.regression.kernel import PolynomialConfig, RbfConfig, kmeans_plus_plus_indices
+from residnet.heads.scikit_config import SklearnConfig
+from residnet.regression.kernel import kmeans_plus_plus_indices
+from residnet.regression.kernel_config import PolynomialConfig, RbfConfig
 from residnet.regression.shrinkage import pls_path
 from residnet.testing.checks import make_example_model, make_example_spec
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 from made_samples import sampled
 
-from residnet.baselines.given import BelievedConfig
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.given_config import BelievedConfig
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.ensemble import mean_of
@@ -20,10 +20,10 @@ from residnet.engine.rollout import Rollout
 from residnet.export.feed_forward import BelievedForce, RequiredForce, ResidualForce
 from residnet.heads.force import ForceHead
 from residnet.heads.linear import PlsrConfig, RidgeConfig
-from residnet.heads.mlp import MlpConfig
-from residnet.heads.symbolic import SymbolicConfig
+from residnet.heads.mlp_config import MlpConfig
+from residnet.heads.symbolic_config import SymbolicConfig
 from residnet.physics.plant import HullPlant
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
 SIGNALS = SignalsConfig(inputs=("tau_x", "tau_y", "tau_n"))

@@ -16,8 +16,9 @@ from made_samples import sampled
 from residnet.core.names import ACCELERATION_NAMES
 from residnet.core.samples import Samples
 from residnet.dynamics.store import load_model, save_model
-from residnet.heads.genetic import GeneticConfig
-from residnet.physics.terms import TermLibrary, parse_term
+from residnet.heads.genetic_config import GeneticConfig
+from residnet.physics.term_library import TermLibrary
+from residnet.physics.terms import parse_term
 from residnet.regression.expressions import (
     Algebra,
     ExpressionLibrary,

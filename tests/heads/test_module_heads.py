@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 import residnet
 from residnet.core.errors import ConfigError, UsageError
-from residnet.heads.base import BaseHeadConfig, Features, ResidualHead, ResidualScale
+from residnet.heads.base import Features, ResidualHead, ResidualScale
+from residnet.heads.config import BaseHeadConfig
 
 TRAINING = {
     "steps": 3,

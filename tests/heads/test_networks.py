@@ -13,7 +13,7 @@ import torch
 from made_samples import NAMES, channels, made, sampled
 from torch import Tensor, nn
 
-from residnet.baselines.given import ZeroBaselineConfig
+from residnet.baselines.given_config import ZeroBaselineConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
@@ -21,11 +21,13 @@ from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.rollout import Rollout, trace_step
 from residnet.heads.base import ResidualHead
-from residnet.heads.lstm import LSTMCell, LstmConfig, LstmHead
+from residnet.heads.lstm import LSTMCell, LstmHead
+from residnet.heads.lstm_config import LstmConfig
 from residnet.heads.mirror import Tanh, fast_tanh
-from residnet.heads.mlp import MlpConfig
-from residnet.heads.recurrent import GRUEnsembleConfig, GRUEnsembleHead
-from residnet.physics.signals import SignalsConfig
+from residnet.heads.mlp_config import MlpConfig
+from residnet.heads.recurrent import GRUEnsembleHead
+from residnet.heads.recurrent_config import GRUEnsembleConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.windows import WindowStore
 
 

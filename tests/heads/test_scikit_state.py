@@ -17,7 +17,8 @@ from residnet.core.errors import ConfigError, UsageError
 from residnet.core.trust import trusting
 from residnet.dynamics.store import load_model, restore_module, save_model
 from residnet.heads import scikit, scikit_state
-from residnet.heads.scikit import SklearnConfig, SklearnHead
+from residnet.heads.scikit import SklearnHead
+from residnet.heads.scikit_config import SklearnConfig
 from residnet.testing.checks import make_example_model, make_example_spec
 
 STEPS: dict[str, Any] = {

@@ -21,7 +21,8 @@ from made_samples import sampled
 from residnet.core.errors import FitError
 from residnet.core.names import ACCELERATION_NAMES
 from residnet.core.samples import Samples
-from residnet.heads.symbolic import SegmentedSamples, SymbolicConfig, SymbolicHead, find_best_delay
+from residnet.heads.symbolic import SegmentedSamples, SymbolicHead, find_best_delay
+from residnet.heads.symbolic_config import SymbolicConfig
 from residnet.physics.symmetry import compute_term_parity
 from residnet.preprocessing.derivatives import SavitzkyGolay
 

@@ -14,7 +14,7 @@ import torch
 from tiny import TINY
 from tiny_fit import logs_of, settings_of
 
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.errors import DataError, FitError
 from residnet.core.processes import available_cores, worker_limit
 from residnet.core.progress import Progress, on_progress
@@ -36,8 +36,8 @@ from residnet.identification.identified import (
 )
 from residnet.identification.prepared import PreparedSplits
 from residnet.identification.settings import FitSettings
-from residnet.physics.signals import SignalsConfig
-from residnet.preprocessing.prepare import compute_channels, make_samples
+from residnet.physics.signals_config import SignalsConfig
+from residnet.preprocessing.samples import compute_channels, make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import Solution
 from residnet.training.score import Score

@@ -13,7 +13,7 @@ from residnet.core.layout import DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.identification.planning import TrialLimits, infer_input_shares, propose_manoeuvres
 from residnet.identification.settings import FitSettings
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.testing.checks import make_example_spec
 

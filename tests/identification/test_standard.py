@@ -12,7 +12,7 @@ import pytest
 import torch
 from random_vessels import small_boat_logs
 
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.layout import SURGE_SWAY_YAW
@@ -32,9 +32,9 @@ from residnet.identification.recipe import (
 )
 from residnet.identification.settings import FitSettings
 from residnet.identification.training_schedule import resolve_training
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.symmetry import acts_along_own_velocity
-from residnet.preprocessing.prepare import make_samples
+from residnet.preprocessing.samples import make_samples
 from residnet.training.config import TrainingConfig
 
 NAMES = ("hull", "hull_network", "ensemble")

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from residnet_tasks.import_logs import ImportConfig
 
-from residnet.core.config import validate_config
+from residnet.core.config import load_config, validate_config
 from residnet.core.errors import DataError
 from residnet.core.files import find_config_folder
 from residnet.core.log import Log
@@ -19,8 +20,6 @@ from residnet.io.readers import ReaderConfig
 from residnet.io.split import SplitConfig, check_leaks
 from residnet.preprocessing.align import GridConfig, align_to_grid
 from residnet.quality import inspect_log
-from residnet.tasks.import_logs import ImportConfig
-from residnet.tasks.registry import load_task
 
 DATA = Path(os.environ.get("RESIDNET_DATA", "nowhere"))
 MOTION = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
@@ -119,8 +118,8 @@ def test_tank_data_are_consistent_and_their_mistakes_would_be_seen() -> None:
 
 @needs("milliampere/raw_nlp1")
 def test_the_ferrys_raw_topics_become_the_table_made_by_hand() -> None:
-    task = load_task(find_config_folder() / "milliampere_raw.yaml", [])
-    assert isinstance(task, ImportConfig)
+    file = find_config_folder().parent / "examples/residnet_tasks/configs/milliampere_raw.yaml"
+    task: ImportConfig = load_config(file, [], ImportConfig)
     log = task.reader.build().read(DATA / "milliampere" / "raw_nlp1")
     table = pd.read_csv(DATA / "milliampere" / "nlp1.csv")
     assert np.ptp(np.diff(log.t)) < 1e-9

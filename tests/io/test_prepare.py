@@ -7,8 +7,9 @@ from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES
 from residnet.evaluation.freerun import FreeRunErrors, Prediction
 from residnet.evaluation.protocol import WindowProtocol
-from residnet.physics.signals import SignalsConfig
-from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, make_samples, prepare_log
+from residnet.physics.signals_config import SignalsConfig
+from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
+from residnet.preprocessing.samples import make_samples
 from residnet.preprocessing.windows import WindowStore
 
 STEP = 0.1

@@ -18,14 +18,15 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from random_vessels import KINDS, random_logs
 
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.config import validate_config
 from residnet.core.log import Log
 from residnet.core.samples import Samples
 from residnet.core.units import si_unit, to_si, unit_names
 from residnet.io.readers import ReaderConfig
-from residnet.physics.signals import SignalsConfig
-from residnet.preprocessing.prepare import PrepareConfig, make_samples, prepare_log
+from residnet.physics.signals_config import SignalsConfig
+from residnet.preprocessing.prepare import PrepareConfig, prepare_log
+from residnet.preprocessing.samples import make_samples
 
 EXACT = 1e-9
 WINDOW = 8

@@ -23,15 +23,17 @@ from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
 from residnet.manoeuvres.open_loop import ConstantInput
 from residnet.manoeuvres.trials import (
+    SimulatedVessel,
+    TrialEnvironment,
+    simulate_manoeuvres,
+    simulate_trial_logs,
+)
+from residnet.manoeuvres.trials_config import (
     DisturbanceConfig,
     SensorsConfig,
     SimulatedTrials,
-    SimulatedVessel,
-    TrialEnvironment,
     WindConfig,
     sample_ornstein_uhlenbeck,
-    simulate_manoeuvres,
-    simulate_trial_logs,
     simulate_wind,
 )
 from residnet.physics.vessel import load_vessel

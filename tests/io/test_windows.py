@@ -16,7 +16,8 @@ from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES
 from residnet.preprocessing.data_module import RowsDataModule, WindowBatch, WindowsDataModule
 from residnet.preprocessing.prepare import PreparedLog
-from residnet.preprocessing.windows import WindowSampler, WindowStage, WindowStore
+from residnet.preprocessing.window_index import WindowStage
+from residnet.preprocessing.windows import WindowSampler, WindowStore
 
 
 def broken_log(seed: int, count: int) -> PreparedLog:

@@ -17,7 +17,7 @@ from residnet.core.log import Log
 from residnet.dynamics.base import Dynamics
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import Rollout, Source
-from residnet.manoeuvres.base import Helm, StackedSource, StopRecorder
+from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.closed_loop import (
     Spiral,
     SteadyConfig,
@@ -29,13 +29,9 @@ from residnet.manoeuvres.closed_loop import (
     update_steadiness,
 )
 from residnet.manoeuvres.open_loop import MultiSine, RandomSteps
-from residnet.manoeuvres.trials import (
-    DisturbanceConfig,
-    SensorsConfig,
-    SimulatedVessel,
-    TrialEnvironment,
-    simulate_manoeuvres,
-)
+from residnet.manoeuvres.sources import StackedSource, StopRecorder
+from residnet.manoeuvres.trials import SimulatedVessel, TrialEnvironment, simulate_manoeuvres
+from residnet.manoeuvres.trials_config import DisturbanceConfig, SensorsConfig
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180

@@ -19,7 +19,7 @@ from residnet.core.registry import load_kinds
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import Rollout, Source
 from residnet.manoeuvres import FamilyConfig, ManoeuvreConfig
-from residnet.manoeuvres.base import Helm, Manoeuvre, ScheduleSource, StackedSource
+from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.manoeuvres.indices import INDEX_UNITS
 from residnet.manoeuvres.open_loop import (
@@ -28,7 +28,8 @@ from residnet.manoeuvres.open_loop import (
     MultiSine,
     ThreeTwoOneOne,
 )
-from residnet.manoeuvres.trials import SimulatedTrials
+from residnet.manoeuvres.sources import ScheduleSource, StackedSource
+from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 

@@ -12,8 +12,10 @@ from torch import Tensor
 
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError
-from residnet.physics.actuators import RudderPropellerConfig, Thrusters, ThrustersConfig
-from residnet.physics.actuators.base import Servo, SteeredActuators, SteeringGearConfig
+from residnet.physics.actuators import RudderPropellerConfig, ThrustersConfig
+from residnet.physics.actuators.base import Servo, SteeredActuators
+from residnet.physics.actuators.config import SteeringGearConfig
+from residnet.physics.actuators.thrusters import Thrusters
 from residnet.physics.vessel import load_vessel
 
 
@@ -147,7 +149,7 @@ def servo(**content: Any) -> Servo:
     config: SteeringGearConfig = validate_config(
         {"limit": 0.6} | content, SteeringGearConfig, "here"
     )
-    return config.build_servo("delta")
+    return Servo(config.servo_spec("delta"))
 
 
 def follow(unit: Servo, command: np.ndarray, dt: float = 0.01) -> np.ndarray:

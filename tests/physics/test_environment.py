@@ -14,15 +14,15 @@ from scipy.integrate import quad
 from residnet.core.config import load_config, validate_config
 from residnet.core.errors import ConfigError
 from residnet.core.registry import find_vessel_files
-from residnet.physics.environment import (
-    GRAVITY,
-    IrregularWaves,
+from residnet.physics.environment import IrregularWaves
+from residnet.physics.environment_config import (
     JonswapSpectrumConfig,
     WavesConfig,
     WindLoadConfig,
     WindLoadsConfig,
 )
 from residnet.physics.hull import FossenConfig
+from residnet.physics.parameters import GRAVITY
 from residnet.physics.vessel import load_vessel
 
 SEA: dict[str, Any] = {

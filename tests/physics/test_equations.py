@@ -19,8 +19,8 @@ from residnet.core.registry import find_vessel_files
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.engine.rollout import Rollout
-from residnet.physics.abkowitz import AbkowitzConfig
-from residnet.physics.hull import SPEED_REGIMES, classify_speed_regime, compute_froude_number
+from residnet.physics.abkowitz_config import AbkowitzConfig
+from residnet.physics.froude import SPEED_REGIMES, classify_speed_regime, compute_froude_number
 from residnet.physics.vessel import VesselConfig, load_vessel
 
 

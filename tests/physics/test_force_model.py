@@ -7,13 +7,12 @@ import torch
 
 from residnet.core.errors import ConfigError, FitError
 from residnet.physics.force_model import (
-    FERRY_TERMS,
     ForceCorrection,
     ForceModel,
     augment_mass,
-    term_order,
     weighted_column_std,
 )
+from residnet.physics.force_terms import FERRY_TERMS, term_order
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 

@@ -8,7 +8,8 @@ import torch
 
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError
-from residnet.physics.signals import Signals, SignalsConfig
+from residnet.physics.signals import Signals
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
 WIND = ("wind_speed", "wind_dir")

@@ -11,14 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.symmetry import (
     compute_term_parity,
     get_channel_parity,
     mirror_channels,
     violates_symmetry,
 )
-from residnet.physics.terms import TermLibrary
+from residnet.physics.term_library import TermLibrary
 
 NAMES = ("u", "v", "r", "delta", "n", "tau_x", "tau_y", "tau_n", "wind_u", "wind_v", "wind_mag")
 # what a mirror at the vessel's centre plane does to each, from the definition of the channels

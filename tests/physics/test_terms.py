@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from residnet.core.errors import ConfigError
+from residnet.physics.term_library import TermLibrary
 from residnet.physics.terms import (
     CandidatesConfig,
     Factor,
-    TermLibrary,
     make_polynomial_terms,
     parse_term,
     rank_candidates,

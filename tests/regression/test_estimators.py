@@ -18,8 +18,10 @@ from sklearn.linear_model import Ridge as ReferenceRidge
 
 from residnet.core.errors import FitError
 from residnet.regression.estimator import Estimator, Solution, assign_group_folds
-from residnet.regression.genetic import EquationSearchConfig, EvolutionConfig, GeneticEquations
-from residnet.regression.kernel import KernelRidge, PolynomialConfig, RbfConfig
+from residnet.regression.genetic import GeneticEquations
+from residnet.regression.genetic_config import EquationSearchConfig, EvolutionConfig
+from residnet.regression.kernel import KernelRidge
+from residnet.regression.kernel_config import PolynomialConfig, RbfConfig
 from residnet.regression.least_squares import CentredLeastSquares, ElasticNet, LeastSquares
 from residnet.regression.shrinkage import PLSR, Ridge
 from residnet.regression.sparse import SparseRegression

@@ -22,13 +22,8 @@ from residnet.regression.expressions import (
     TooLargeError,
     apply_function,
 )
-from residnet.regression.genetic import (
-    EvolutionConfig,
-    EvolutionResult,
-    FitnessEvaluator,
-    evolve,
-    expression_limits,
-)
+from residnet.regression.genetic import EvolutionResult, FitnessEvaluator, evolve, expression_limits
+from residnet.regression.genetic_config import EvolutionConfig
 
 NAMES = ("a", "b", "c")
 DATA = {name: np.random.default_rng(i).normal(size=200) for i, name in enumerate(NAMES)}

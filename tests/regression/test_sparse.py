@@ -14,12 +14,12 @@ from residnet.core.errors import FitError
 from residnet.regression.sparse import (
     ForwardSearch,
     SparseEquation,
-    SparseSearchConfig,
     find_equation,
     merge_similar_columns,
     reduce_problem,
     rss_with_one_added,
 )
+from residnet.regression.sparse_config import SparseSearchConfig
 
 
 def named(count: int) -> list[str]:

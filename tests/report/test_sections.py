@@ -15,6 +15,8 @@ import pytest
 from browser import browser, layout
 from made_run import made_run, write_json
 from read_page import Page, plain
+from residnet_tasks.actuators import ActuatorsTaskConfig
+from residnet_tasks.import_logs import ImportConfig
 from tiny import write_yaml
 
 from residnet.autopilot.report import course
@@ -26,12 +28,11 @@ from residnet.report.blocks import Section
 from residnet.report.fit import fit_sections
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections import manoeuvres
+from residnet.report.sections import manoeuvres, sweep
+from residnet.report.sections.variants import plot_differences, tabulate_variants
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Task
-from residnet.tasks import study
-from residnet.tasks.actuators import ActuatorsTaskConfig
-from residnet.tasks.import_logs import ImportConfig
+from residnet.tasks.sweep.variants import compare_variants, compute_window_errors
 
 needs_browser = pytest.mark.skipif(browser() is None, reason="no browser is installed")
 DEG = math.pi / 180
@@ -188,9 +189,9 @@ def made_actuators(run: Path) -> Path:
     return run
 
 
-def made_study(run: Path) -> Path:
+def made_variants(run: Path) -> Path:
     """A recipe and a variant that is worse, under two protocols."""
-    resolved(run, {"task": "study"})
+    resolved(run, {"task": "sweep"})
     rows = []
     for variant, overrides, shift in (("recipe", [], 0.0), ("no_head", ["~heads"], 0.05)):
         row = {"variant": variant, "overrides": overrides, "seeds": 3, "windows": 12}
@@ -199,7 +200,7 @@ def made_study(run: Path) -> Path:
         row |= {"difference_ci95": [0.5 * shift, 1.5 * shift] if shift else None}
         rows += [{**row, "protocol": protocol} for protocol in ("T30", "manoeuvre")]
     content = {"run": "made", "model": "plsr", "split": "test", "reference": "recipe"}
-    write_json(run / "study.json", content | {"rows": rows})
+    write_json(run / "variants.json", content | {"rows": rows})
     return run
 
 
@@ -214,7 +215,7 @@ TASKS: dict[str, tuple[Callable[[Path], Path], Callable[[RunFiles], Sequence[Sec
     "fit": (made_run, fit_sections),
     "import": (made_import, of_task(ImportConfig)),
     "simulate": (made_simulate, manoeuvres.sections),
-    "study": (made_study, of_task(study.StudyConfig)),
+    "variants": (made_variants, sweep.sections),
 }
 
 
@@ -250,7 +251,7 @@ def test_every_task_has_a_page_whose_sections_hold_something(
     shown = re.sub(r"data:image/png;base64,[^\"]+|<script.*?</script>", "", text, flags=re.DOTALL)
     shown = shown.partition('id="provenance"')[0]
     assert re.findall(r"\b(?:None|nan|inf|Undefined)\b|[{}]{2}", shown.partition("<body>")[2]) == []
-    if task in ("actuators", "import", "simulate", "study"):
+    if task in ("actuators", "import", "simulate", "variants"):
         # the page of a finished run can be written again, and is the same
         assert plain(written(RunFiles(path.parent), task)) == text
 
@@ -334,7 +335,7 @@ def test_actuator_parameters_come_with_intervals(page_of: Callable[[str], Path])
 
 
 def test_variants_are_compared_with_the_reference(page_of: Callable[[str], Path]) -> None:
-    cells = Page(plain(page_of("study"))).table("variant", "no_head")
+    cells = Page(plain(page_of("variants"))).table("variant", "no_head")
     assert cells["no_head"][:4] == ["0.2500", "0.0100", "+0.0500", "+0.0250 to +0.0750"]
     assert cells["recipe"][2:4] == ["", ""]
     assert cells["no_head"][-1] == "~heads"
@@ -364,7 +365,7 @@ def variants(seeds: int) -> tuple[pd.DataFrame, dict[str, np.ndarray]]:
 
 def test_rows_of_a_study_are_means_over_windows_and_seeds() -> None:
     table, arrays = variants(3)
-    recipe, other = study.compare_variants(table, "recipe")
+    recipe, other = compare_variants(table, "recipe")
     errors = arrays["other"]
     assert other["nrmse_mean"] == pytest.approx(errors.mean())
     assert other["nrmse_sd"] == pytest.approx(errors.mean(1).std(ddof=1))
@@ -380,16 +381,16 @@ def test_rows_of_a_study_are_means_over_windows_and_seeds() -> None:
 
 
 def test_one_seed_has_no_spread_and_the_reference_no_difference(tmp_path: Path) -> None:
-    found = study.compare_variants(variants(1)[0], "recipe")
+    found = compare_variants(variants(1)[0], "recipe")
     rows = [row | {"overrides": [], "seconds": 10.0} for row in found]
     assert rows[1]["nrmse_sd"] is None
-    recipe, other = study.tabulate_variants(rows, "recipe").rows
+    recipe, other = tabulate_variants(rows, "recipe").rows
     assert [cell.text for cell in recipe.cells[:4]] == [f"{rows[0]['nrmse_mean']:.4f}", "–", "", ""]
     low, high = rows[1]["difference_ci95"]
     assert (other.cells[3].text, other.cells[3].mark) == (f"+{low:.4f} to +{high:.4f}", "best")
-    figure = study.plot_differences(rows, "recipe")
+    figure = plot_differences(rows, "recipe")
     assert figure.cases[0].curves[0]["difference"][0].tolist() == [rows[1]["difference"]]
     run = made_run(tmp_path / "made")
     for model, split, said in (("gru", "test", "no model 'gru'"), ("selected", "train", "'train'")):
         with pytest.raises(DataError, match=said):
-            study.compute_window_errors(run, model, split)
+            compute_window_errors(run, model, split)

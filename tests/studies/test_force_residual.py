@@ -17,7 +17,7 @@ from tiny import write_yaml
 import residnet
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
-from residnet.physics.force_model import FERRY_TERMS
+from residnet.physics.force_terms import FERRY_TERMS
 from residnet.studies.jervan2020.force_logs import compare_accelerations
 from residnet.studies.jervan2020.measured import (
     ForceResidualConfig,

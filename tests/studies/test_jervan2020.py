@@ -19,12 +19,13 @@ from residnet.autopilot.motion import (
     required_force,
     sample_filtered_course,
 )
-from residnet.baselines.given import BelievedConfig
+from residnet.baselines.given_config import BelievedConfig
 from residnet.core.config import load_config
 from residnet.core.errors import FitError
 from residnet.export import get_exporter
 from residnet.export.feed_forward import ExportedForce, RequiredForce
-from residnet.physics.force_model import FERRY_TERMS, ForceCorrection, ForceModel
+from residnet.physics.force_model import ForceCorrection, ForceModel
+from residnet.physics.force_terms import FERRY_TERMS
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
+from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.registry import load_kinds
 from residnet.core.samples import Samples
 from residnet.dynamics.ensemble import MeanOfTrajectories
@@ -18,7 +19,7 @@ from residnet.export.base import LoadedExport
 from residnet.export.vessel import ExportedVessel
 from residnet.heads import HeadConfig
 from residnet.heads.base import ClosedFormHead
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 
 SIGNALS = SignalsConfig(
     inputs=("n_port", "n_stbd"), exogenous=("wind_speed", "wind_dir"), forces="wam_v_cal"

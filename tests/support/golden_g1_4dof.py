@@ -17,8 +17,9 @@ from kinds import of_kind
 
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import Source
-from residnet.manoeuvres.base import Helm, ScheduleSource, StackedSource
+from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.closed_loop import Zigzag
+from residnet.manoeuvres.sources import ScheduleSource, StackedSource
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 

@@ -21,12 +21,13 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.heads.base import ZeroHead
-from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
+from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.manoeuvres.open_loop import AccelerationDeceleration, ConstantInput, ThreeTwoOneOne
-from residnet.physics.actuators import Thrusters
+from residnet.manoeuvres.sources import StackedSource
+from residnet.physics.actuators.thrusters import Thrusters
 from residnet.physics.plant import HullPlant
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
 DT = 0.01

@@ -29,10 +29,12 @@ from residnet.autopilot.heading.predictive import DocumentAutopilot, SimulatedPr
 from residnet.dynamics.base import Dynamics
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import Source
-from residnet.manoeuvres.base import Helm, ScheduleSource
+from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.closed_loop import Zigzag
+from residnet.manoeuvres.sources import ScheduleSource
 from residnet.physics.hull import RollingHullConfig
-from residnet.physics.nomoto import NomotoConfig, NomotoVessel
+from residnet.physics.nomoto import NomotoVessel
+from residnet.physics.nomoto_config import NomotoConfig
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from residnet.core.samples import Samples
-from residnet.physics.terms import CandidatesConfig, TermLibrary
+from residnet.physics.term_library import TermLibrary
+from residnet.physics.terms import CandidatesConfig
 
 CHANNELS = ("u", "v", "r", "n", "delta")
 RATIOS = ("u n^-1", "v n^-1", "r n^-1", "delta n^-1", "u^2 n^-1", "u v n^-1", "u r n^-2")

@@ -5,10 +5,11 @@ from __future__ import annotations
 import torch
 from kinds import of_kind
 
-from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
+from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 
 
 def nomoto_model(gain: float, time: float, dt: float) -> tuple[ModelSpec, HybridDynamics]:

@@ -17,7 +17,7 @@ from residnet.core.names import STATE_NAMES
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.rollout import Rollout
 from residnet.heads.base import ResidualHead, ZeroHead
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
 
 STEP = 0.1

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.manoeuvres.trials import SimulatedTrials, simulate_trial_logs
+from residnet.manoeuvres.trials import simulate_trial_logs
+from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.quality.actuators import estimate_neutral_angle
 from residnet.quality.effects import OneStepRegression
 from residnet.quality.statistics import LogStatistics

@@ -1,23 +1,26 @@
-"""The sample package of examples/, laid out as pip lays it out, without asking an index."""
+"""The packages of examples/, laid out as pip lays them out, without asking an index."""
 
 from __future__ import annotations
 
 import tomllib
 from pathlib import Path
 
-SAMPLE = Path(__file__).parents[2] / "examples" / "residnet_sample"
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SAMPLE = EXAMPLES / "residnet_sample"
+TASKS = EXAMPLES / "residnet_tasks"
+"""Package with the tasks `actuators` and `import`."""
 
 
-def install(site: Path) -> Path:
-    """Put the sample package and its entry points into the folder `site`, and return it.
+def install(site: Path, package: Path = SAMPLE) -> Path:
+    """Put a package and its entry points into the folder `site`, and return it.
 
     What pip does for an editable install of a pure package: a link to the sources, and a
     `.dist-info` folder with the metadata of pyproject.toml.
     """
-    project = tomllib.loads((SAMPLE / "pyproject.toml").read_text())["project"]
-    info = site / f"residnet_sample-{project['version']}.dist-info"
+    project = tomllib.loads((package / "pyproject.toml").read_text())["project"]
+    info = site / f"{package.name}-{project['version']}.dist-info"
     info.mkdir(parents=True)
-    (site / "residnet_sample").symlink_to(SAMPLE / "src" / "residnet_sample")
+    (site / package.name).symlink_to(package / "src" / package.name)
     lines = [f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"]
     (info / "METADATA").write_text("".join(lines))
     groups = [

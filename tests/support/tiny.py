@@ -123,14 +123,18 @@ SWEEP: dict[str, Any] = {
     "runner": {"kind": "processes", "workers": 1},
 }
 """A sweep over `TINY`, which lies beside it as tiny.yaml."""
-STUDY: dict[str, Any] = {
-    "task": "study",
-    "name": "tiny_study",
+VARIANTS: dict[str, Any] = {
+    "task": "sweep",
+    "name": "tiny_variants",
     "base": "tiny.yaml",
     "common": ["heads={ridge: {kind: ridge}}", "training={}", "ensembles={}", "export.models=[]"],
-    "variants": {"recipe": [], "short": ["heads.ridge.degree=1"]},
-    "reference": "recipe",
-    "model": "ridge",
-    "seeds": [0, 1],
+    "search": {
+        "kind": "variants",
+        "variants": {"recipe": [], "short": ["heads.ridge.degree=1"]},
+        "reference": "recipe",
+        "model": "ridge",
+        "seeds": [0, 1],
+    },
+    "runner": {"kind": "processes", "workers": 1},
 }
 """Another recipe and another seed of `TINY`, which lies beside it as tiny.yaml."""

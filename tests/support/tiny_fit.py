@@ -10,7 +10,7 @@ from residnet.core.config import validate_config
 from residnet.identification.prepared import PreparedSplits, prepare_splits
 from residnet.identification.settings import FitSettings
 from residnet.io.sources import read_split_logs
-from residnet.manoeuvres.trials import SimulatedTrials
+from residnet.manoeuvres.trials_config import SimulatedTrials
 
 DATA = validate_config(TINY["data"], SimulatedTrials, "here")
 

@@ -14,10 +14,12 @@ from kinds import of_kind
 from tiny import Command, read_json, write_yaml
 
 from residnet.core.config import validate_config
-from residnet.physics.actuators import DifferentialThrustConfig, Thrusters
+from residnet.physics.actuators import DifferentialThrustConfig
+from residnet.physics.actuators.thrusters import Thrusters
 from residnet.physics.hull import FossenConfig
 from residnet.physics.vessel import load_vessel
 
+pytestmark = pytest.mark.usefixtures("example_tasks")
 VESSEL = of_kind(load_vessel("wam_v_cal"), FossenConfig)
 
 

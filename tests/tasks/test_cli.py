@@ -25,7 +25,7 @@ from residnet.export import vessel
 from residnet.io.drafting.reading import find_log_files
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import TaskOutcome
-from residnet.tasks.simulate import SimulateConfig
+from residnet.tasks.simulate.config import SimulateConfig
 
 CONSTANT = {"kind": "constant", "name": "turn", "drive": 0.5, "steer": 0.3}
 PROGRAMME = {"vessel": "wam_v_cal", "duration": "5 s", "manoeuvres": [CONSTANT]}

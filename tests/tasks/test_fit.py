@@ -21,7 +21,7 @@ from tiny import TINY, Command, read_json, write_yaml
 from residnet.core.config import validate_config
 from residnet.dynamics.store import load_model
 from residnet.evaluation.verdict import LEVEL_TEXTS
-from residnet.manoeuvres.trials import SimulatedTrials
+from residnet.manoeuvres.trials_config import SimulatedTrials
 
 ALONE: dict[str, Any] = {**TINY, "ensembles": {}, "training": {}, "export": {"models": []}}
 

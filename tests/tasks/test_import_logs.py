@@ -6,11 +6,14 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 import written_logs
 from tiny import Command, read_json, write_yaml
 
 from residnet.core.log import Log
 from residnet.io.readers.base import CanonicalConfig
+
+pytestmark = pytest.mark.usefixtures("example_tasks")
 
 
 def config(folder: Path, logs: str) -> Path:

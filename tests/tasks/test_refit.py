@@ -10,7 +10,8 @@ from read_page import Page, plain
 from tiny import TINY, Command, call, read_json, write_yaml
 
 from residnet.core.config import validate_config
-from residnet.manoeuvres.trials import SimulatedTrials, simulate_trial_logs
+from residnet.manoeuvres.trials import simulate_trial_logs
+from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.runs.folder import verify_checksums
 
 pytestmark = pytest.mark.long

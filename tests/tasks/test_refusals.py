@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from tiny import STUDY, SWEEP, TINY, Command, write_yaml
+from tiny import SWEEP, TINY, VARIANTS, Command, write_yaml
 from tiny_tasks import COURSE, TINY_TASKS, actuators, autopilot, flown, imported, measured
 
 FERRY = {
@@ -49,6 +49,9 @@ def of_tiny(content: dict[str, Any]) -> Callable[[Path], dict[str, Any]]:
     return made
 
 
+pytestmark = pytest.mark.usefixtures("example_tasks")
+
+
 BASES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "fit": lambda _: TINY,
     "csv": measured,
@@ -56,7 +59,7 @@ BASES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "ferry": lambda _: FERRY,
     "ship": flown,
     "sweep": of_tiny(SWEEP),
-    "study": of_tiny(STUDY),
+    "variants": of_tiny(VARIANTS),
     "actuators": actuators,
     "autopilot": steered,
     "course": course,
@@ -118,11 +121,12 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("'objective={kind: figure, name: nrmse}'", "must not be used for selection"),
         ("objective.model=selected pruning={}", "name the network whose training is monitored"),
     ],
-    "study": [
-        ("reference=recpie", "did you mean 'recipe'"),
-        ("model=rigde", "no model is named 'rigde'"),
-        ("'seeds=[1, 1]'", "each only once"),
-        ("'variants.short=[heads.ridge.degre=1]'", "degre"),
+    "variants": [
+        ("search.reference=recpie", "did you mean 'recipe'"),
+        ("search.model=rigde", "no model is named 'rigde'"),
+        ("'search.seeds=[1, 1]'", "each only once"),
+        ("'search.variants.short=[heads.ridge.degre=1]'", "degre"),
+        ("'space.seed={choices: [1, 2]}'", "leave space and pruning out"),
     ],
     "actuators": [
         ("~throttle", "no test is named"),
@@ -184,7 +188,7 @@ def test_a_wrong_config_is_one_line_before_any_work(
         assert not Path("out").exists(), "nothing is begun"
 
 
-@pytest.mark.parametrize("base", ["fit", "recipe", "ferry", "study", "course", *TINY_TASKS])
+@pytest.mark.parametrize("base", ["fit", "recipe", "ferry", "variants", "course", *TINY_TASKS])
 def test_what_is_right_passes(
     base: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:

@@ -14,7 +14,8 @@ from tiny import TINY, Command, call, read_json, write_yaml
 
 from residnet.core.log import Log
 from residnet.io.readers.base import CanonicalConfig
-from residnet.manoeuvres.trials import SimulatedTrials, simulate_trial_logs
+from residnet.manoeuvres.trials import simulate_trial_logs
+from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.tasks.registry import load_task
 
 STEP = 0.1

@@ -1,4 +1,4 @@
-"""Tasks `sweep` and `study`: every run of many is kept, and a kill changes nothing."""
+"""Task `sweep`: every run of many is kept, and a kill changes nothing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 from read_page import plain
-from tiny import STUDY, SWEEP, TINY, Command, read_json, write_yaml
+from tiny import SWEEP, TINY, VARIANTS, Command, read_json, write_yaml
 
 from residnet.core.config import load_config
 from residnet.core.processes import IsolatedProcessPool
@@ -209,22 +209,22 @@ def test_the_same_sweep_runs_through_ray(sweep: Path, tmp_path: Path, command: C
 
 
 @pytest.mark.long
-def test_all_variants_and_seeds_of_a_study_stand_in_one_table(
+def test_all_variants_and_seeds_stand_in_one_table(
     sweep: Path, tmp_path: Path, command: Command
 ) -> None:
     out = tmp_path / "out"
-    file = write_yaml(tmp_path / "study.yaml", STUDY)
+    file = write_yaml(tmp_path / "variants.yaml", VARIANTS)
     assert command("run", file, "--out", out).code == 0
-    rows = read_json(out / "study.json")["rows"]
+    rows = read_json(out / "variants.json")["rows"]
     assert {(row["variant"], row["protocol"]) for row in rows} == {
-        (v, p) for v in STUDY["variants"] for p in ("manoeuvre", "T10")
+        (v, p) for v in VARIANTS["search"]["variants"] for p in ("manoeuvre", "T10")
     }
     for row in rows:
         runs = [out / "variants" / f"{row['variant']}.{seed}" for seed in (0, 1)]
         found = [_error(run, "test", row["protocol"]) for run in runs]
         assert row["nrmse_mean"] == pytest.approx(sum(found) / 2, rel=1e-6)
     assert "short" in plain(out / "report.html")
-    assert (out / "figures" / "01_study.png").stat().st_size > 1000
+    assert (out / "figures" / "01_variants.png").stat().st_size > 1000
     stamps = {path: path.stat().st_mtime_ns for path in out.glob("variants/*/metrics.json")}
     assert len(stamps) == 4
     (out / "variants" / "short.1" / "summary.json").unlink()

@@ -11,14 +11,17 @@ import numpy as np
 import pytest
 import torch
 
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import FitError
-from residnet.manoeuvres.trials import SimulatedTrials, simulate_trial_logs
-from residnet.physics.signals import SignalsConfig
-from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, make_samples, prepare_log
+from residnet.manoeuvres.trials import simulate_trial_logs
+from residnet.manoeuvres.trials_config import SimulatedTrials
+from residnet.physics.signals_config import SignalsConfig
+from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
+from residnet.preprocessing.samples import make_samples
 from residnet.training import current as module
-from residnet.training.current import CurrentConfig, estimate_currents, through_water
+from residnet.training.current import estimate_currents, through_water
+from residnet.training.current_config import CurrentConfig
 
 SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal")
 PREPARE = PrepareConfig.model_validate(

@@ -17,16 +17,18 @@ from kinds import of_kind
 from made_system import LINEAR, SCALES, STEP, free_run_error, inputs, model_of, trials
 from torch import Tensor, nn
 
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.rollout import Rollout
-from residnet.heads.lstm import LstmConfig
-from residnet.heads.mlp import MlpConfig, MlpHead
+from residnet.heads.lstm_config import LstmConfig
+from residnet.heads.mlp import MlpHead
+from residnet.heads.mlp_config import MlpConfig
 from residnet.preprocessing.data_module import WindowBatch, WindowsDataModule
-from residnet.preprocessing.prepare import PreparedLog, make_samples
+from residnet.preprocessing.prepare import PreparedLog
+from residnet.preprocessing.samples import make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.training.config import MachineConfig, TrainingConfig
 from residnet.training.heads import HeadTraining, Validate, one_step_loss, rollout_loss, train

@@ -23,21 +23,24 @@ from made_system import (
 from torch import Tensor
 
 from residnet.baselines.base import ParametricBaseline
-from residnet.baselines.given import ZeroBaselineConfig
-from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
+from residnet.baselines.given_config import ZeroBaselineConfig
+from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.errors import DataError, FitError, ResidnetError
 from residnet.core.layout import HEADING
 from residnet.core.samples import Samples
-from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.time_steps import Integrator
 from residnet.engine.rollout import Rollout
 from residnet.heads.base import ZeroHead
-from residnet.physics.signals import SignalsConfig
-from residnet.preprocessing.prepare import PreparedLog, make_samples
+from residnet.physics.signals_config import SignalsConfig
+from residnet.preprocessing.prepare import PreparedLog
+from residnet.preprocessing.samples import make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.training import refit as module
 from residnet.training.left_out import estimate_leave_one_out
-from residnet.training.refit import Problem, RefitConfig, refit, sensitivities
+from residnet.training.refit import Problem, refit, sensitivities
+from residnet.training.refit_config import RefitConfig
 
 
 def fitted(

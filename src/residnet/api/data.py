@@ -35,8 +35,8 @@ from residnet.io.readers import ReaderConfig
 from residnet.io.sources import DataConfig, MeasuredLogs
 from residnet.io.sources import read_split_logs as read_splits
 from residnet.io.split import SPLITS, assign_log_names, check_leaks, split_logs
-from residnet.manoeuvres.trials import SimulatedTrials
-from residnet.physics.signals import SignalsConfig
+from residnet.manoeuvres.trials_config import SimulatedTrials
+from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.masks import MaskRule
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.preprocessing.prepare import PrepareConfig, PreparedLog
@@ -348,7 +348,7 @@ class Dataset:
         import torch
 
         from residnet.preprocessing.data_module import WindowsDataModule
-        from residnet.preprocessing.windows import WindowStage
+        from residnet.preprocessing.window_index import WindowStage
 
         settings = validate_config(
             {

@@ -37,7 +37,7 @@ from residnet.export import get_exporter
 from residnet.export.base import require_releasable
 from residnet.export.vessel import ExportedVessel
 from residnet.heads import HeadConfig
-from residnet.heads.base import BaseHeadConfig
+from residnet.heads.config import BaseHeadConfig
 from residnet.heads.module import register_stored_modules
 from residnet.identification.fitter import FittedModel
 from residnet.identification.monitoring import (

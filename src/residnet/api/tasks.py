@@ -20,7 +20,7 @@ from residnet.api.values import (
     to_builtin,
 )
 from residnet.baselines import BaselineConfig
-from residnet.baselines.base import IdentifiedConfig
+from residnet.baselines.config import IdentifiedConfig
 from residnet.core.config import load_config, validate_config
 from residnet.core.errors import UsageError
 from residnet.core.files import read_table
@@ -33,7 +33,7 @@ from residnet.core.trust import trusting
 from residnet.evaluation.booklet import build_index_rows
 from residnet.evaluation.metrics import build_metrics_table
 from residnet.heads import HeadConfig
-from residnet.heads.base import FeatureConfig
+from residnet.heads.config import FeatureConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.manoeuvres.base import Manoeuvre
 from residnet.manoeuvres.trials import ManoeuvreRun
@@ -42,7 +42,8 @@ from residnet.physics.vessel_file import VesselFile
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Task
 from residnet.tasks.registry import TaskConfig, list_catalogue
-from residnet.tasks.simulate import Programme
+from residnet.tasks.simulate.config import Programme
+from residnet.tasks.simulate.execute import build_crafts, simulate_all
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -215,8 +216,8 @@ def simulate(
     flights = []
     rows = []
     with forward_progress(progress):
-        for craft, sea in programme.build_crafts():
-            craft_flights = programme.simulate_all(craft, sea)
+        for craft, sea in build_crafts(programme):
+            craft_flights = simulate_all(programme, craft, sea)
             flights += craft_flights
             rows += build_index_rows(craft, craft_flights, programme.hull_length)
     identity_columns = ("log", "manoeuvre", "craft", "fault")

@@ -31,8 +31,8 @@ from residnet.autopilot.heading.vessels import SteeredPlant, SteeredVessel
 from residnet.core.columns import all_but_pose
 from residnet.core.frames import wrap_angle
 from residnet.core.layout import HEADING, POSITION, RANGE_VELOCITIES
-from residnet.manoeuvres.trials import DisturbanceConfig
-from residnet.physics.environment import WavesConfig
+from residnet.manoeuvres.trials_config import DisturbanceConfig
+from residnet.physics.environment_config import WavesConfig
 from residnet.physics.plant import Plant
 
 METRIC_UNITS = {

@@ -26,7 +26,8 @@ from residnet.core.frames import wrap_angle_array
 from residnet.core.layout import HEADING, MOTION, PLANAR_LAYOUT, POSE
 from residnet.core.log import Log
 from residnet.engine.rollout import Source
-from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
+from residnet.manoeuvres.base import Helm, Manoeuvre
+from residnet.manoeuvres.sources import StackedSource
 
 _POSE = PLANAR_LAYOUT.pose
 

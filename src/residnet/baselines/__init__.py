@@ -7,24 +7,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 from residnet.core.registry import PluginUnion
 
 if TYPE_CHECKING:
-    from residnet.baselines.base import IdentifiedConfig
+    from residnet.baselines.config import IdentifiedConfig
 
     BaselineConfig = IdentifiedConfig
 else:
+    _STEERING = "residnet.baselines.steering_config"
     BaselineConfig = Annotated[
         Any,
         PluginUnion(
             "residnet.baselines",
-            "residnet.baselines.base:IdentifiedConfig",
+            "residnet.baselines.config:IdentifiedConfig",
             {
-                "believed": "residnet.baselines.given:BelievedConfig",
-                "equations": "residnet.baselines.given:EquationsConfig",
-                "linear_steady": "residnet.baselines.steering:LinearSteadyConfig",
-                "mmg": "residnet.baselines.mmg:MMGConfig",
-                "nomoto": "residnet.baselines.steering:NomotoBaselineConfig",
-                "nomoto_sideslip": "residnet.baselines.steering:NomotoSideslipBaselineConfig",
-                "regressors": "residnet.baselines.regressors:RegressorsConfig",
-                "still": "residnet.baselines.given:ZeroBaselineConfig",
+                "believed": "residnet.baselines.given_config:BelievedConfig",
+                "equations": "residnet.baselines.given_config:EquationsConfig",
+                "linear_steady": f"{_STEERING}:LinearSteadyConfig",
+                "mmg": "residnet.baselines.mmg_config:MMGConfig",
+                "nomoto": f"{_STEERING}:NomotoBaselineConfig",
+                "nomoto_sideslip": f"{_STEERING}:NomotoSideslipBaselineConfig",
+                "regressors": "residnet.baselines.regressors_config:RegressorsConfig",
+                "still": "residnet.baselines.given_config:ZeroBaselineConfig",
             },
         ),
     ]

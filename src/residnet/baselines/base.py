@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Self, final
+from typing import final
 
 import torch
 from torch import Tensor, nn
 
-from residnet.core.config import Config
-from residnet.core.errors import ConfigError, FitError
+from residnet.core.errors import FitError
 from residnet.core.layout import PLANAR_LAYOUT
 from residnet.core.samples import Samples
-from residnet.physics.symmetry import get_dof
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.least_squares import minimize_levenberg_marquardt
 
@@ -149,89 +147,14 @@ class ParametricBaseline(Baseline, ABC):
         """
 
 
-class IdentifiedConfig(Config, ABC):
-    """Configuration of a baseline and of its identification."""
-
-    kind: str
-
-    def without_file_references(self) -> Self:
-        """Return the config without references to files, for storage with a model."""
-        return self
-
-    @abstractmethod
-    def build(self, names: Sequence[str]) -> Baseline:
-        """Build the baseline, not yet fitted, for channels `names`.
-
-        Raises:
-            ConfigError: if a required channel is missing.
-        """
-
-    def validate_samples(self, samples: Samples) -> None:
-        """Check that the samples contain the manoeuvres required for the identification.
-
-        Raises:
-            FitError: if they do not.
-        """
-
-    def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Identify the baseline from samples whose target is the measured acceleration.
-
-        By default all parameters (`torch.nn.Parameter`) of the baseline are fitted by
-        `fit_parameters`.
-
-        Returns:
-            The solution; or several candidates for a selection by free runs, the preferred one
-            first.
-
-        Raises:
-            FitError: if the data do not determine a coefficient.
-        """
-        return [fit_parameters(baseline, samples)]
-
-    @final
-    def fit_preferred(self, baseline: Baseline, samples: Samples) -> list[Coefficient]:
-        """Load the first solution of `fit_solutions` and return its coefficient table."""
-        preferred = self.fit_solutions(baseline, samples)[0]
-        baseline.load_state_dict(preferred.state, strict=False)
-        return list(preferred.table)
-
-
-def require_channels(names: Sequence[str], required: Sequence[str], subject: str) -> None:
-    """Check that channels exist, that required velocities are modelled and that roll is not.
-
-    Raises:
-        ConfigError: with the first missing channel.
-        UsageError: if the model includes roll.
-    """
-    dof = get_dof(names)
-    dof.require_no_roll(subject)
-    for name in required:
-        if name in dof.fixed_states:
-            raise ConfigError(
-                f"{subject} needs the velocity {name}, but signals.velocities are"
-                f" {', '.join(dof.velocities)}; use a baseline of kind 'regressors' or"
-                " 'nomoto', which needs no further velocities"
-            )
-        if name not in names:
-            raise ConfigError(
-                f"{subject} needs the channel '{name}', but the model has {', '.join(names)};"
-                " add it to signals"
-            )
-
-
 def select_manoeuvres(samples: Samples, kinds: Sequence[str]) -> Samples:
     """Return the samples of some kinds of manoeuvre; all samples if `kinds` is empty.
 
     Raises:
         FitError: if there are no such samples.
     """
-    selected = samples.select_manoeuvres(kinds)
-    if len(selected) == 0:
-        raise FitError(
-            f"no sample is of the manoeuvres {list(kinds)} of the baseline; kinds in the data:"
-            f" {sorted(set(samples.kinds))}"
-        )
-    return selected
+    samples.origins.require_manoeuvres(kinds)
+    return samples.select_manoeuvres(kinds)
 
 
 _MAX_FIT_SAMPLES = 4000

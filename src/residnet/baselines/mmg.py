@@ -12,174 +12,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Annotated, Literal, NamedTuple, final
+from typing import TYPE_CHECKING, final
 
 import torch
-from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from residnet.baselines.base import (
-    Baseline,
-    IdentifiedConfig,
-    ParametricBaseline,
-    require_channels,
-    select_manoeuvres,
+from residnet.baselines.base import ParametricBaseline, select_manoeuvres
+from residnet.baselines.mmg_parameters import (
+    PARAMETER_NAMES,
+    MMGHull,
+    MMGPropeller,
+    MMGRudder,
+    ParameterPrior,
 )
-from residnet.core.config import Config, Kilograms, Metres
 from residnet.core.errors import FitError
-from residnet.core.names import VELOCITY_NAMES, suggest_name
+from residnet.core.names import VELOCITY_NAMES
 from residnet.core.samples import Samples
-from residnet.physics.parameters import Density, SquareMetres
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.least_squares import minimize_levenberg_marquardt
+
+if TYPE_CHECKING:
+    from residnet.baselines.mmg_config import MMGConfig
 
 _WAKE_SLOPE = 2.0
 """C_1, the slope of the wake fraction over the drift angle; the value of the KVLCC2 in the source.
 """
 # lower bound of U^2, so that v / U is defined at rest; (m/s)^2
 _MIN_SPEED_SQUARED = 1e-6
-
-
-class MMGHull(Config):
-    """Particulars of the hull; the origin of the body frame is midship.
-
-    Attributes:
-        length: length between perpendiculars.
-        beam: beam of the hull.
-        draught: draught of the hull.
-        mass: mass of the displaced water.
-        gyration: radius of gyration about the centre of gravity, divided by the length.
-        x_G: longitudinal position of the centre of gravity, positive forward of midship.
-        density: density of the water.
-    """
-
-    length: Metres = Field(gt=0)
-    beam: Metres = Field(gt=0)
-    draught: Metres = Field(gt=0)
-    mass: Kilograms = Field(gt=0)
-    gyration: float = Field(default=0.25, gt=0, lt=1)
-    x_G: Metres = 0.0
-    density: Density = Field(default=1000.0, gt=0)
-
-    @property
-    def block_coefficient(self) -> float:
-        """Block coefficient, dimensionless."""
-        return self.mass / (self.density * self.length * self.beam * self.draught)
-
-
-class MMGPropeller(Config):
-    """Propeller with ahead revolutions.
-
-    Attributes:
-        diameter: diameter of the propeller.
-        x: longitudinal position divided by the length, positive forward of midship.
-        thrust: coefficients of the open-water thrust K_T = k_0 + k_1 J + k_2 J^2.
-    """
-
-    diameter: Metres = Field(gt=0)
-    x: float = -0.48
-    thrust: tuple[float, float, float]
-
-
-class MMGRudder(Config):
-    """Rudder in the slipstream of the propeller.
-
-    Attributes:
-        area: area of the movable part.
-        aspect: aspect ratio, span squared divided by area.
-        x: longitudinal position divided by the length, positive forward of midship.
-        race: share of the span in the slipstream (propeller race), propeller diameter divided by
-            span.
-    """
-
-    area: SquareMetres = Field(gt=0)
-    aspect: float = Field(gt=0)
-    x: float = -0.5
-    race: float = Field(gt=0, le=1)
-
-    @property
-    def lift_slope(self) -> float:
-        """Gradient of the rudder normal force by the formula of Fujii, dimensionless."""
-        return 6.13 * self.aspect / (2.25 + self.aspect)
-
-
-class ParameterPrior(NamedTuple):
-    """Prior of a parameter: mean, standard deviation and description."""
-
-    mean: float
-    sd: float
-    meaning: str
-
-
-def default_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
-    """Return the default prior of every parameter, for a merchant ship with this hull.
-
-    The means of the linear hull derivatives are those of the formulas of Kijima. The means of most
-    higher-order derivatives are zero, so that the trials determine them.
-    """
-    # aspect ratio k of the hull as a low-aspect-ratio wing, with its mirror image at the surface
-    aspect_ratio = 2.0 * hull.draught / hull.length
-    beam_fullness = hull.block_coefficient * hull.beam / hull.length
-    # m' = m / (rho/2 L^2 d)
-    mass_nondim = 2.0 * hull.mass / (hull.density * hull.length**2 * hull.draught)
-    return {
-        "m_x": ParameterPrior(0.022, 0.01, "added mass in surge"),
-        "m_y": ParameterPrior(0.2, 0.06, "added mass in sway"),
-        "J_z": ParameterPrior(0.011, 0.004, "added moment of inertia in yaw"),
-        "R_0": ParameterPrior(0.02, 0.01, "resistance straight ahead"),
-        "X_vv": ParameterPrior(0.0, 0.1, "surge force of drift"),
-        "X_vr": ParameterPrior(
-            0.0, 0.1, "surge force of drift in a turn, in addition to that of the added mass"
-        ),
-        "X_rr": ParameterPrior(0.0, 0.03, "surge force of turning"),
-        "X_vvvv": ParameterPrior(0.5, 0.5, "surge force of large drift"),
-        "Y_0": ParameterPrior(0.0, 0.005, "sway force of asymmetry"),
-        "Y_v": ParameterPrior(
-            -(0.5 * math.pi * aspect_ratio + 1.4 * beam_fullness), 0.15, "sway force of drift"
-        ),
-        "Y_r": ParameterPrior(
-            mass_nondim + 0.022 - 1.5 * beam_fullness, 0.06, "sway force of turning"
-        ),
-        "Y_vvv": ParameterPrior(-1.0, 1.0, "sway force of large drift"),
-        "Y_vvr": ParameterPrior(0.0, 0.8, "sway force of large drift and turning"),
-        "Y_vrr": ParameterPrior(0.0, 0.5, "sway force of drift and fast turning"),
-        "Y_rrr": ParameterPrior(0.0, 0.05, "sway force of fast turning"),
-        "N_0": ParameterPrior(0.0, 0.002, "yaw moment of asymmetry"),
-        "N_v": ParameterPrior(-aspect_ratio, 0.05, "yaw moment of drift"),
-        "N_r": ParameterPrior(
-            -0.54 * aspect_ratio + aspect_ratio * aspect_ratio, 0.02, "yaw moment of turning"
-        ),
-        "N_vvv": ParameterPrior(0.0, 0.3, "yaw moment of large drift"),
-        "N_vvr": ParameterPrior(0.0, 0.3, "yaw moment of large drift and turning"),
-        "N_vrr": ParameterPrior(0.0, 0.1, "yaw moment of drift and fast turning"),
-        "N_rrr": ParameterPrior(0.0, 0.02, "yaw moment of fast turning"),
-        "t_P": ParameterPrior(0.22, 0.03, "thrust deduction"),
-        "w_P0": ParameterPrior(0.4, 0.06, "wake fraction straight ahead"),
-        "C_2p": ParameterPrior(
-            1.3,
-            0.25,
-            "inflow at large drift over inflow straight ahead, drift to port or turn to starboard",
-        ),
-        "C_2n": ParameterPrior(1.1, 0.25, "the same, drift to starboard or turn to port"),
-        "t_R": ParameterPrior(0.35, 0.15, "steering resistance deduction"),
-        "a_H": ParameterPrior(
-            0.3, 0.2, "sway force induced on the hull by the rudder, divided by the rudder force"
-        ),
-        "x_H": ParameterPrior(
-            -0.45, 0.1, "longitudinal position of that force, in lengths forward of midship"
-        ),
-        "gamma_p": ParameterPrior(0.5, 0.2, "flow straightening, inflow from port"),
-        "gamma_n": ParameterPrior(0.5, 0.2, "flow straightening, inflow from starboard"),
-        "l_R": ParameterPrior(
-            -0.8, 0.3, "effective longitudinal position of the rudder in a turn, in lengths"
-        ),
-        "epsilon": ParameterPrior(1.05, 0.2, "wake at the propeller over wake at the rudder"),
-        "kappa": ParameterPrior(0.5, 0.1, "share of the slipstream acceleration at the rudder"),
-    }
-
-
-PARAMETER_NAMES = tuple(default_priors(MMGHull(length=1.0, beam=0.2, draught=0.1, mass=10.0)))
-"""Names of the parameters, in the order of the columns of theta."""
 
 
 @final
@@ -438,123 +297,64 @@ def _subsample(samples: Samples) -> Samples:
     return samples.select(mask)
 
 
-class MMGConfig(IdentifiedConfig):
-    """MMG standard model of a ship with one propeller and one rudder.
+def fit_mmg(config: MMGConfig, baseline: MMGBaseline, samples: Samples) -> Solution:
+    """Compute the maximum a posteriori estimate by the Gauss-Newton method.
 
-    The model follows Yasukawa and Yoshimura (2015). Every parameter has a prior with a mean and
-    a standard deviation, which default to usual values. The fit is the maximum a posteriori
-    estimate from the measured accelerations. A `refit` of this baseline on free runs continues from
-    it and yields the standard errors of the prediction intervals.
-
-    Attributes:
-        hull: particulars of the hull.
-        propeller: particulars of the propeller.
-        rudder: particulars of the rudder.
-        beliefs: prior mean and standard deviation by non-dimensional parameter, for parameters that
-            differ from the defaults; a standard deviation of 0 fixes the parameter.
-        revolutions: channel of the propeller revolutions, 1/s.
-        angle: channel of the rudder angle, rad, positive to starboard.
-        correlation: number of successive acceleration samples with the information of one
-            independent sample.
-        manoeuvres: kinds of manoeuvre to fit on; empty for all.
+    Raises:
+        FitError: if the accelerations at the prior means are not finite.
     """
+    selected = select_manoeuvres(samples, config.manoeuvres)
+    subsample = _subsample(selected)
+    # the likelihood of correlated samples must not outweigh the prior
+    independent_samples = len(selected) / config.correlation
+    free_index = baseline.free_indices()
+    mean, precision = baseline.prior()
 
-    kind: Literal["mmg"] = "mmg"
-    hull: MMGHull
-    propeller: MMGPropeller
-    rudder: MMGRudder
-    beliefs: dict[str, tuple[float, Annotated[float, Field(ge=0)]]] = Field(default_factory=dict)
-    revolutions: str = "n"
-    angle: str = "delta"
-    correlation: int = Field(default=100, ge=1, le=100_000)
-    manoeuvres: tuple[str, ...] = ()
+    def acceleration_residual(theta: Tensor) -> Tensor:
+        baseline.theta[free_index] = theta
+        predicted: Tensor = baseline(subsample.z)
+        return subsample.target - predicted
 
-    @model_validator(mode="after")
-    def _validate_beliefs(self) -> MMGConfig:
-        for name in self.beliefs:
-            if name not in PARAMETER_NAMES:
-                raise ValueError(
-                    f"beliefs: no parameter '{name}'{suggest_name(name, PARAMETER_NAMES)}"
-                )
-        return self
+    def negative_log_posterior(theta: Tensor) -> float:
+        # Gaussian likelihood, concentrated with respect to the variance of each axis
+        negative_log_likelihood = (
+            0.5 * independent_samples * acceleration_residual(theta).square().mean(0).log().sum()
+        )
+        return float(negative_log_likelihood + 0.5 * (precision * (theta - mean).square()).sum())
 
-    def build(self, names: Sequence[str]) -> MMGBaseline:
-        """Build the baseline for channels `names`, with every parameter at its prior mean."""
-        required_channels = (*VELOCITY_NAMES, self.revolutions, self.angle)
-        require_channels(names, required_channels, "the baseline 'mmg'")
-        columns = [list(names).index(name) for name in required_channels]
-        configured_priors = {
-            name: ParameterPrior(*mean_and_std, "") for name, mean_and_std in self.beliefs.items()
-        }
-        priors = (default_priors(self.hull) | configured_priors).values()
-        return MMGBaseline(MMGForces(self.hull, self.propeller, self.rudder, columns), priors)
+    def normal_equations(theta: Tensor) -> tuple[Tensor, Tensor]:
+        residual = acceleration_residual(theta)
+        axis_weight = independent_samples / len(subsample) / residual.square().mean(0)
+        jacobian = baseline.parameter_jacobian(subsample.z)
+        hessian = torch.einsum("bip,biq,i->pq", jacobian, jacobian, axis_weight) + torch.diag(
+            precision
+        )
+        gradient = torch.einsum("bip,bi,i->p", jacobian, residual, axis_weight)
+        return hessian, gradient + precision * (mean - theta)
 
-    def validate_samples(self, samples: Samples) -> None:
-        select_manoeuvres(samples, self.manoeuvres)
+    def linearize(theta: Tensor) -> tuple[float, Callable[[float], tuple[float, Tensor]]]:
+        hessian, gradient = normal_equations(theta)
 
-    def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Compute the maximum a posteriori estimate by the Gauss-Newton method.
+        def try_step(damping: float) -> tuple[float, Tensor]:
+            damped_hessian = hessian + damping * torch.diag(hessian.diagonal())
+            next_theta = theta + torch.linalg.solve(damped_hessian, gradient)
+            return negative_log_posterior(next_theta), next_theta
 
-        Raises:
-            FitError: if the accelerations at the prior means are not finite.
-        """
-        assert isinstance(baseline, MMGBaseline)
-        selected = select_manoeuvres(samples, self.manoeuvres)
-        subsample = _subsample(selected)
-        # the likelihood of correlated samples must not outweigh the prior
-        independent_samples = len(selected) / self.correlation
-        free_index = baseline.free_indices()
-        mean, precision = baseline.prior()
+        return negative_log_posterior(theta), try_step
 
-        def acceleration_residual(theta: Tensor) -> Tensor:
-            baseline.theta[free_index] = theta
-            predicted: Tensor = baseline(subsample.z)
-            return subsample.target - predicted
-
-        def negative_log_posterior(theta: Tensor) -> float:
-            # Gaussian likelihood, concentrated with respect to the variance of each axis
-            negative_log_likelihood = (
-                0.5
-                * independent_samples
-                * acceleration_residual(theta).square().mean(0).log().sum()
-            )
-            return float(
-                negative_log_likelihood + 0.5 * (precision * (theta - mean).square()).sum()
-            )
-
-        def normal_equations(theta: Tensor) -> tuple[Tensor, Tensor]:
-            residual = acceleration_residual(theta)
-            axis_weight = independent_samples / len(subsample) / residual.square().mean(0)
-            jacobian = baseline.parameter_jacobian(subsample.z)
-            hessian = torch.einsum("bip,biq,i->pq", jacobian, jacobian, axis_weight) + torch.diag(
-                precision
-            )
-            gradient = torch.einsum("bip,bi,i->p", jacobian, residual, axis_weight)
-            return hessian, gradient + precision * (mean - theta)
-
-        def linearize(theta: Tensor) -> tuple[float, Callable[[float], tuple[float, Tensor]]]:
-            hessian, gradient = normal_equations(theta)
-
-            def try_step(damping: float) -> tuple[float, Tensor]:
-                damped_hessian = hessian + damping * torch.diag(hessian.diagonal())
-                next_theta = theta + torch.linalg.solve(damped_hessian, gradient)
-                return negative_log_posterior(next_theta), next_theta
-
-            return negative_log_posterior(theta), try_step
-
-        if not torch.isfinite(acceleration_residual(mean)).all():
-            raise FitError(
-                "the MMG model's accelerations are not finite along the training logs; check"
-                " hull, propeller and rudder, and units"
-            )
-        theta_map = minimize_levenberg_marquardt(
-            # no initial damping: the prior makes the problem well-conditioned
-            mean,
-            linearize,
-            _MAX_STEPS,
-            min_relative_decrease=_MIN_RELATIVE_GAIN,
-            damping=0.0,
-        ).minimizer
-        standard_errors = torch.linalg.inv(normal_equations(theta_map)[0]).diagonal().sqrt()
-        theta = baseline.theta.detach().clone()
-        return [Solution({}, {"theta": theta}, tuple(baseline.refresh_table((), standard_errors)))]
+    if not torch.isfinite(acceleration_residual(mean)).all():
+        raise FitError(
+            "the MMG model's accelerations are not finite along the training logs; check"
+            " hull, propeller and rudder, and units"
+        )
+    theta_map = minimize_levenberg_marquardt(
+        # no initial damping: the prior makes the problem well-conditioned
+        mean,
+        linearize,
+        _MAX_STEPS,
+        min_relative_decrease=_MIN_RELATIVE_GAIN,
+        damping=0.0,
+    ).minimizer
+    standard_errors = torch.linalg.inv(normal_equations(theta_map)[0]).diagonal().sqrt()
+    theta = baseline.theta.detach().clone()
+    return Solution({}, {"theta": theta}, tuple(baseline.refresh_table((), standard_errors)))

@@ -1,50 +1,39 @@
 """Baselines that are linear in their coefficients, nu_dot = Theta phi(z), with named regressors.
 
-Least squares does not ensure a damped model. Sway and yaw are often correlated in logs. A term such
-as u r in yaw may then get a coefficient of negative damping that terms in sway cancel in the
-training data: the fit is good, but the model is unstable. The option `dissipative` removes such
-terms.
+Least squares does not ensure a damped model. A term such as u r in yaw may have either sign, and if
+sway and yaw are correlated in the logs, negative damping of this term can be cancelled by terms in
+sway: the fit is good, but the model is unstable. The option `dissipative` removes such terms.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, Literal, final
+from typing import TYPE_CHECKING, Any, final
 
 import torch
-from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from residnet.baselines.base import (
-    Baseline,
-    IdentifiedConfig,
-    ParametricBaseline,
-    select_manoeuvres,
-)
-from residnet.baselines.sets import ChannelRoles, SetName, drop_equivalent_terms, expand_sets
-from residnet.core.errors import ConfigError
-from residnet.core.names import VELOCITY_NAMES
+from residnet.baselines.base import ParametricBaseline, select_manoeuvres
 from residnet.core.samples import Samples, directional_derivatives
 from residnet.physics.signals import RestoringAcceleration
 from residnet.physics.symmetry import (
     ChannelNames,
-    active_channels,
     acts_along_own_velocity,
     get_axis_parities,
     get_dof,
-    is_active_term,
     mirror_terms,
     violates_symmetry,
 )
-from residnet.physics.terms import TermLibrary
+from residnet.physics.term_library import TermLibrary
 from residnet.regression.estimator import Coefficient, Solution, evaluate_regressors, select_columns
 from residnet.regression.least_squares import LeastSquares
 
+if TYPE_CHECKING:
+    from residnet.baselines.regressors_config import RegressorsConfig
+
 _RANGE_MARGIN = 0.5
 """Widening of the training range to either side before a bounded model clamps, as a share of it."""
-AxisTermNames = dict[Literal["u", "v", "r", "w", "p", "q"], tuple[str, ...]]
-Penalty = Annotated[float, Field(ge=0)]
 
 
 @final
@@ -275,24 +264,6 @@ class RegressorBaseline(ParametricBaseline):
         )
 
 
-def active_terms(
-    terms_by_axis: Sequence[Sequence[str]], names: Sequence[str]
-) -> list[tuple[str, ...]]:
-    """Return the terms per dynamic state without terms that are identically zero.
-
-    States without terms are inactive velocities, angles, whose rates are kinematic, and states
-    beyond the axes of `terms_by_axis`.
-    """
-    dof = get_dof(names)
-    all_axes = [*terms_by_axis, *[()] * (dof.n_dynamic - len(terms_by_axis))]
-    return [
-        tuple(term for term in axis_terms if is_active_term(term, names))
-        if axis in dof.regressed_indices
-        else ()
-        for axis, axis_terms in enumerate(all_axes)
-    ]
-
-
 _SLOPE_SAMPLES = 400
 """Minimum number of samples after thinning for the median of derivatives; chosen by hand."""
 
@@ -340,174 +311,83 @@ def _find_common_undamped_term(
     return set.intersection(*undamped_terms)
 
 
-class RegressorsConfig(IdentifiedConfig):
-    """Least squares or ridge regression of the accelerations on named regressors.
+def fit_regressors(
+    config: RegressorsConfig, baseline: RegressorBaseline, samples: Samples
+) -> list[Solution]:
+    """Fit a baseline by least squares or ridge regression; one solution for each penalty.
 
-    Attributes:
-        sets: named sets of regressors for every axis, expanded for the channels of the model:
-            `linear`; `fossen` (linear and quadratic damping, Coriolis products, propeller and
-            rudder); `abkowitz` (third-order Taylor series about straight-ahead motion); `astern`
-            (additional terms for astern revolutions); `wind`; `polynomial_1` and `polynomial_2`
-            (all products of velocities and inputs, the ridge models of document 001 section 2.2).
-        terms: additional regressors of every axis, or per axis `u`, `v`, `r` (with roll also `p`;
-            in six degrees of freedom also `w`, `p`, `q`). Without sets and terms, the regressors
-            are the constant and every channel.
-        drive: channels used as thrust by the sets; if empty n, or tau_x if the model has forces.
-        steer: channels used as steering by the sets; if empty delta, or tau_n if the model has
-            forces.
-        ridge: penalty relative to the energy of each regressor, 0 for ordinary least squares. Of
-            several penalties, the one with the best free run on validation data is selected.
-        manoeuvres: kinds of manoeuvre to fit on; empty for all.
-        dissipative: whether terms with negative damping are removed and the others fitted again.
-            These are terms proportional to the velocity of their axis, such as u|u| in surge or
-            v|r| in sway, with a positive coefficient; and, if the damping of an axis is negative at
-            most samples, the term that contributes most, such as u r in yaw. A refit does the same.
-        bounded: whether velocities and inputs are clamped if they exceed the training range by more
-            than half its width, with a restoring acceleration on such velocities, so that the model
-            cannot diverge.
+    Raises:
+        FitError: if the data do not determine a coefficient.
     """
+    selected = select_manoeuvres(samples, config.manoeuvres)
+    estimator = LeastSquares(config.ridge if isinstance(config.ridge, tuple) else (config.ridge,))
+    terms = baseline.library.terms
+    term_values = evaluate_regressors(baseline.library, selected.z, range(len(terms)))
 
-    kind: Literal["regressors"] = "regressors"
-    sets: tuple[SetName, ...] = ()
-    terms: tuple[str, ...] | AxisTermNames = ()
-    drive: tuple[str, ...] = ()
-    steer: tuple[str, ...] = ()
-    ridge: Penalty | Annotated[tuple[Penalty, ...], Field(min_length=2)] = 0.0
-    manoeuvres: tuple[str, ...] = ()
-    dissipative: bool = False
-    bounded: bool = False
+    def fit_axis(axis: int, columns: list[int]) -> list[Solution]:
+        return estimator.fit(
+            select_columns(term_values, columns),
+            selected.target[:, [axis]],
+            selected.group,
+            names=[terms[j] for j in columns],
+            outputs=(baseline.output_names[axis],),
+        )
 
-    @model_validator(mode="after")
-    def _validate_terms(self) -> RegressorsConfig:
-        if isinstance(self.terms, dict) and not {*VELOCITY_NAMES} <= set(self.terms):
-            raise ValueError(f"terms: expected all of the axes u, v, r, got {sorted(self.terms)}")
-        if (self.drive or self.steer) and not self.sets:
-            raise ValueError(
-                "drive and steer are channels of the terms of `sets`; give sets, or remove them"
-            )
-        return self
-
-    def axis_terms(self, names: Sequence[str]) -> list[tuple[str, ...]]:
-        """Return the regressors of each axis for channels `names`.
-
-        Duplicate regressors are removed. Inactive velocities have no regressors and occur in none.
-        """
-        return active_terms(self._configured_terms(names), names)
-
-    def _configured_terms(self, names: Sequence[str]) -> list[tuple[str, ...]]:
-        """Return the regressors of each axis as configured, including inactive ones."""
-        axes = get_dof(names).layout.velocities
-        if isinstance(self.terms, dict) and set(self.terms) != set(axes):
-            raise ConfigError(
-                f"terms: expected the axes {', '.join(axes)} of the model, got {sorted(self.terms)}"
-            )
-        terms_by_axis = (
-            [
-                tuple(axis_terms)
-                for _, axis_terms in sorted(
-                    self.terms.items(), key=lambda item: axes.index(item[0])
+    # inactive velocities are zero, and rates of angles follow from kinematics: none is fitted
+    learned_axes = get_dof(selected.names).regressed_indices
+    axis_fits = {}
+    velocity_slopes = (
+        _own_velocity_slopes(baseline.library, selected) if config.dissipative else None
+    )
+    for axis in learned_axes:
+        destabilising: set[str] = set()
+        undamped: set[str] = set()
+        while True:
+            columns = [
+                j for j in baseline.term_columns(axis) if terms[j] not in destabilising | undamped
+            ]
+            axis_solutions = fit_axis(axis, columns)
+            if config.dissipative and (
+                new_destabilising := _destabilising_in_all(axis_solutions, axis, selected.names)
+            ):
+                destabilising |= new_destabilising
+            elif velocity_slopes is not None and (
+                new_undamped := _find_common_undamped_term(
+                    axis_solutions, terms, velocity_slopes[axis]
                 )
-            ]
-            if isinstance(self.terms, dict)
-            else [tuple(self.terms)] * len(axes)
+            ):
+                # terms that were removed by their sign are tried again, because their sign may
+                # change without the undamped term
+                destabilising = set()
+                undamped = undamped | new_undamped
+            else:
+                break
+        axis_fits[axis] = axis_solutions
+    axis_solutions = [
+        baseline.combine_axis_fits(
+            dict(zip(learned_axes, axis_candidates, strict=True)),
+            axis_candidates[0].hyperparameters,
         )
-        if self.sets:
-            set_terms = expand_sets(
-                self.sets, ChannelRoles.from_channels(names, self.drive, self.steer)
-            )
-            return [
-                drop_equivalent_terms((*set_terms, *axis_terms), names)
-                for axis_terms in terms_by_axis
-            ]
-        return (
-            [axis_terms or ("1", *active_channels(names)) for axis_terms in terms_by_axis]
-            if self.terms == ()
-            else terms_by_axis
-        )
+        for axis_candidates in zip(*axis_fits.values(), strict=True)
+    ]
+    if not config.bounded:
+        return axis_solutions
+    restoring = RestoringAcceleration(_RANGE_MARGIN, len(selected.names), baseline.n_dof)
+    restoring.calibrate(selected)
+    state = {f"bound.{name}": value for name, value in restoring.state_dict().items()}
+    return [replace(solution, state={**solution.state, **state}) for solution in axis_solutions]
 
-    def build(self, names: Sequence[str]) -> RegressorBaseline:
-        return RegressorBaseline(
-            self.axis_terms(names), names, is_dissipative=self.dissipative, is_bounded=self.bounded
-        )
 
-    def validate_samples(self, samples: Samples) -> None:
-        select_manoeuvres(samples, self.manoeuvres)
-
-    def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        assert isinstance(baseline, RegressorBaseline)
-        selected = select_manoeuvres(samples, self.manoeuvres)
-        estimator = LeastSquares(self.ridge if isinstance(self.ridge, tuple) else (self.ridge,))
-        terms = baseline.library.terms
-        term_values = evaluate_regressors(baseline.library, selected.z, range(len(terms)))
-
-        def fit_axis(axis: int, columns: list[int]) -> list[Solution]:
-            return estimator.fit(
-                select_columns(term_values, columns),
-                selected.target[:, [axis]],
-                selected.group,
-                names=[terms[j] for j in columns],
-                outputs=(baseline.output_names[axis],),
-            )
-
-        # inactive velocities are zero, and rates of angles follow from kinematics: none is fitted
-        learned_axes = get_dof(selected.names).regressed_indices
-        axis_fits = {}
-        velocity_slopes = (
-            _own_velocity_slopes(baseline.library, selected) if self.dissipative else None
-        )
-        for axis in learned_axes:
-            destabilising: set[str] = set()
-            undamped: set[str] = set()
-            while True:
-                columns = [
-                    j
-                    for j in baseline.term_columns(axis)
-                    if terms[j] not in destabilising | undamped
-                ]
-                axis_solutions = fit_axis(axis, columns)
-                if new_destabilising := self._destabilising_in_all(
-                    axis_solutions, axis, selected.names
-                ):
-                    destabilising |= new_destabilising
-                elif velocity_slopes is not None and (
-                    new_undamped := _find_common_undamped_term(
-                        axis_solutions, terms, velocity_slopes[axis]
-                    )
-                ):
-                    # terms that were removed by their sign are tried again, because their sign may
-                    # change without the undamped term
-                    destabilising = set()
-                    undamped = undamped | new_undamped
-                else:
-                    break
-            axis_fits[axis] = axis_solutions
-        axis_solutions = [
-            baseline.combine_axis_fits(
-                dict(zip(learned_axes, axis_candidates, strict=True)),
-                axis_candidates[0].hyperparameters,
-            )
-            for axis_candidates in zip(*axis_fits.values(), strict=True)
-        ]
-        if not self.bounded:
-            return axis_solutions
-        restoring = RestoringAcceleration(_RANGE_MARGIN, len(selected.names), baseline.n_dof)
-        restoring.calibrate(selected)
-        state = {f"bound.{name}": value for name, value in restoring.state_dict().items()}
-        return [replace(solution, state={**solution.state, **state}) for solution in axis_solutions]
-
-    def _destabilising_in_all(
-        self, solutions: Sequence[Solution], axis: int, names: Sequence[str]
-    ) -> set[str]:
-        """Return the terms with the sign of negative damping in every solution."""
-        if not self.dissipative:
-            return set()
-        destabilising_terms = [
-            {
-                coefficient.term
-                for coefficient in solution.table
-                if coefficient.value > 0.0
-                and acts_along_own_velocity(coefficient.term, axis, names)
-            }
-            for solution in solutions
-        ]
-        return set.intersection(*destabilising_terms)
+def _destabilising_in_all(
+    solutions: Sequence[Solution], axis: int, names: Sequence[str]
+) -> set[str]:
+    """Return the terms with the sign of negative damping in every solution."""
+    destabilising_terms = [
+        {
+            coefficient.term
+            for coefficient in solution.table
+            if coefficient.value > 0.0 and acts_along_own_velocity(coefficient.term, axis, names)
+        }
+        for solution in solutions
+    ]
+    return set.intersection(*destabilising_terms)

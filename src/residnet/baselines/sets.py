@@ -7,9 +7,12 @@ from itertools import combinations, combinations_with_replacement
 from typing import Literal, NamedTuple
 
 from residnet.core.errors import ConfigError
-from residnet.core.names import VELOCITY_NAMES, suggest_name
-from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
-from residnet.physics.symmetry import canonical_factors, get_dof
+from residnet.core.names import FORCE_CHANNELS, VELOCITY_NAMES, WIND_CHANNELS, suggest_name
+from residnet.physics.symmetry import (
+    canonical_factors,
+    get_dof,
+    is_active_term,
+)
 from residnet.physics.terms import Factor, make_polynomial_terms
 
 SetName = Literal["linear", "fossen", "abkowitz", "astern", "wind", "polynomial_1", "polynomial_2"]
@@ -294,3 +297,21 @@ def drop_equivalent_terms(terms: Sequence[str], names: Sequence[str]) -> tuple[s
     for term in terms:
         term_of_factors.setdefault(canonical_factors(term, names, {}), term)
     return tuple(term_of_factors.values())
+
+
+def active_terms(
+    terms_by_axis: Sequence[Sequence[str]], names: Sequence[str]
+) -> list[tuple[str, ...]]:
+    """Return the terms per dynamic state without terms that are identically zero.
+
+    States without terms are inactive velocities, angles, whose rates are kinematic, and states
+    beyond the axes of `terms_by_axis`.
+    """
+    dof = get_dof(names)
+    all_axes = [*terms_by_axis, *[()] * (dof.n_dynamic - len(terms_by_axis))]
+    return [
+        tuple(term for term in axis_terms if is_active_term(term, names))
+        if axis in dof.regressed_indices
+        else ()
+        for axis, axis_terms in enumerate(all_axes)
+    ]

@@ -7,17 +7,16 @@ states.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Literal, NamedTuple, final
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from residnet.baselines.base import Baseline, IdentifiedConfig, require_channels, select_manoeuvres
-from residnet.baselines.regressors import RegressorBaseline, active_terms
-from residnet.core.config import Seconds
+from residnet.baselines.base import select_manoeuvres
+from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.sets import active_terms
 from residnet.core.errors import FitError
 from residnet.core.names import ACCELERATION_NAMES, VELOCITY_NAMES
 from residnet.core.samples import Samples
@@ -25,40 +24,12 @@ from residnet.physics.symmetry import get_dof
 from residnet.regression.estimator import Coefficient, Ratio, Solution
 from residnet.regression.least_squares import LeastSquares
 
-
-class SteeringBaselineConfig(IdentifiedConfig, ABC):
-    """Common base of the configurations of models of speed and steering.
-
-    Attributes:
-        drive: input channel of surge.
-        steer: input channel of steering.
-    """
-
-    required_velocities: ClassVar[tuple[str, ...]] = VELOCITY_NAMES
-    """Velocities that the model must have."""
-
-    kind: str
-    drive: str
-    steer: str
-
-    @abstractmethod
-    def axis_terms(self) -> tuple[tuple[str, ...], ...]:
-        """Return the terms per axis; sway with `("v",)` decays with the yaw time constant."""
-
-    @final
-    def build(self, names: Sequence[str]) -> RegressorBaseline:
-        velocities = get_dof(names).velocities
-        # a model of surge only needs no steering channel, and one without surge no drive
-        driving = (
-            [self.drive] if velocities == ("u",) else [self.steer] if "u" not in velocities else []
-        )
-        driving = driving or [self.drive, self.steer]
-        require_channels(names, (*self.required_velocities, *driving), f"baseline '{self.kind}'")
-        # the decay of sway is a copy of the yaw coefficient, which a refit must not change
-        terms_by_axis = active_terms(self.axis_terms(), names)
-        return RegressorBaseline(
-            terms_by_axis, names, ((1, "v"),) if terms_by_axis[1] == ("v",) else ()
-        )
+if TYPE_CHECKING:
+    from residnet.baselines.steering_config import (
+        LinearSteadyConfig,
+        NomotoLagConfig,
+        SteadyStateBlock,
+    )
 
 
 def _sway_decay(yaw_coefficients: Sequence[Coefficient]) -> tuple[Coefficient, ...]:
@@ -67,87 +38,6 @@ def _sway_decay(yaw_coefficients: Sequence[Coefficient]) -> tuple[Coefficient, .
         coefficient for coefficient in yaw_coefficients if coefficient.term == "r"
     )
     return (Coefficient("v_dot", "v", yaw_coefficient.value, yaw_coefficient.standard_error),)
-
-
-class _NomotoBaselineConfig(SteeringBaselineConfig, ABC):
-    """Common base of the configurations of both Nomoto models.
-
-    The equations are T_u u_dot + u = K_u drive + b_u (eq. (12)) and T r_dot + r = K steer + b
-    (eq. (13)).
-
-    Attributes:
-        manoeuvres: kinds of manoeuvre to fit on; empty for all.
-    """
-
-    sway_terms: ClassVar[tuple[str, ...]] = ("v",)
-
-    drive: str = "n"
-    steer: str = "delta"
-    manoeuvres: tuple[str, ...] = ()
-
-    @final
-    def axis_terms(self) -> tuple[tuple[str, ...], ...]:
-        return ("u", self.drive, "1"), self.sway_terms, ("r", self.steer, "1")
-
-    @final
-    def validate_samples(self, samples: Samples) -> None:
-        select_manoeuvres(samples, self.manoeuvres)
-
-    @final
-    def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Fit each axis; the table has the coefficients, then T, K and b of each axis.
-
-        Raises:
-            FitError: if the data do not determine a coefficient, or an axis is unstable.
-        """
-        assert isinstance(baseline, RegressorBaseline)
-        ratios = (
-            _lag_ratios("u", self.drive, "_u"),
-            {
-                "T_beta": Ratio(-1.0, None, "v"),
-                "K_beta": Ratio(1.0, "u r", "v"),
-                "b_beta": Ratio(-1.0, "u", "v"),
-            },
-            _lag_ratios("r", self.steer, ""),
-        )
-        selected = select_manoeuvres(samples, self.manoeuvres)
-        axis_fits = {}
-        parameters = []
-        for axis, terms in enumerate(active_terms(self.axis_terms(), selected.names)):
-            if len(terms) > 1:
-                axis_fits[axis] = self._fit_lag(baseline, selected, axis, terms)
-                parameters += _ratio_parameters(axis, terms, axis_fits[axis], ratios[axis])
-        if 1 not in axis_fits and "v" in get_dof(selected.names).velocities:
-            axis_fits[1] = Solution({}, {}, _sway_decay(axis_fits[2].table))
-        solution = baseline.combine_axis_fits(axis_fits, {})
-        return [replace(solution, table=(*solution.table, *parameters))]
-
-    def _fit_lag(
-        self, baseline: RegressorBaseline, samples: Samples, axis: int, terms: Sequence[str]
-    ) -> Solution:
-        """Fit a first-order lag of one axis by least squares.
-
-        Raises:
-            FitError: if the data do not determine it, or it is unstable.
-        """
-        term_columns = [baseline.library.terms.index(term) for term in terms]
-        (fit,) = LeastSquares().fit(
-            baseline.library(samples.z)[:, term_columns],
-            samples.target[:, [axis]],
-            samples.group,
-            names=terms,
-            outputs=(ACCELERATION_NAMES[axis],),
-        )
-        slope = float(fit.coefficients[0, 0])
-        standard_error = float(fit.standard_errors[0, 0])
-        name = VELOCITY_NAMES[axis]
-        if slope >= 0:
-            raise FitError(
-                f"a Nomoto model needs a stable {name}, but the coefficient of {name} in"
-                f" {name}_dot is {slope:.2g} +- {standard_error:.1g} 1/s: the vessel is unstable or"
-                " barely excited; use a baseline of kind 'regressors' or fit on other `manoeuvres`"
-            )
-        return fit
 
 
 def _lag_ratios(state: str, drive: str, suffix: str) -> dict[str, Ratio]:
@@ -181,187 +71,150 @@ def _ratio_parameters(
     return parameters
 
 
-class NomotoBaselineConfig(_NomotoBaselineConfig):
-    """Nomoto model of first order, T r_dot + r = K steer + b.
+def fit_nomoto(config: NomotoLagConfig, baseline: RegressorBaseline, samples: Samples) -> Solution:
+    """Fit a Nomoto model; the table has the coefficients, then T, K and b of each axis.
 
-    Surge is a first-order lag of the drive. Sway, which the model does not describe, decays with T.
-    If the model has only surge or only yaw, only its lag is identified.
+    Raises:
+        FitError: if the data do not determine a coefficient, or an axis is unstable.
     """
+    ratios = (
+        _lag_ratios("u", config.drive, "_u"),
+        {
+            "T_beta": Ratio(-1.0, None, "v"),
+            "K_beta": Ratio(1.0, "u r", "v"),
+            "b_beta": Ratio(-1.0, "u", "v"),
+        },
+        _lag_ratios("r", config.steer, ""),
+    )
+    selected = select_manoeuvres(samples, config.manoeuvres)
+    axis_fits = {}
+    parameters = []
+    for axis, terms in enumerate(active_terms(config.axis_terms(), selected.names)):
+        if len(terms) > 1:
+            axis_fits[axis] = _fit_lag(baseline, selected, axis, terms)
+            parameters += _ratio_parameters(axis, terms, axis_fits[axis], ratios[axis])
+    if 1 not in axis_fits and "v" in get_dof(selected.names).velocities:
+        axis_fits[1] = Solution({}, {}, _sway_decay(axis_fits[2].table))
+    solution = baseline.combine_axis_fits(axis_fits, {})
+    return replace(solution, table=(*solution.table, *parameters))
 
-    required_velocities = ()
 
-    kind: Literal["nomoto"] = "nomoto"
+def _fit_lag(
+    baseline: RegressorBaseline, samples: Samples, axis: int, terms: Sequence[str]
+) -> Solution:
+    """Fit a first-order lag of one axis by least squares.
 
-
-class NomotoSideslipBaselineConfig(_NomotoBaselineConfig):
-    """Nomoto model with sideslip (document 003 eqs. (14), (15)).
-
-    T_beta beta_dot + beta = -K_beta r + b_beta, formulated for v = u beta.
+    Raises:
+        FitError: if the data do not determine it, or it is unstable.
     """
+    term_columns = [baseline.library.terms.index(term) for term in terms]
+    (fit,) = LeastSquares().fit(
+        baseline.library(samples.z)[:, term_columns],
+        samples.target[:, [axis]],
+        samples.group,
+        names=terms,
+        outputs=(ACCELERATION_NAMES[axis],),
+    )
+    slope = float(fit.coefficients[0, 0])
+    standard_error = float(fit.standard_errors[0, 0])
+    name = VELOCITY_NAMES[axis]
+    if slope >= 0:
+        raise FitError(
+            f"a Nomoto model needs a stable {name}, but the coefficient of {name} in"
+            f" {name}_dot is {slope:.2g} +- {standard_error:.1g} 1/s: the vessel is unstable or"
+            " barely excited; use a baseline of kind 'regressors' or fit on other `manoeuvres`"
+        )
+    return fit
 
-    sway_terms = ("v", "u r", "u")
 
-    kind: Literal["nomoto_sideslip"] = "nomoto_sideslip"
+def fit_steady_states(
+    config: LinearSteadyConfig, baseline: RegressorBaseline, samples: Samples
+) -> Solution:
+    """Fit the linear model; the notes contain the steady states and Phi (Table 1).
 
-
-class _SteadyStateBlock(NamedTuple):
-    """States with a common input, and the kinds of manoeuvre that identify their dynamics."""
-
-    states: tuple[str, ...]
-    drive: str
-    manoeuvre_kinds: tuple[str, ...]
-
-
-class LinearSteadyConfig(SteeringBaselineConfig):
-    """Linear models u_dot = a u + k tau + c and (v, r)_dot = A (v, r) + B tau + C.
-
-    The equations are (12) and (16) of document 003. Steady states of constant-input manoeuvres give
-    x_ss = Phi tau + Phi_bias by least squares (eqs. (24), (32)). Then x_dot = A (x - Phi tau -
-    Phi_bias) gives A by least squares on derivatives (eq. (29)), and B = -A Phi (eq. (28)). Nomoto
-    models are identified by the same method.
-
-    Attributes:
-        steering_model: `linear` is (16). `nomoto` is (13), with a sway velocity that decays with
-            the yaw time constant. `nomoto_sideslip` is (15) with sway velocity instead of sideslip
-            and the yaw rate as the input of sway.
-        steady: kinds of manoeuvre with constant input.
-        settled: time after the start of a constant-input manoeuvre from which samples count as
-            steady.
-        speed: kinds of manoeuvre that identify a.
-        steering: kinds of manoeuvre that identify A.
+    Raises:
+        FitError: if a required kind of manoeuvre is missing.
     """
-
-    kind: Literal["linear_steady"] = "linear_steady"
-    drive: str = "tau_x"
-    steer: str = "tau_n"
-    steering_model: Literal["linear", "nomoto", "nomoto_sideslip"] = "linear"
-    steady: tuple[str, ...] = ("constant",)
-    settled: Seconds = 40.0
-    speed: tuple[str, ...] = ("acceleration_deceleration",)
-    steering: tuple[str, ...] = ("zigzag", "three_two_one_one")
-
-    def axis_terms(self) -> tuple[tuple[str, ...], ...]:
-        terms_of_axis: dict[str, tuple[str, ...]] = {"v": ("v",)}
-        for block in self._steady_state_blocks():
-            terms_of_axis |= dict.fromkeys(block.states, (*block.states, block.drive, "1"))
-        return tuple(terms_of_axis[axis] for axis in VELOCITY_NAMES)
-
-    def _steady_state_blocks(self) -> list[_SteadyStateBlock]:
-        yaw_block = _SteadyStateBlock(("r",), self.steer, self.steering)
-        steering_blocks = {
-            "linear": [_SteadyStateBlock(("v", "r"), self.steer, self.steering)],
-            "nomoto": [yaw_block],
-            "nomoto_sideslip": [_SteadyStateBlock(("v",), "r", self.steering), yaw_block],
-        }
-        return [
-            _SteadyStateBlock(("u",), self.drive, self.speed),
-            *steering_blocks[self.steering_model],
-        ]
-
-    def validate_samples(self, samples: Samples) -> None:
-        """Check that the samples contain all required kinds of manoeuvre.
-
-        Raises:
-            FitError: if a kind is missing.
-        """
-        self._steady_means(samples, ())
-        for kinds in (self.speed, self.steering):
-            select_manoeuvres(samples, kinds)
-
-    def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Fit the model; the notes contain the steady states and Phi (Table 1).
-
-        Raises:
-            FitError: if a required kind of manoeuvre is missing.
-        """
-        assert isinstance(baseline, RegressorBaseline)
-        tables: dict[str, tuple[Coefficient, ...]] = {}
-        steady_constraints: dict[str, dict[str, Any]] = {}
-        for block in self._steady_state_blocks():
-            # static gain and bias from the steady states, then the dynamics
-            means = self._steady_means(samples, (*block.states, block.drive))
-            design_matrix = torch.stack((means[:, -1], torch.ones_like(means[:, -1])), dim=1)
-            (steady_fit,) = LeastSquares().fit(
-                design_matrix,
-                means[:, :-1],
-                torch.arange(len(means)),
-                names=(block.drive, "1"),
-                outputs=block.states,
-            )
-            tables |= self._fit_dynamics(samples, block, steady_fit)
-            for i, state in enumerate(block.states):
-                (value, bias), (standard_error, bias_standard_error) = (
-                    values[:, i].tolist()
-                    for values in (steady_fit.coefficients, steady_fit.standard_errors)
-                )
-                steady_constraints[state] = {
-                    "of": block.drive,
-                    "phi": value,
-                    "phi_error": standard_error,
-                }
-                steady_constraints[state] |= {"bias": bias, "bias_error": bias_standard_error}
-        tables.setdefault("v", _sway_decay(tables["r"]))
-        names = (*VELOCITY_NAMES, self.drive, self.steer)
-        steady_states = dict(zip(names, self._steady_means(samples, names).T.tolist(), strict=True))
-        axis_fits = {i: Solution({}, {}, tables[axis]) for i, axis in enumerate(VELOCITY_NAMES)}
-        solution = baseline.combine_axis_fits(axis_fits, {})
-        return [
-            replace(
-                solution,
-                notes={"steady_states": steady_states, "steady_constraints": steady_constraints},
-            )
-        ]
-
-    def _steady_means(self, samples: Samples, names: Sequence[str]) -> Tensor:
-        """Return the mean channels [M, len(names)] of the steady part of M constant manoeuvres."""
-        steady_samples = samples.select_manoeuvres(self.steady)
-        steady_samples = steady_samples.select(steady_samples.t >= self.settled)
-        groups, group_index = torch.unique(steady_samples.group, return_inverse=True)
-        if len(groups) < 3:
-            raise FitError(
-                "baseline 'linear_steady' needs at least 3 constant-input manoeuvres of kinds"
-                f" {list(self.steady)} longer than {self.settled:g} s, the data have"
-                f" {len(groups)}; kinds in the data: {sorted(set(samples.kinds))}"
-            )
-        selected_channels = steady_samples.z[:, [samples.names.index(name) for name in names]]
-        group_sums = selected_channels.new_zeros(len(groups), len(names)).index_add_(
-            0, group_index, selected_channels
+    tables: dict[str, tuple[Coefficient, ...]] = {}
+    steady_constraints: dict[str, dict[str, Any]] = {}
+    for block in config.steady_state_blocks():
+        # static gain and bias from the steady states, then the dynamics
+        means = _steady_means(config, samples, (*block.states, block.drive))
+        design_matrix = torch.stack((means[:, -1], torch.ones_like(means[:, -1])), dim=1)
+        (steady_fit,) = LeastSquares().fit(
+            design_matrix,
+            means[:, :-1],
+            torch.arange(len(means)),
+            names=(block.drive, "1"),
+            outputs=block.states,
         )
-        return group_sums / torch.bincount(group_index)[:, None]
-
-    def _fit_dynamics(
-        self, samples: Samples, block: _SteadyStateBlock, steady_fit: Solution
-    ) -> dict[str, tuple[Coefficient, ...]]:
-        """Fit the dynamics of a block; return the coefficients of each state.
-
-        The order is A, then B = -A Phi and -A Phi_bias. Standard errors are propagated to first
-        order under the assumption that the errors of A and Phi are independent.
-        """
-        dynamic_samples = select_manoeuvres(samples, block.manoeuvre_kinds)
-        states = block.states
-        phi = steady_fit.coefficients
-        phi_standard_error = steady_fit.standard_errors
-        states_matrix = torch.stack([dynamic_samples.channel(name) for name in states], dim=1)
-        (fit,) = LeastSquares().fit(
-            states_matrix - dynamic_samples.channel(block.drive)[:, None] * phi[0] - phi[1],
-            dynamic_samples.target[:, [VELOCITY_NAMES.index(name) for name in states]],
-            dynamic_samples.group,
-            names=states,
-        )
-        a = fit.coefficients
-        a_standard_error = fit.standard_errors
-        # x_dot = A (x - Phi tau - Phi_bias), with A transposed: rows are regressors
-        coefficients = torch.cat((a, -phi @ a))
-        variance = (
-            phi_standard_error.square() @ a.square() + phi.square() @ a_standard_error.square()
-        )
-        standard_errors = torch.cat((a_standard_error, variance.sqrt()))
-        return {
-            state: tuple(
-                Coefficient(
-                    f"{state}_dot", term, float(coefficients[j, i]), float(standard_errors[j, i])
-                )
-                for j, term in enumerate((*states, block.drive, "1"))
+        tables |= _fit_dynamics(samples, block, steady_fit)
+        for i, state in enumerate(block.states):
+            (value, bias), (standard_error, bias_standard_error) = (
+                values[:, i].tolist()
+                for values in (steady_fit.coefficients, steady_fit.standard_errors)
             )
-            for i, state in enumerate(states)
-        }
+            steady_constraints[state] = {
+                "of": block.drive,
+                "phi": value,
+                "phi_error": standard_error,
+            }
+            steady_constraints[state] |= {"bias": bias, "bias_error": bias_standard_error}
+    tables.setdefault("v", _sway_decay(tables["r"]))
+    names = (*VELOCITY_NAMES, config.drive, config.steer)
+    steady_states = dict(zip(names, _steady_means(config, samples, names).T.tolist(), strict=True))
+    axis_fits = {i: Solution({}, {}, tables[axis]) for i, axis in enumerate(VELOCITY_NAMES)}
+    solution = baseline.combine_axis_fits(axis_fits, {})
+    return replace(
+        solution,
+        notes={"steady_states": steady_states, "steady_constraints": steady_constraints},
+    )
+
+
+def _steady_means(config: LinearSteadyConfig, samples: Samples, names: Sequence[str]) -> Tensor:
+    """Return the mean channels [M, len(names)] of the steady part of M constant manoeuvres."""
+    config.require_steady_manoeuvres(samples.origins)
+    steady_samples = samples.select_manoeuvres(config.steady)
+    steady_samples = steady_samples.select(steady_samples.t >= config.settled)
+    groups, group_index = torch.unique(steady_samples.group, return_inverse=True)
+    selected_channels = steady_samples.z[:, [samples.names.index(name) for name in names]]
+    group_sums = selected_channels.new_zeros(len(groups), len(names)).index_add_(
+        0, group_index, selected_channels
+    )
+    return group_sums / torch.bincount(group_index)[:, None]
+
+
+def _fit_dynamics(
+    samples: Samples, block: SteadyStateBlock, steady_fit: Solution
+) -> dict[str, tuple[Coefficient, ...]]:
+    """Fit the dynamics of a block; return the coefficients of each state.
+
+    The order is A, then B = -A Phi and -A Phi_bias. Standard errors are propagated to first
+    order under the assumption that the errors of A and Phi are independent.
+    """
+    dynamic_samples = select_manoeuvres(samples, block.manoeuvre_kinds)
+    states = block.states
+    phi = steady_fit.coefficients
+    phi_standard_error = steady_fit.standard_errors
+    states_matrix = torch.stack([dynamic_samples.channel(name) for name in states], dim=1)
+    (fit,) = LeastSquares().fit(
+        states_matrix - dynamic_samples.channel(block.drive)[:, None] * phi[0] - phi[1],
+        dynamic_samples.target[:, [VELOCITY_NAMES.index(name) for name in states]],
+        dynamic_samples.group,
+        names=states,
+    )
+    a = fit.coefficients
+    a_standard_error = fit.standard_errors
+    # x_dot = A (x - Phi tau - Phi_bias), with A transposed: rows are regressors
+    coefficients = torch.cat((a, -phi @ a))
+    variance = phi_standard_error.square() @ a.square() + phi.square() @ a_standard_error.square()
+    standard_errors = torch.cat((a_standard_error, variance.sqrt()))
+    return {
+        state: tuple(
+            Coefficient(
+                f"{state}_dot", term, float(coefficients[j, i]), float(standard_errors[j, i])
+            )
+            for j, term in enumerate((*states, block.drive, "1"))
+        )
+        for i, state in enumerate(states)
+    }

@@ -37,12 +37,23 @@ path of its key with `=`: `"free_run.lead": "warmup"`, `"baseline.kind=fossen": 
 """
 
 
+REPLACED_VALUES: dict[str, str] = {
+    "task=actuators": "it is an example now: pip install ./examples/residnet_tasks",
+    "task=study": "it is the task sweep with search: {kind: variants, variants: ..., seeds: ...}",
+    "task=import": "it is an example now: pip install ./examples/residnet_tasks",
+}
+"""Values that this release removes, as in `RENAMED_KEYS` -> what to do; emptied with the next."""
+
+
 def format_renaming_hint(path: tuple[str | int, ...], value: str | None = None) -> str:
-    """Return `; it was renamed to 'new'` for a renamed key or value, else an empty text."""
+    """Return what replaces a renamed key, or a renamed or removed value; else an empty text."""
     key_text = ".".join(map(str, path)) + ("" if value is None else f"={value}")
     for old_key, new_key in RENAMED_KEYS.items():
         if fnmatchcase(f".{key_text}", f"*.{old_key}"):
             return f"; it was renamed to '{new_key}'"
+    for old_value, advice in REPLACED_VALUES.items():
+        if fnmatchcase(f".{key_text}", f"*.{old_value}"):
+            return f"; {advice}"
     return ""
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Hashable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import yaml
@@ -146,6 +147,16 @@ def parse_yaml(text: str, source: str, *, show_location: bool = True) -> tuple[A
     Raises:
         ConfigError: if the text is not YAML, repeats a key or refers to itself.
     """
+    value, node = _parse_document(text, source, show_location)
+    return _copy_without_aliases(value), node
+
+
+@lru_cache(maxsize=64)
+def _parse_document(text: str, source: str, show_location: bool) -> tuple[Any, Node | None]:
+    """Parse one YAML document; a vessel file is read several times in the check of a config.
+
+    The caller must not change the value.
+    """
     try:
         # inside the try block, because the constructor rejects characters that YAML forbids
         loader = _ConfigLoader(text)
@@ -174,7 +185,7 @@ def parse_yaml(text: str, source: str, *, show_location: bool = True) -> tuple[A
                 " its aliases out",
                 "config.too_large",
             )
-        return _copy_without_aliases(loader.construct_document(node)), node
+        return loader.construct_document(node), node
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         problem = error.problem or error.context or "cannot be read"

@@ -481,12 +481,8 @@ RANGE_VELOCITIES = slice(0, PLANAR_LAYOUT.n_dof)
 """Velocities in ranges, channels and accelerations, where they are first."""
 RANGE_INPUTS = slice(PLANAR_LAYOUT.n_dof, None)
 """Inputs in training ranges, where they follow the velocities."""
-
-
 ATTITUDE = tuple(map(SIX_DOF_LAYOUT.state_names.index, ("phi", "theta", "psi")))
 """Columns of roll, pitch and heading among the states of six degrees of freedom."""
-
-
 _MIN_COS_PITCH = 1e-3
 """Lower bound on cos(pitch) as a divisor of the heading rate."""
 
@@ -520,3 +516,11 @@ def to_horizontal_plane(nu: np.ndarray) -> np.ndarray:
         )
     cos_roll = np.cos(nu[..., ROLL_LAYOUT.dynamic_states.index("phi")])
     return np.stack((nu[..., 0], nu[..., 1] * cos_roll, nu[..., 2] * cos_roll), axis=-1)
+
+
+ROLLING_LAYOUT = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))
+"""Surge, sway, roll and yaw, without heave and pitch (document 004 and its corrections)."""
+SUBMERGED_LAYOUT = StateLayout(
+    ("x", "y", "z", "phi", "theta", "psi"), ("u", "v", "w", "p", "q", "r")
+)
+"""Six degrees of freedom, z is the depth."""

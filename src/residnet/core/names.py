@@ -114,8 +114,6 @@ CHANNEL_UNITS: dict[str, str] = {
     "current_north": "m/s",
     "current_east": "m/s",
 }
-
-
 _SI_OF_PREFIX = {
     **{r"n(_|$)": "1/s", "delta|azimuth": "rad", "tau_x|tau_y|thrust": "N", "tau_n": "N m"},
     "throttle": "-",
@@ -166,3 +164,7 @@ def azimuth_thrusters(names: Sequence[str]) -> dict[str, str]:
         if thrust_quantity and suffix != "_diff":
             thrust_of_angle[name_of_base[angle]] = name_of_base[f"{thrust_quantity}{suffix}"]
     return thrust_of_angle
+
+
+WIND_CHANNELS = ("wind_u", "wind_v", "wind_mag")
+FORCE_CHANNELS = ("tau_x", "tau_y", "tau_n")

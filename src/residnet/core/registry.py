@@ -71,6 +71,12 @@ _broken: dict[tuple[str, str, str], EntryPointPart] = {}
 
 
 @functools.cache
+def _installed_entry_points() -> Any:
+    """Return the `EntryPoints` of all installed packages, whose metadata are read once."""
+    return importlib.metadata.entry_points()
+
+
+@functools.cache
 def load_entry_points(group: str) -> tuple[EntryPointPart, ...]:
     """Load the entry points of one group, once, sorted by name.
 
@@ -87,7 +93,7 @@ def load_entry_points(group: str) -> tuple[EntryPointPart, ...]:
         )
     _loading_groups.append(group)
     try:
-        entry_points = importlib.metadata.entry_points(group=group)
+        entry_points = _installed_entry_points().select(group=group)
         return tuple(
             _load_entry_point(entry_point)
             for entry_point in sorted(entry_points, key=lambda point: point.name)
@@ -133,6 +139,7 @@ def type_adapter(model: Any) -> TypeAdapter[Any]:
 
 def clear_caches() -> None:
     """Clear the cached entry points, for tests that install packages."""
+    _installed_entry_points.cache_clear()
     load_entry_points.cache_clear()
     _broken.clear()
     type_adapter.cache_clear()
@@ -143,8 +150,8 @@ class PluginUnion:
     """Marker of a config field that accepts one of several kinds, from any installed package.
 
     For example `HeadConfig = Annotated[Any, PluginUnion("residnet.heads",
-    "residnet.heads.base:BaseHeadConfig", {"lstm": "residnet.heads.lstm:LstmConfig"})]`. Parts that
-    are not configs, such as export formats, have the kind as a class attribute.
+    "residnet.heads.config:BaseHeadConfig", {"lstm": "residnet.heads.lstm_config:LstmConfig"})]`.
+    Parts that are not configs, such as export formats, have the kind as a class attribute.
 
     Attributes:
         group: entry-point group of the kinds of other packages.

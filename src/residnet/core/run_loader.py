@@ -27,7 +27,6 @@ from residnet.core.ownership import (
     require_inside,
     sha256,
 )
-from residnet.core.run_shapes import require_shape
 
 SIZE_LIMITS = {
     ".json": 256_000_000,
@@ -244,6 +243,8 @@ def read_json_value(path: Path, folder: Path | None = None) -> Any:
     Raises:
         UsageError: if there is no such regular file, or it is too large or no JSON.
     """
+    from residnet.core.run_shapes import require_shape
+
     require_inside(folder or path.parent, path)
     try:
         text = read_regular_file(path, SIZE_LIMITS[".json"]).decode("utf-8")

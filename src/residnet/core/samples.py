@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from residnet.core.arrays.paged import iterate_row_chunks, release_pages, take_rows
+from residnet.core.sample_origins import SampleOrigins
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,11 @@ class Samples:
 
     def __len__(self) -> int:
         return int(self.z.shape[0])
+
+    @property
+    def origins(self) -> SampleOrigins:
+        """Manoeuvre and time of the samples."""
+        return SampleOrigins(self.group.numpy(), self.t.numpy(), self.kinds)
 
     def select_manoeuvres(self, kinds: Collection[str]) -> Samples:
         """Return the samples of manoeuvres of given kinds; all if `kinds` is empty."""

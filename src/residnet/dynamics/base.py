@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -22,8 +21,7 @@ from residnet.core.columns import (
 )
 from residnet.core.frames import compose_rotation, cross_product, to_earth
 from residnet.core.layout import PLANAR_LAYOUT
-
-Integrator = Literal["rk4", "heun", "euler", "semi_implicit_euler"]
+from residnet.dynamics.time_steps import Integrator
 
 # Butcher tableaux (nodes, weights) of explicit schemes in which every stage depends on the
 # previous stage alone; the first stage is the state itself

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline
-from residnet.baselines.given import ZeroBaselineConfig
+from residnet.baselines.given_config import ZeroBaselineConfig
 from residnet.core.columns import dynamic_states, pose, zero_acceleration
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import MAX_MEMORY, HybridDynamics

@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from residnet.baselines.base import Baseline
 from residnet.core.columns import dynamic_states, pose, with_depth_rate
 from residnet.core.layout import ATTITUDE, DegreesOfFreedom
-from residnet.dynamics.base import Dynamics, Integrator
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.time_steps import Integrator
 from residnet.heads.base import ResidualHead
 from residnet.physics.signals import Signals
 from residnet.physics.symmetry import get_dof

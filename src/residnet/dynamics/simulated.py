@@ -11,28 +11,6 @@ from torch import Tensor, nn
 from residnet.dynamics.base import Dynamics
 from residnet.physics.plant import Plant
 
-MAX_STEPS = 2_000_000
-"""Steps of the longest simulation: more than two days at ten steps a second."""
-
-
-def check_steps(duration: float, step: float, what: str = "duration") -> None:
-    """Refuse a simulation of more than `MAX_STEPS` steps.
-
-    Args:
-        duration: duration of the simulation in s.
-        step: step of the simulation in s.
-        what: name of the duration in the message.
-
-    Raises:
-        ValueError: if the number of steps exceeds `MAX_STEPS`.
-    """
-    n_steps = duration / step
-    if n_steps > MAX_STEPS:
-        raise ValueError(
-            f"{what} of {duration:g} s has {n_steps:.3g} steps of {step:g} s; at most {MAX_STEPS:,}"
-            " are simulated: shorten it or increase the step"
-        )
-
 
 @final
 class PlantDynamics(Dynamics):

@@ -25,12 +25,12 @@ from residnet.core.names import require_plain_name, suggest_name
 from residnet.core.ownership import find_run_manifest, read_regular_file
 from residnet.core.run_loader import SIZE_LIMITS, require_trustworthy
 from residnet.core.version import __version__
-from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.time_steps import Integrator
 from residnet.heads import HeadConfig
 from residnet.heads.base import ZeroHead
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 
 
 class BandTable(Config):

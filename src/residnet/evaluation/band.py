@@ -12,10 +12,10 @@ from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.layout import DYNAMIC_STATES, EXTRA_STATES, HEADING, PLANAR_LAYOUT, VELOCITIES
-from residnet.evaluation.records import BandsFile
 
 if TYPE_CHECKING:
     from residnet.dynamics.store import BandTable
+    from residnet.evaluation.records import BandsFile
 
 
 def band_channels(states: np.ndarray, position_radius: np.ndarray) -> np.ndarray:
@@ -407,6 +407,8 @@ def build_bands_file(run: str, bands: BandsByModel) -> BandsFile:
         run: name of the run.
         bands: bands by model and protocol; models without bands are omitted.
     """
+    from residnet.evaluation.records import BandsFile
+
     models = {
         model: {protocol: band.to_json() for protocol, band in bands_by_protocol.items()}
         for model, bands_by_protocol in bands.items()

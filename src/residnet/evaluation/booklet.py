@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -13,12 +13,14 @@ from residnet.core.config import Config, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
-from residnet.evaluation.records import BookletFile
 from residnet.manoeuvres import ManoeuvreConfig
-from residnet.manoeuvres.actuated import InputShare
 from residnet.manoeuvres.base import Manoeuvre
 from residnet.manoeuvres.indices import INDEX_UNITS, LENGTH_INDICES
-from residnet.manoeuvres.trials import ManoeuvreRun, SimulatedVessel
+from residnet.manoeuvres.input_shares import InputShare
+
+if TYPE_CHECKING:
+    from residnet.evaluation.records import BookletFile
+    from residnet.manoeuvres.trials import ManoeuvreRun, SimulatedVessel
 
 SCHEMA = "residnet.booklet/1"
 # exponent of the length scale that converts a unit from model to ship by Froude's law
@@ -119,6 +121,8 @@ def build_booklet(
     Args:
         length: length of the hull in the scale of the logs, m.
     """
+    from residnet.evaluation.records import BookletFile
+
     rows = [_page_row(page, length, scale, level) for page in pages]
     index_names = sorted({name for row in rows for name in row["indices"]})
     metadata = {

@@ -29,11 +29,11 @@ from residnet.baselines.base import Baseline, ParametricBaseline
 from residnet.baselines.mmg import MMGBaseline
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import UsageError
+from residnet.core.names import FORCE_CHANNELS
 from residnet.core.records import FileRecord, Record
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.evaluation.records import Interval
-from residnet.physics.signals import FORCE_CHANNELS
 from residnet.physics.similarity import (
     DIMENSIONLESS,
     Dimension,

@@ -19,9 +19,7 @@ EXPORT_FORMATS = PluginUnion(
         "c": "residnet.export.c:CExporter",
         "onnx": "residnet.export.onnx_file:OnnxExporter",
         "casadi": "residnet.export.c:CasadiExporter",
-        "fmu": "residnet.export.fmu:Fmu3Exporter",
-        "fmu2": "residnet.export.fmu:Fmu2Exporter",
-        "simulink": "residnet.export.c:SimulinkExporter",
+        "fmu2": "residnet.export.fmu:FmuExporter",
         "aoti": "residnet.export.torchscript:AotiExporter",
         "parameters": "residnet.export.parameters:ParametersExporter",
         "feed_forward": "residnet.export.feed_forward:FeedForwardExporter",
@@ -29,6 +27,12 @@ EXPORT_FORMATS = PluginUnion(
     key="name",
 )
 """All registered formats, including formats of other packages."""
+_REPLACEMENTS = {
+    "fmu": "FMI 3.0 is no longer written; give fmu2 (FMI 2.0)",
+    "simulink": "S-functions are no longer written; Simulink imports fmu2 (FMI 2.0), and calls c by"
+    " its C Caller block",
+}
+"""Formats of earlier versions, and what to use instead."""
 
 
 def get_exporter(name: str) -> Exporter:
@@ -38,7 +42,10 @@ def get_exporter(name: str) -> Exporter:
         ConfigError: if no format has this name or its package cannot be imported.
     """
     if name not in (format_names := EXPORT_FORMATS.kind_names()):
-        raise ConfigError(f"no export format '{name}'{suggest_name(name, format_names)}")
+        hint = suggest_name(name, format_names)
+        if name in _REPLACEMENTS:
+            hint = f"; {_REPLACEMENTS[name]}"
+        raise ConfigError(f"no export format '{name}'{hint}")
     exporter_class = EXPORT_FORMATS.find_kind(name)
     if isinstance(exporter_class, EntryPointPart):
         raise ConfigError(f"export format {exporter_class.error_message}")

@@ -1,8 +1,4 @@
-"""Formats as C: `c`, one C99 source file and its header without a runtime; `casadi`, for MPC; and
-`simulink`, a level-2 S-function around the exported C.
-
-Source: MathWorks, "S-Function Callback Methods" and "Guidelines for Writing C MEX S-Functions".
-"""
+"""Formats as C: `c`, one C99 source file and its header without a runtime; `casadi`, for MPC."""
 
 from __future__ import annotations
 
@@ -673,82 +669,4 @@ class CasadiExporter(Exporter):
             }
             write_card(file, card)
             file.write_bytes(temporary_path.read_bytes())
-        return card
-
-
-def render_s_function(
-    exported: Exportable, prefix: str, name: str, result_sizes: Mapping[str, int]
-) -> str:
-    """Return the source of the S-function of a vessel or a controller.
-
-    The outputs of a vessel are its state and flags; state and memory are kept in the S-function.
-    The outputs of a controller are its first result and the flags.
-
-    Args:
-        exported: the exportable step.
-        prefix: prefix of the functions in the C file.
-        result_sizes: sizes of the results of the step.
-    """
-    argument_sizes = dict(exported.arguments)
-    is_vessel = isinstance(exported, ExportedVessel)
-    memory_sizes = [argument_sizes.pop(name) for name in (("x", "s") if is_vessel else ("s",))]
-    output_name = (
-        "x"
-        if is_vessel
-        else next(result_name for result_name in exported.results if result_name in result_sizes)
-    )
-    return render_template(
-        "s_function.c",
-        about=exported.label,
-        vessel=is_vessel,
-        prefix=prefix,
-        name=name,
-        dt=repr(float(exported.dt or 0.0)),
-        ports=list(argument_sizes.items()),
-        out=output_name,
-        width=memory_sizes[0] if is_vessel else result_sizes[output_name],
-        flags=exported.flags,
-        memory=memory_sizes[-1],
-        kept=sum(memory_sizes),
-    )
-
-
-@final
-class SimulinkExporter(Exporter):
-    """A level-2 S-function in double precision, with the C that it calls."""
-
-    name: ClassVar[str] = "simulink"
-    suffix: ClassVar[str] = "_sfun.c"
-    about: ClassVar[str] = "A level-2 S-function for Simulink around the C code."
-    default_name_from_run: ClassVar[bool] = True
-
-    def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
-        """Write the S-function, the C file and header that it calls, and the card."""
-        if exported.dt is None:
-            raise UsageError(f"{exported.label}: has no step of its own; export it as c")
-        exported.require_finite_numbers()
-        name = to_c_identifier(file.stem)
-        file = file.with_name(f"{name}.c")
-        card = exported.build_card() | {
-            "format": self.name,
-            "dtype": "float64",
-            "safety": "The file is source code: compile only what you trust.",
-        }
-        prefix = f"{name}_model"
-        c_files = generate_c_source(exported, card, f"{prefix}.h", prefix, is_double_only=True)
-        with tempfile.TemporaryDirectory() as folder:
-            temporary_path = Path(folder) / f"{name}_model.c"
-            temporary_path.write_text(c_files.source)
-            temporary_path.with_suffix(".h").write_text(c_files.header)
-            library = compile_shared_library([temporary_path], temporary_path.with_suffix(".so"))
-            loaded = CompiledModel(library, exported, torch.float64, prefix)
-            parity = exported.check_parity(loaded, "the S-function's code", torch.float64)
-            size = measure_footprint(temporary_path)
-            size["warnings"] = report_footprint(temporary_path.name, size)
-            card |= {"size": size, "parity": parity}
-        s_function_text = render_s_function(exported, c_files.prefix, name, loaded.output_sizes)
-        write_card(file, card)
-        file.with_name(f"{name}_model.c").write_text(c_files.source)
-        file.with_name(f"{name}_model.h").write_text(c_files.header)
-        file.write_text(s_function_text)
         return card

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from residnet.core.errors import ExportError, UsageError
 from residnet.core.layout import PLANAR_LAYOUT, RANGE_VELOCITIES
+from residnet.core.names import FORCE_CHANNELS
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exportable, Exporter, LoadedExport, require_releasable
@@ -27,8 +28,7 @@ from residnet.export.torchscript import (
 )
 from residnet.export.vessel import ExportedVessel
 from residnet.heads.force import ForceHead
-from residnet.physics.force_model import MOTION_CHANNELS
-from residnet.physics.signals import FORCE_CHANNELS
+from residnet.physics.force_terms import MOTION_CHANNELS
 
 FADE_SHARE = 0.25
 """Share of the width of a training range, beyond its edge, over which a correction fades out."""

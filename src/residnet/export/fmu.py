@@ -1,4 +1,6 @@
-"""The formats `fmu` and `fmu2`: co-simulation units of FMI 3.0 and 2.0 around the exported C.
+"""The format `fmu2`: co-simulation units of FMI 2.0 around the exported C.
+
+Simulink, Dymola and OMSimulator import FMI 2.0.
 
 The archive holds the sources and binaries for this machine and for every other platform whose
 compiler is installed.
@@ -13,11 +15,10 @@ import shutil
 import sys
 import tempfile
 import zipfile
-from abc import abstractmethod
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any, ClassVar, Literal, final
+from typing import Any, ClassVar, final
 
 import torch
 
@@ -44,20 +45,22 @@ _VALUE_REFERENCES = (
 LIBRARY_NAME = "model"
 
 
-def render_model_description(card: Mapping[str, Any], token: str, version: str) -> str:
-    """Return modelDescription.xml for `version` 3.0 or 2.0."""
+def render_model_description(card: Mapping[str, Any], token: str) -> str:
+    """Return modelDescription.xml."""
     variables = [
         (f"{entry['name']}{name_suffix}", first_reference + i, causality, entry["unit"])
         for card_section, name_suffix, first_reference, causality in _VALUE_REFERENCES
         for i, entry in enumerate(card[card_section])
     ]
-    return render_template(f"fmi{version[0]}.xml", card=card, token=token, variables=variables)
+    return render_template("fmi2.xml", card=card, token=token, variables=variables)
 
 
+@final
 class FmuExporter(Exporter):
-    """A co-simulation unit in double precision, with its sources."""
+    """A co-simulation unit of FMI 2.0 in double precision, with its sources."""
 
-    version: ClassVar[Literal["2.0", "3.0"]]
+    name: ClassVar[str] = "fmu2"
+    about: ClassVar[str] = "A co-simulation unit of FMI 2.0, with its C sources."
     suffix: ClassVar[str] = ".fmu"
 
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
@@ -85,17 +88,14 @@ class FmuExporter(Exporter):
             )
             loaded = CompiledModel(library, exported, torch.float64, prefix)
             cross_binaries = {}
-            for cross_compiler, platforms, suffix in _CROSS_COMPILERS:
-                platform_folder = platforms[self.version]
-                if (
-                    platform_folder not in ("", self.platform_name())
-                    and shutil.which(cross_compiler) is not None
-                ):
+            this_platform = _platform_name()
+            for cross_compiler, platform_folder, suffix in _CROSS_COMPILERS:
+                if platform_folder != this_platform and shutil.which(cross_compiler) is not None:
                     library_path = folder / f"{platform_folder}{suffix}"
                     cross_binaries[platform_folder] = compile_shared_library(
                         _c_sources(folder, sources), library_path, compiler_path=cross_compiler
                     )
-            binaries = {self.platform_name(): library} | cross_binaries
+            binaries = {this_platform: library} | cross_binaries
             card |= {
                 "parity": exported.check_parity(loaded, "the FMU's code", torch.float64),
                 "binaries": list(binaries),
@@ -104,15 +104,10 @@ class FmuExporter(Exporter):
                 atomic_write(file) as temporary_path,
                 zipfile.ZipFile(temporary_path, "w", zipfile.ZIP_DEFLATED) as archive,
             ):
-                archive.writestr(
-                    "modelDescription.xml", render_model_description(card, token, self.version)
-                )
+                archive.writestr("modelDescription.xml", render_model_description(card, token))
                 archive.writestr("resources/card.json", json.dumps(card, indent=1))
                 for file_name, text in sources.items():
                     archive.writestr(f"sources/{file_name}", text)
-                if self.version == "3.0":
-                    build_description = _read_packaged_file("fmi3_build.xml")
-                    archive.writestr("sources/buildDescription.xml", build_description)
                 for platform_folder, binary in binaries.items():
                     archive.write(
                         binary, f"binaries/{platform_folder}/{LIBRARY_NAME}{binary.suffix}"
@@ -123,9 +118,8 @@ class FmuExporter(Exporter):
         """Return the source files by name."""
         prefix = c_files.prefix
         upper = c_files.prefix.upper()
-        fmi_source = f"fmi{self.version[0]}.c"
         return {
-            fmi_source: _read_packaged_file(fmi_source),
+            "fmi2.c": _read_packaged_file("fmi2.c"),
             "instance.h": _read_packaged_file("instance.h"),
             "model.h": render_template(
                 "fmi_model.h", p=prefix, upper=upper, dt=f"{dt:g}", token=token
@@ -134,19 +128,14 @@ class FmuExporter(Exporter):
             "model_code.h": c_files.header,
         }
 
-    @abstractmethod
-    def platform_name(self) -> str:
-        """Return this machine as the standard names it."""
-
 
 _LIBRARY_SUFFIX = {"win32": ".dll", "darwin": ".dylib"}
 """Of libraries, by the system; `.so` elsewhere."""
-_CROSS_COMPILERS = (
-    ("x86_64-w64-mingw32-gcc", {"3.0": "x86_64-windows", "2.0": "win64"}, ".dll"),
-    # version 2.0 has no name for it
-    ("aarch64-linux-gnu-gcc", {"3.0": "aarch64-linux", "2.0": ""}, ".so"),
-)
-"""Compilers for other machines as Linux distributions name them, the platform, and its suffix."""
+_CROSS_COMPILERS = (("x86_64-w64-mingw32-gcc", "win64", ".dll"),)
+"""Compilers for other machines as Linux distributions name them, the platform, and its suffix.
+
+FMI 2.0 has no name for 64-bit ARM.
+"""
 
 
 def _c_sources(folder: Path, sources: Mapping[str, str]) -> list[Path]:
@@ -157,36 +146,15 @@ def _read_packaged_file(name: str) -> str:
     return resources.files("residnet.export").joinpath(name).read_text()
 
 
-def _machine_name() -> str:
-    names = {"x86_64": "x86_64", "amd64": "x86_64", "aarch64": "aarch64", "arm64": "aarch64"}
+def _platform_name() -> str:
+    """Return this machine as FMI 2.0 names it.
+
+    Raises:
+        ExportError: if FMI 2.0 has no name for it.
+    """
     machine = platform.machine().lower()
-    if machine not in names:
+    if machine not in ("x86_64", "amd64"):
         raise ExportError(
-            f"format fmu: this machine ({machine}) has no name in the standard; export as c"
+            f"format fmu2: this machine ({machine}) has no name in FMI 2.0; export as c"
         )
-    return names[machine]
-
-
-@final
-class Fmu3Exporter(FmuExporter):
-    """A co-simulation unit of FMI 3.0."""
-
-    name: ClassVar[str] = "fmu"
-    about: ClassVar[str] = "A co-simulation unit of FMI 3.0, with its C sources."
-    version: ClassVar[Literal["2.0", "3.0"]] = "3.0"
-
-    def platform_name(self) -> str:
-        system = {"win32": "windows", "darwin": "darwin"}.get(sys.platform, "linux")
-        return f"{_machine_name()}-{system}"
-
-
-@final
-class Fmu2Exporter(FmuExporter):
-    """A co-simulation unit of FMI 2.0."""
-
-    name: ClassVar[str] = "fmu2"
-    about: ClassVar[str] = "A co-simulation unit of FMI 2.0, with its C sources."
-    version: ClassVar[Literal["2.0", "3.0"]] = "2.0"
-
-    def platform_name(self) -> str:
-        return {"win32": "win64", "darwin": "darwin64"}.get(sys.platform, "linux64")
+    return {"win32": "win64", "darwin": "darwin64"}.get(sys.platform, "linux64")

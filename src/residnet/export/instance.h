@@ -1,4 +1,4 @@
-/* One instance of the exported model, common to FMI 2.0 and 3.0. Written by residnet.
+/* One instance of the exported model, of FMI 2.0. Written by residnet.
    model.h names the model's functions; references 1 to INPUTS are the inputs, 101 and on the
    states, 201 and on the states to start from, 300 is `outside`. */
 #include <float.h>

@@ -22,13 +22,12 @@ from residnet.baselines.given import FixedBaseline
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config_yaml import parse_yaml
 from residnet.core.errors import UsageError
-from residnet.core.names import ACCELERATION_NAMES, VELOCITY_NAMES
+from residnet.core.names import ACCELERATION_NAMES, FORCE_CHANNELS, VELOCITY_NAMES
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exportable, Exporter, render_template
 from residnet.export.c import to_c_identifier
 from residnet.export.vessel import ExportedVessel
-from residnet.physics.signals import FORCE_CHANNELS
 
 Matrix = npt.NDArray[np.float64]
 _N_SAMPLES = 4000

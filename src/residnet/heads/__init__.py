@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from residnet.core.registry import PluginUnion
 
 if TYPE_CHECKING:
-    from residnet.heads.base import BaseHeadConfig
+    from residnet.heads.config import BaseHeadConfig
 
     HeadConfig = BaseHeadConfig
 else:
@@ -15,17 +15,17 @@ else:
         Any,
         PluginUnion(
             "residnet.heads",
-            "residnet.heads.base:BaseHeadConfig",
+            "residnet.heads.config:BaseHeadConfig",
             {
                 "plsr": "residnet.heads.linear:PlsrConfig",
                 "ridge": "residnet.heads.linear:RidgeConfig",
-                "kernel": "residnet.heads.kernel:KernelConfig",
-                "symbolic": "residnet.heads.symbolic:SymbolicConfig",
-                "genetic": "residnet.heads.genetic:GeneticConfig",
-                "mlp": "residnet.heads.mlp:MlpConfig",
-                "lstm": "residnet.heads.lstm:LstmConfig",
-                "sklearn": "residnet.heads.scikit:SklearnConfig",
-                "recurrent": "residnet.heads.recurrent:GRUEnsembleConfig",
+                "kernel": "residnet.heads.kernel_config:KernelConfig",
+                "symbolic": "residnet.heads.symbolic_config:SymbolicConfig",
+                "genetic": "residnet.heads.genetic_config:GeneticConfig",
+                "mlp": "residnet.heads.mlp_config:MlpConfig",
+                "lstm": "residnet.heads.lstm_config:LstmConfig",
+                "sklearn": "residnet.heads.scikit_config:SklearnConfig",
+                "recurrent": "residnet.heads.recurrent_config:GRUEnsembleConfig",
             },
             python_kinds={"module": "residnet.heads.module:ModuleHeadConfig"},
         ),

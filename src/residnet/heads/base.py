@@ -8,19 +8,15 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.arrays import paged
 from residnet.core.columns import zero_acceleration
-from residnet.core.config import Config
-from residnet.core.errors import ConfigError
 from residnet.core.layout import PLANAR_LAYOUT
-from residnet.core.names import ACCELERATION_NAMES, suggest_name
 from residnet.core.renamed_state import RenamedStateModule
 from residnet.core.samples import Samples
 from residnet.physics.signals import RestoringAcceleration
-from residnet.physics.symmetry import active_channels, get_dof
+from residnet.physics.symmetry import get_dof
 from residnet.regression.estimator import Solution
 from residnet.regression.shrinkage import CONSTANT_TOLERANCE
 
@@ -178,13 +174,6 @@ class ResidualHead(nn.Module, ABC):
 class ClosedFormHead(ResidualHead):
     """Residual head whose parameters are fitted in closed form instead of by gradient descent."""
 
-    def validate_samples(self, samples: Samples) -> None:
-        """Check that the samples have enough manoeuvres for the folds of the fit.
-
-        Raises:
-            FitError: if they have fewer.
-        """
-
     @abstractmethod
     def fit_solutions(self, samples: Samples) -> list[Solution]:
         """Fit samples whose target is the residual [N, n].
@@ -235,56 +224,6 @@ class EquationHead(ClosedFormHead):
             for j, name in enumerate(self.format_terms())
             if axis_weights[j] != 0.0
         }
-
-
-class FeatureConfig(Config):
-    """Input features of a head and their clamping outside the training range.
-
-    Attributes:
-        features: names of channels; empty for all.
-        margin: widening of the training range to either side, as a share of its width. Features are
-            clamped to the wider range, so that the residual is constant outside and cannot diverge.
-    """
-
-    features: tuple[str, ...] = ()
-    margin: float = Field(default=0.1, ge=0)
-
-    def select_features(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Return the names of the features among the channels `names`.
-
-        Raises:
-            ConfigError: if a feature is not a channel.
-        """
-        for name in self.features:
-            if name in ACCELERATION_NAMES and name not in names:
-                raise ConfigError(
-                    f"head feature '{name}' is an acceleration, which only heads in force space"
-                    " support (plsr or ridge, space: force)"
-                )
-            if name not in names:
-                raise ConfigError(
-                    f"head feature '{name}' is not a channel of the model"
-                    f"{suggest_name(name, names)}"
-                )
-        return self.features or active_channels(names)
-
-
-class BaseHeadConfig(FeatureConfig, ABC):
-    """Configuration of a head of another package.
-
-    Attributes:
-        kind: a `Literal` with the name of the entry point in the group `residnet.heads`.
-    """
-
-    kind: str
-
-    @abstractmethod
-    def build(self, names: Sequence[str]) -> ResidualHead:
-        """Build the head, not yet fitted, for channels `names`.
-
-        Raises:
-            ConfigError: if a required channel is missing.
-        """
 
 
 class Features(nn.Module):

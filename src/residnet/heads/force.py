@@ -13,15 +13,15 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.columns import zero_acceleration
-from residnet.core.errors import ConfigError, FitError
+from residnet.core.errors import FitError
 from residnet.core.layout import RANGE_VELOCITIES
-from residnet.core.names import ACCELERATION_NAMES
+from residnet.core.names import ACCELERATION_NAMES, FORCE_CHANNELS
 from residnet.core.renamed_state import RenamedStateModule
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisHead
-from residnet.physics.force_model import augment_mass, find_acceleration_terms
-from residnet.physics.signals import FORCE_CHANNELS
+from residnet.physics.force_model import augment_mass
+from residnet.physics.force_terms import find_acceleration_terms, require_inertia_matrix
 from residnet.regression.estimator import Solution
 
 _CONSTANT_FORCE_STD = 1e-9
@@ -57,10 +57,8 @@ class ForceHead(RenamedStateModule, ClosedFormHead):
         self.upper_velocities = nn.Buffer(torch.zeros(3, dtype=torch.float64))
 
     def set_inertia(self, mass: Tensor | None) -> None:
-        if mass is None:
-            raise ConfigError(
-                "space: force needs a baseline with a mass matrix; set its kind to 'believed'"
-            )
+        require_inertia_matrix(has_inertia_matrix=mass is not None)
+        assert mass is not None
         self.mass.copy_(mass)
         self.inverse.copy_(torch.linalg.inv(mass))
 
@@ -94,9 +92,6 @@ class ForceHead(RenamedStateModule, ClosedFormHead):
                 # a clamped acceleration would no longer be affine in nu_dot
                 self.inner.features.low[feature_index] = -torch.inf
                 self.inner.features.high[feature_index] = torch.inf
-
-    def validate_samples(self, samples: Samples) -> None:
-        self.inner.validate_samples(samples)
 
     def fit_solutions(self, samples: Samples) -> list[Solution]:
         """Return the solutions of the basis functions with a positive definite mass M + A.

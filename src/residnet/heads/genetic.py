@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, final
+from typing import TYPE_CHECKING, final
 
 import torch
 from torch import Tensor
 
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
-from residnet.heads.base import EquationHead, FeatureConfig, Features
-from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term
+from residnet.heads.base import EquationHead, Features
+from residnet.physics.term_library import TermLibrary
+from residnet.physics.terms import CandidatesConfig, parse_term
 from residnet.regression.estimator import Solution
 from residnet.regression.expressions import (
     CoefficientTable,
@@ -19,27 +20,11 @@ from residnet.regression.expressions import (
     Factors,
     format_product,
 )
-from residnet.regression.genetic import EquationSearchConfig, GeneticEquations
+from residnet.regression.genetic import GeneticEquations
 from residnet.regression.sparse import SparseRegression
 
-
-class GeneticConfig(FeatureConfig, EquationSearchConfig):
-    """Equation of the residual of each axis in SI units, found by genetic programming.
-
-    Fitting needs the extra `gp`; using a fitted model does not.
-
-    Attributes:
-        kind: name of the head.
-        optional: whether a fit skips the head with a warning if the extra is not installed, instead
-            of ending with an error.
-    """
-
-    kind: Literal["genetic"] = "genetic"
-    optional: bool = False
-
-    def build(self, names: Sequence[str]) -> GeneticHead:
-        """Build the head for channels `names`."""
-        return GeneticHead(self, names)
+if TYPE_CHECKING:
+    from residnet.heads.genetic_config import GeneticConfig
 
 
 @final

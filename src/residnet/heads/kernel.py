@@ -5,62 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Literal, final
+from typing import TYPE_CHECKING, final
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
-from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
+from residnet.heads.base import ClosedFormHead, Features
 from residnet.physics.symmetry import get_dof
-from residnet.physics.terms import TermLibrary
+from residnet.physics.term_library import TermLibrary
 from residnet.regression.equation_rows import median_time_step, number_regular_segments
-from residnet.regression.estimator import Solution, assign_group_folds, default_fold_count
-from residnet.regression.kernel import (
-    KernelRidge,
-    PolynomialConfig,
-    RbfConfig,
-    RecursiveErrors,
-    RegularizationPath,
-)
+from residnet.regression.estimator import Solution, default_fold_count
+from residnet.regression.kernel import KernelRidge, RecursiveErrors, RegularizationPath
 from residnet.regression.shrinkage import CONSTANT_TOLERANCE
 
-
-class KernelConfig(FeatureConfig):
-    """Kernel ridge regression of each residual on standardised features, without intercept.
-
-    Attributes:
-        kernel: radial basis functions (`rbf`) or a polynomial (`polynomial`).
-        terms: additional features computed from the features, such as `n|n|`, which a polynomial of
-            low degree in the revolutions approximates poorly.
-        penalties: candidate penalties per sample; lambda of document 001 and `alpha` of
-            scikit-learn are the penalty times the number of samples.
-        choose: criterion of the kernel setting and the penalties. `free_run` minimizes the error of
-            free runs on validation data, first over the setting and a shared penalty, then over the
-            penalty of each axis in turn, with no residual as a candidate (document 001 section 4,
-            second approach). `one_step` minimizes the cross-validated error of the acceleration of
-            each axis. `recursion` minimizes, for each axis, the error of its velocity in a free run
-            with the other velocities as measured (first approach).
-        folds: number of folds of the cross-validation, which never splits a manoeuvre; null for
-            five folds, or the number of manoeuvres if it is lower.
-    """
-
-    kind: Literal["kernel"] = "kernel"
-    kernel: Annotated[RbfConfig | PolynomialConfig, Field(discriminator="kind")] = Field(
-        default_factory=RbfConfig
-    )
-    terms: tuple[str, ...] = ()
-    penalties: tuple[Annotated[float, Field(gt=0)], ...] = Field(
-        default=(1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1), min_length=1
-    )
-    choose: Literal["one_step", "recursion", "free_run"] = "free_run"
-    folds: int | None = Field(default=None, ge=2, le=1_000)
-
-    def build(self, names: Sequence[str]) -> KernelHead:
-        """Build the head for channels `names`."""
-        return KernelHead(self, names)
+if TYPE_CHECKING:
+    from residnet.heads.kernel_config import KernelConfig
 
 
 @final
@@ -134,9 +95,6 @@ class KernelHead(ClosedFormHead):
     def parameter_counts(self) -> list[float]:
         """Return the effective number of parameters per axis, the trace of the smoother."""
         return [float(n_effective) for n_effective in self.effective]
-
-    def validate_samples(self, samples: Samples) -> None:
-        assign_group_folds(samples.group, self.config.folds or default_fold_count(samples.group))
 
     def fit_solutions(self, samples: Samples) -> list[Solution]:
         score_paths = None

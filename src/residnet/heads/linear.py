@@ -4,21 +4,54 @@ from __future__ import annotations
 
 from abc import ABC
 from collections.abc import Sequence
-from typing import Literal, final
+from typing import TYPE_CHECKING, Literal, Self, final
 
 from pydantic import Field
 
 from residnet.core.names import ACCELERATION_NAMES
-from residnet.heads.base import ClosedFormHead
-from residnet.heads.basis import BasisConfig, BasisHead
-from residnet.heads.force import ForceHead
-from residnet.physics.force_model import FERRY_TERMS, MOTION_CHANNELS
-from residnet.regression.estimator import Estimator
-from residnet.regression.shrinkage import PLSR, Ridge
+from residnet.heads.basis_config import BasisConfig
+from residnet.physics.force_terms import (
+    FERRY_TERMS,
+    MOTION_CHANNELS,
+    find_acceleration_terms,
+    require_inertia_matrix,
+)
+from residnet.physics.terms import parse_term
+
+if TYPE_CHECKING:
+    from residnet.heads.base import ClosedFormHead
+    from residnet.regression.estimator import Estimator
 
 
 class LinearBasisConfig(BasisConfig, ABC):
     """Base of the configurations of heads that are linear in basis functions."""
+
+    @final
+    def check_channels(self, names: Sequence[str]) -> None:
+        config = self
+        channel_names: Sequence[str] = names
+        if self.space == "force":
+            config = self._with_force_defaults()
+            channel_names = (*ACCELERATION_NAMES, *names)
+        feature_names = config.select_features(channel_names)
+        terms = config.term_names(channel_names)
+        for term in terms:
+            parse_term(term, feature_names)
+        if self.space == "force":
+            find_acceleration_terms(terms, feature_names)
+
+    @final
+    def check_inertia(self, names: Sequence[str], *, has_inertia_matrix: bool) -> None:
+        if self.space == "force":
+            require_inertia_matrix(has_inertia_matrix=has_inertia_matrix)
+
+    def _with_force_defaults(self) -> Self:
+        """Return the config with the features and terms of document 002 where none are given."""
+        force_defaults = {
+            "features": self.features or MOTION_CHANNELS,
+            "terms": self.terms or FERRY_TERMS,
+        }
+        return self.model_copy(update=force_defaults)
 
     @final
     def build(self, names: Sequence[str]) -> ClosedFormHead:
@@ -27,16 +60,12 @@ class LinearBasisConfig(BasisConfig, ABC):
         Raises:
             ConfigError: if a term is invalid or, in force space, not affine in the accelerations.
         """
+        from residnet.heads.basis import BasisHead
+        from residnet.heads.force import ForceHead
+
         if self.space == "acceleration":
             return BasisHead(self, names)
-        # defaults of document 002: accelerations and velocities as features, and its thirty terms
-        force_defaults = {
-            "features": self.features or MOTION_CHANNELS,
-            "terms": self.terms or FERRY_TERMS,
-        }
-        return ForceHead(
-            BasisHead(self.model_copy(update=force_defaults), (*ACCELERATION_NAMES, *names))
-        )
+        return ForceHead(BasisHead(self._with_force_defaults(), (*ACCELERATION_NAMES, *names)))
 
 
 class PlsrConfig(LinearBasisConfig):
@@ -54,6 +83,8 @@ class PlsrConfig(LinearBasisConfig):
 
     def build_estimator(self, n_folds: int | None) -> Estimator:
         """Build the PLSR estimator, with alternative orders if free runs select."""
+        from residnet.regression.shrinkage import PLSR
+
         has_alternatives = self.choose == "free_run" and self.order is None
         return PLSR(
             self.order, max_order=self.max_order, folds=n_folds, has_alternatives=has_alternatives
@@ -77,4 +108,6 @@ class RidgeConfig(LinearBasisConfig):
 
     def build_estimator(self, n_folds: int | None) -> Estimator:
         """Build the ridge estimator, with all penalties as alternatives if free runs select."""
+        from residnet.regression.shrinkage import Ridge
+
         return Ridge(self.penalties, folds=n_folds, has_alternatives=self.choose == "free_run")

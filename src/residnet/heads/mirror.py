@@ -12,11 +12,10 @@ from typing import ClassVar, final
 import torch
 from torch import Tensor, nn
 
-from residnet.core.errors import ConfigError
 from residnet.core.renamed_state import RenamedStateModule
 from residnet.core.samples import Samples
 from residnet.heads.base import ResidualHead
-from residnet.physics.symmetry import get_axis_parities, mirror_channels
+from residnet.physics.symmetry import get_axis_parities, require_mirror_image
 
 
 def fast_tanh(x: Tensor, min_size: int = 8_192) -> Tensor:
@@ -55,12 +54,7 @@ class MirroredHead(RenamedStateModule, ResidualHead):
 
     def __init__(self, inner: ResidualHead, names: Sequence[str]) -> None:
         super().__init__(names)
-        mirror = mirror_channels(names)
-        if mirror is None:
-            raise ConfigError(
-                f"mirror: the mirror image of some of the channels {', '.join(names)} is unknown"
-                " (the torque of a single propeller heels a vessel with roll); remove `mirror`"
-            )
+        mirror = require_mirror_image(names)
         self.inner_head = inner
         self.inner_state_size = inner.n_state
         self.n_state = 2 * inner.n_state

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, ClassVar, Literal, final
+from typing import TYPE_CHECKING, ClassVar, final
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.renamed_state import RenamedStateModule
-from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
-from residnet.heads.mirror import MirroredHead, Tanh
+from residnet.heads.base import Features, ResidualHead, ResidualScale
+from residnet.heads.mirror import Tanh
+
+if TYPE_CHECKING:
+    from residnet.heads.mlp_config import MlpConfig
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "tanh": Tanh,
@@ -19,33 +21,6 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
     "relu": nn.ReLU,
     "softsign": nn.Softsign,
 }
-
-
-_UnitCount = Annotated[int, Field(ge=1, le=10_000)]
-
-
-class MlpConfig(FeatureConfig):
-    """Multi-layer perceptron with one activation function.
-
-    The output layer is initialised near zero, so that training starts from the baseline.
-
-    Attributes:
-        hidden: number of units of each hidden layer.
-        activation: activation function of the hidden layers.
-        dropout: dropout probability of the hidden units.
-        mirror: whether the residual is mirror-symmetric between port and starboard by construction.
-    """
-
-    kind: Literal["mlp"] = "mlp"
-    hidden: tuple[_UnitCount, ...] = Field(default=(64, 64), min_length=1, max_length=100)
-    activation: Literal["tanh", "silu", "relu", "softsign"] = "tanh"
-    dropout: float = Field(default=0.0, ge=0, lt=1)
-    mirror: bool = False
-
-    def build(self, names: Sequence[str]) -> ResidualHead:
-        """Build the head for channels `names`."""
-        head = MlpHead(self, names)
-        return MirroredHead(head, names) if self.mirror else head
 
 
 @final

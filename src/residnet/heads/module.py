@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ConfigError, UsageError
-from residnet.heads.base import BaseHeadConfig, Features, ResidualHead, ResidualScale
+from residnet.heads.base import Features, ResidualHead, ResidualScale
+from residnet.heads.config import BaseHeadConfig
 from residnet.physics.symmetry import get_dof
 
 _templates: dict[str, nn.Module] = {}

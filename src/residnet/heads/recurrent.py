@@ -4,51 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, final
+from typing import TYPE_CHECKING, ClassVar, final
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
-from residnet.core.config import Seconds
 from residnet.core.renamed_state import RenamedStateModule
-from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
+from residnet.heads.base import Features, ResidualHead, ResidualScale
 from residnet.physics.signals import RestoringAcceleration
+
+if TYPE_CHECKING:
+    from residnet.heads.recurrent_config import GRUEnsembleConfig
 
 _INNOVATION_CLIP_STD = 4.0
 """Bound of the innovations after smooth clipping, in standard deviations of the residual."""
 _MIN_GATE = 1e-13
 """Lower bound of the update gate, so that its logarithm is finite in float32."""
-
-
-class GRUEnsembleConfig(FeatureConfig):
-    """Ensemble of K gated recurrent units (Cho et al. 2014), trained as one batch.
-
-    The update gate is the share of the memory retained over `step`. At a shorter time step of the
-    model the corresponding root of the gate is used, so that networks trained at a coarse step run
-    at a fine one.
-
-    The networks also receive the innovations, which are the one-step prediction errors of the
-    acceleration in the measured past, low-pass filtered over two steps. In a free run the
-    innovations decay, and the memory retains the information.
-
-    Attributes:
-        members: number of networks; each predicts its own states, and velocities are averaged.
-        hidden_size: number of hidden units of each network.
-        step: time step of the gates.
-        restoring: whether a restoring acceleration acts on velocities outside their training range,
-            so that networks without a baseline cannot diverge.
-    """
-
-    kind: Literal["recurrent"] = "recurrent"
-    members: int = Field(default=1, ge=1, le=100)
-    hidden_size: int = Field(default=32, ge=1, le=1_000)
-    step: Seconds = Field(default=0.5, gt=0)
-    restoring: bool = False
-
-    def build(self, names: Sequence[str]) -> ResidualHead:
-        """Build the head for channels `names`."""
-        return GRUEnsembleHead(self, names)
 
 
 @final

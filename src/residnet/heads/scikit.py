@@ -8,23 +8,23 @@ so that these heads cannot be exported.
 
 from __future__ import annotations
 
-import importlib
-import inspect
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal, final
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 import torch
-from pydantic import Field, field_validator
 from torch import Tensor
 
 from residnet.core.errors import FitError, UsageError
-from residnet.core.names import suggest_name
 from residnet.core.samples import Samples
 from residnet.core.trust import is_trusted
-from residnet.heads.base import ClosedFormHead, FeatureConfig, Features, ResidualScale
-from residnet.heads.scikit_state import FITTED, KERNELS, StateError, decode, encode
+from residnet.heads.base import ClosedFormHead, Features, ResidualScale
+from residnet.heads.scikit_estimators import _parse_step, make_estimator
+from residnet.heads.scikit_state import StateError, decode, encode
 from residnet.regression.estimator import Solution
+
+if TYPE_CHECKING:
+    from residnet.heads.scikit_config import SklearnConfig
 
 _DIFFERENCE_STEP = 0.1
 """Step of central differences in standard deviations of a feature.
@@ -36,146 +36,6 @@ _STORED_STATE = 1
 """First byte of a stored state that holds the arrays of fitted estimators."""
 _STORED_SAMPLES = 2
 """First byte of a stored state that holds samples; the estimators are fitted again on loading."""
-_STORES_PICKLES = ("memory",)
-"""Parameters that configure a joblib cache, which unpickles its files."""
-
-
-class SklearnConfig(FeatureConfig):
-    """Pipeline of scikit-learn that ends in a regressor, fitted per axis.
-
-    Features and targets are standardised.
-
-    Attributes:
-        pipeline: steps of the pipeline. A step is a dotted name below `sklearn`, or a mapping from
-            the name to the parameters, whose values may again be names or mappings. Classes outside
-            of `residnet.heads.scikit_state.FITTED` need `--trust`.
-        samples: maximum number of training samples; more samples are decimated evenly.
-    """
-
-    kind: Literal["sklearn"] = "sklearn"
-    pipeline: tuple[str | dict[str, dict[str, Any] | None], ...] = Field(
-        default=("sklearn.ensemble.HistGradientBoostingRegressor",), min_length=1
-    )
-    samples: int = Field(default=5_000, ge=10, le=1_000_000)
-
-    @field_validator("pipeline")
-    @classmethod
-    def _validate_pipeline(cls, steps: tuple[Any, ...]) -> tuple[Any, ...]:
-        estimators = [make_estimator(step) for step in steps]
-        final_step = estimators[-1]
-        if not callable(getattr(final_step, "predict", None)):
-            raise ValueError(
-                f"the last step, {type(final_step).__name__}, is not a regressor; end the pipeline"
-                " with one"
-            )
-        for estimator in estimators[:-1]:
-            if not callable(getattr(estimator, "transform", None)):
-                raise ValueError(
-                    f"{type(estimator).__name__} is not a transformer; only the last step may be a"
-                    " regressor"
-                )
-        return steps
-
-    @property
-    def is_storable(self) -> bool:
-        """Whether all classes are on the allow-list, so that the fitted state can be stored."""
-        return all(_is_listed(step, FITTED) for step in self.pipeline)
-
-    def build(self, names: Sequence[str]) -> ClosedFormHead:
-        """Build the head for channels `names`."""
-        return SklearnHead(self, names)
-
-
-def _parse_step(step: Any) -> tuple[str, Mapping[str, Any]] | None:
-    """Return the class name and parameters of a step; None for a plain value."""
-    if isinstance(step, str) and step.startswith("sklearn."):
-        return step, {}
-    if isinstance(step, Mapping) and len(step) == 1:
-        name, parameters = next(iter(step.items()))
-        if isinstance(name, str) and name.startswith("sklearn."):
-            return name, parameters or {}
-    return None
-
-
-def _is_listed(step: Any, names: Any) -> bool:
-    """Return whether a class and the classes in its parameters are on the allow-lists."""
-    parsed_step = _parse_step(step)
-    if parsed_step is None:
-        return False
-    class_name, parameters = parsed_step
-    if class_name not in names:
-        return False
-    return all(_is_listed(value, KERNELS) for value in parameters.values() if _parse_step(value))
-
-
-def make_estimator(step: Any, *, listed: Any = FITTED) -> Any:
-    """Construct the estimator of a step, not yet fitted, with a fixed random seed.
-
-    Args:
-        step: class name, or a mapping from the class name to the parameters.
-        listed: class names that are allowed without `--trust`.
-
-    Raises:
-        ValueError: if the class or a parameter does not exist or is not allowed.
-    """
-    parsed_step = _parse_step(step)
-    if parsed_step is None:
-        raise ValueError(
-            f"{step!r} is not a class below `sklearn`; give a name such as sklearn.svm.SVR"
-        )
-    name, parameters = parsed_step
-    if name not in listed and not is_trusted():
-        raise ValueError(
-            f"'{name}' is not among the classes of scikit-learn whose fitted state is stored as"
-            f" data{suggest_name(name, listed)}; docs/howto/head.md lists them. Give --trust (in"
-            " Python trust=True) only for configs and runs whose source you trust"
-        )
-    module_name, _, class_name = name.rpartition(".")
-    try:
-        estimator_class = getattr(importlib.import_module(module_name), class_name)
-    except (ImportError, AttributeError):
-        raise ValueError(f"scikit-learn has no '{name}'") from None
-    if not inspect.isclass(estimator_class):
-        raise ValueError(f"'{name}' is not a class of scikit-learn")
-    settings = {key: _parameter(name, key, value) for key, value in parameters.items()}
-    if "random_state" in inspect.signature(estimator_class).parameters:
-        settings.setdefault("random_state", 0)
-    if name == "sklearn.neighbors.KNeighborsRegressor":
-        # the search tree is an object of compiled code, which cannot be stored as arrays
-        algorithm = settings.setdefault("algorithm", "brute")
-        if algorithm != "brute":
-            raise ValueError(f"{name}: algorithm: expected 'brute', got {algorithm}")
-    try:
-        estimator = estimator_class(**settings)
-        # scikit-learn validates parameters at the fit; an error here shows the key of the config
-        if hasattr(estimator, "_validate_params"):
-            estimator._validate_params()
-    except (TypeError, ValueError) as error:
-        first_line = next(iter(str(error).splitlines()), "")
-        raise ValueError(f"{name}: {first_line}") from None
-    return estimator
-
-
-def _parameter(owner: str, key: str, value: Any) -> Any:
-    """Convert a parameter: a plain value, a list of plain values, or an allowed kernel.
-
-    Raises:
-        ValueError: if the value is of another type, or configures a cache of pickles.
-    """
-    if key in _STORES_PICKLES and value is not None:
-        raise ValueError(
-            f"{owner}: {key}: is a cache of pickles, which residnet does not open; remove it"
-        )
-    if _parse_step(value):
-        return make_estimator(value, listed=KERNELS)
-    if isinstance(value, list | tuple):
-        return [_parameter(owner, key, part) for part in value]
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    raise ValueError(
-        f"{owner}: {key}: expected a number, a string or a list of these, got"
-        f" {type(value).__name__}"
-    )
 
 
 @final

@@ -4,30 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple, final
+from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
-from residnet.core.config import Config
-from residnet.core.errors import ConfigError, FitError
-from residnet.core.names import suggest_name
+from residnet.core.errors import FitError
 from residnet.core.samples import Samples
-from residnet.heads.base import EquationHead, FeatureConfig, Features
+from residnet.heads.base import EquationHead, Features
 from residnet.physics.symmetry import compute_term_parity, get_axis_parities
-from residnet.physics.terms import CandidatesConfig, TermLibrary, parse_term, rank_candidates
+from residnet.physics.term_library import TermLibrary
+from residnet.physics.terms import parse_term
 from residnet.regression.equation_rows import (
     RegressionRows,
-    RowsConfig,
-    SampleRows,
     median_time_step,
     number_regular_segments,
 )
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.expressions import format_equation, format_sum, terms_to_sympy
-from residnet.regression.sparse import SparseRegression, SparseSearchConfig
+from residnet.regression.sparse import SparseRegression
+
+if TYPE_CHECKING:
+    from residnet.heads.symbolic_config import DelayConfig, SymbolicConfig
 
 _ROUNDING_SHARE = 1e-14
 """Relative residual energy below which a fit is at the level of rounding errors."""
@@ -35,19 +34,6 @@ _RANK_TOLERANCE = 1e-10
 """Ratio to the largest eigenvalue below which an eigenvalue counts as zero."""
 _MIN_NORM = 1e-300
 """Lower bound of the norm of a term and of the argument of the logarithm of an error."""
-
-
-class DelayConfig(Config):
-    """Input delay that is identified by the fit, common to all delayed channels.
-
-    Attributes:
-        channels: delayed inputs.
-        longest: maximum candidate delay in time steps; the memory of the head contains this number
-            of samples and a flag.
-    """
-
-    channels: tuple[str, ...] = Field(min_length=1)
-    longest: int = Field(default=20, ge=1, le=500)
 
 
 class DelayLine(nn.Module):
@@ -61,11 +47,8 @@ class DelayLine(nn.Module):
     def __init__(self, config: DelayConfig | None, names: Sequence[str]) -> None:
         super().__init__()
         delayed_names = config.channels if config is not None else ()
-        for name in delayed_names:
-            if name not in names:
-                raise ConfigError(
-                    f"delay: '{name}' is not a feature of the head{suggest_name(name, names)}"
-                )
+        if config is not None:
+            config.require_features(names)
         self.max_delay = config.longest if config is not None else 0
         self.delayed_names = delayed_names
         self.n_delayed = len(delayed_names)
@@ -230,36 +213,6 @@ _MAX_DELAY_ROUNDS = 6
 """Maximum number of iterations of the search for a delay."""
 
 
-class SymbolicConfig(FeatureConfig):
-    """Equation of each axis in SI units, identified by sparse regression.
-
-    Attributes:
-        candidates: candidate terms, given by types.
-        terms: names of candidate terms; if given, they replace `candidates`.
-        search: settings of the search.
-        estimator: rows of the regression: samples, or windows of the weak form.
-        symmetric: whether the candidates of each axis exclude terms that violate port/starboard
-            symmetry, for channels with a known mirror image.
-        delay: delayed inputs; null for no delay.
-        choose: criterion of the number of terms. `one_step` is the extended BIC of the
-            accelerations; `free_run` is the error of free runs on validation data, with shorter and
-            longer equations and no residual as candidates.
-    """
-
-    kind: Literal["symbolic"] = "symbolic"
-    candidates: CandidatesConfig = Field(default_factory=CandidatesConfig)
-    terms: tuple[str, ...] = ()
-    search: SparseSearchConfig = Field(default_factory=SparseSearchConfig)
-    estimator: RowsConfig = Field(default_factory=SampleRows)
-    symmetric: bool = False
-    delay: DelayConfig | None = None
-    choose: Literal["one_step", "free_run"] = "one_step"
-
-    def build(self, names: Sequence[str]) -> SymbolicHead:
-        """Build the head for channels `names`."""
-        return SymbolicHead(self, names)
-
-
 @final
 class SymbolicHead(EquationHead):
     """Head with the residual rho [..., n] = phi(features) coefficients, with sparse coefficients.
@@ -275,11 +228,7 @@ class SymbolicHead(EquationHead):
         self.line = DelayLine(config.delay, feature_names)
         self.n_state = self.line.n_state
         self.config = config
-        self.candidates = (
-            rank_candidates(dict.fromkeys(config.terms), feature_names)
-            if config.terms
-            else config.candidates.generate_candidates(feature_names)
-        )
+        self.candidates = config.rank_terms(feature_names)
         self.library = TermLibrary([candidate.term for candidate in self.candidates], feature_names)
         self.coefficients = nn.Buffer(
             torch.zeros(self.library.n_terms, self.n_dof, dtype=torch.float64)

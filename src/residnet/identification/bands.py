@@ -45,7 +45,8 @@ from residnet.identification.identified import (
     spread_member_names,
     trajectory_member_names,
 )
-from residnet.preprocessing.prepare import PreparedLog, make_samples
+from residnet.preprocessing.prepare import PreparedLog
+from residnet.preprocessing.samples import make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import Solution
 from residnet.training.left_out import estimate_leave_one_out

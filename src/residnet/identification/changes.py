@@ -22,7 +22,7 @@ from residnet.core.layout import (
 )
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.symmetry import get_dof
 
 _AXIS_NAMES = {"u": "surge", "v": "sway", "r": "yaw", "p": "roll", "w": "heave", "q": "pitch"}

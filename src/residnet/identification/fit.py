@@ -27,7 +27,7 @@ from residnet.core.progress import (
 from residnet.core.registry import is_python_part
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, restore_module
-from residnet.heads.genetic import GeneticConfig
+from residnet.heads.genetic_config import GeneticConfig
 from residnet.identification.bands import calibrate_bands
 from residnet.identification.fitter import FitStore, FittedModel, Fitter
 from residnet.identification.identified import IdentifiedModels

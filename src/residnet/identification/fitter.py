@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from residnet.baselines import BaselineConfig
 from residnet.baselines.base import Baseline, ParametricBaseline
-from residnet.baselines.given import ZeroBaselineConfig
+from residnet.baselines.given_config import ZeroBaselineConfig
 from residnet.core.arrays import paged
 from residnet.core.errors import FitError
 from residnet.core.model_names import CONSTANT_VELOCITY
@@ -33,16 +33,17 @@ from residnet.evaluation.band import Band
 from residnet.evaluation.freerun import Candidate, FreeRunErrors, run_free_runs
 from residnet.evaluation.protocol import EvaluationConfig, make_windows
 from residnet.heads.base import ClosedFormHead
-from residnet.identification.prepared import PreparedSplits, compute_velocity_limits
+from residnet.identification.prepared import compute_velocity_limits
 from residnet.identification.recipe import TrainingDataSummary, has_enough_logs_for_networks
 from residnet.identification.settings import FitSettings
 from residnet.identification.training_schedule import resolve_training
-from residnet.preprocessing.prepare import PreparedLog, compute_training_ranges, make_samples
+from residnet.preprocessing.prepare import PreparedLog, compute_training_ranges
+from residnet.preprocessing.samples import make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.sparse import coefficient_to_dict
 from residnet.training.config import TrainingConfig
-from residnet.training.refit import find_free_run_starts, refit, require_parametric_baseline
+from residnet.training.refit import refit, require_parametric_baseline
 from residnet.training.score import ExampleRun, Score
 
 if TYPE_CHECKING:
@@ -360,7 +361,11 @@ class Fitter:
         )
         self.training_samples = make_samples(self.training_logs, self.signals)
         self.validation_samples = make_samples(logs["validation"], self.signals)
-        self.settings = self._resolve_settings(settings) if resolve_recipe else settings
+        self.settings = (
+            _resolve_settings(settings, self.training_samples, self.training_logs)
+            if resolve_recipe
+            else settings
+        )
         settings = self.settings
         self.state_scales = torch.from_numpy(settings.evaluation.scales.to_array())
         self.score_on_validation = ValidationScorer(
@@ -370,35 +375,6 @@ class Fitter:
             self.velocity_limits,
             use_overlapping_windows=settings.recipe is not None,
         )
-
-    def _resolve_settings(self, settings: FitSettings) -> FitSettings:
-        """Return the settings with the recipe's parts and the trainings that follow from the logs.
-
-        The trainings of all networks are listed, also those that the user has set.
-        """
-        summary = TrainingDataSummary.from_logs(
-            self.training_samples,
-            self.training_logs,
-            settings.evaluation,
-            settings.prepare.grid.step,
-        )
-        if settings.recipe is not None:
-            settings = settings.with_parts(summary)
-            if not has_enough_logs_for_networks(summary):
-                log_message(
-                    f"  mlp and lstm are left out: the training logs of"
-                    f" {summary.n_samples * summary.dt:.0f} s are shorter than ten free runs of"
-                    f" {summary.free_run_length:g} s"
-                )
-        training_configs = {}
-        for name, head_config in settings.heads.items():
-            head = head_config.build(self.signals.names)
-            if not isinstance(head, ClosedFormHead):
-                training_config = settings.training.get(name, TrainingConfig())
-                training_configs[name] = resolve_training(
-                    training_config, head, summary, settings.effort
-                )
-        return settings.model_copy(update={"training": training_configs})
 
     def build_spec(self, name: str, role: str, baseline: BaselineConfig) -> ModelSpec:
         """Return the description of a model of this fit.
@@ -720,41 +696,46 @@ class Fitter:
         return reloaded
 
 
-def check_fit(logs: PreparedSplits, settings: FitSettings) -> Fitter:
-    """Check that prepared logs hold the manoeuvres, folds and windows that a fit requires.
-
-    The fit calls the same functions and therefore refuses with the same messages.
-
-    Returns:
-        The fitter of the logs; no part is fitted yet.
+def derive_settings(training_logs: Sequence[PreparedLog], settings: FitSettings) -> FitSettings:
+    """Return the settings with the parts and trainings that follow from the training logs.
 
     Raises:
-        DataError: if a split holds no sample, or no window of a protocol or of a training.
-        FitError: if manoeuvres that a baseline requires are missing, too few for the folds of a
-            head, or too short for a refit.
+        DataError: if no log has trainable samples.
     """
-    fitter = Fitter(logs, settings, FitStore())
-    # the fitter's settings include the parts of a recipe, which follow from the logs
-    settings = fitter.settings
-    dt = settings.prepare.grid.step
-    window_store = WindowStore.from_logs(fitter.training_logs)
-    for baseline in settings.all_baselines.values():
-        baseline.validate_samples(fitter.training_samples)
-    for refit_config in settings.refit.values():
-        find_free_run_starts(window_store, refit_config, dt)
-    for name, config in settings.heads.items():
-        head = config.build(fitter.signals.names)
-        if isinstance(head, ClosedFormHead):
-            try:
-                head.validate_samples(fitter.training_samples)
-            except FitError as error:
-                raise FitError(f"head {name}: {error}") from None
-        else:
-            training_config = settings.training[name]
-            for window_config in training_config.windows(dt):
-                if window_config is not None:
-                    window_config.make_samplers(window_store, training_config.steps)
-    return fitter
+    samples = make_samples(training_logs, settings.signals.build())
+    return _resolve_settings(settings, samples, training_logs)
+
+
+def _resolve_settings(
+    settings: FitSettings, samples: Samples, training_logs: Sequence[PreparedLog]
+) -> FitSettings:
+    """Return the settings with the recipe's parts and the trainings that follow from the logs.
+
+    The trainings of all networks are listed, also those that the user has set.
+    """
+    summary = TrainingDataSummary.from_logs(
+        samples,
+        training_logs,
+        settings.evaluation,
+        settings.prepare.grid.step,
+    )
+    if settings.recipe is not None:
+        settings = settings.with_parts(summary)
+        if not has_enough_logs_for_networks(summary):
+            log_message(
+                f"  mlp and lstm are left out: the training logs of"
+                f" {summary.n_samples * summary.dt:.0f} s are shorter than ten free runs of"
+                f" {summary.free_run_length:g} s"
+            )
+    training_configs = {}
+    for name, head_config in settings.heads.items():
+        head = head_config.build(samples.names)
+        if not isinstance(head, ClosedFormHead):
+            training_config = settings.training.get(name, TrainingConfig())
+            training_configs[name] = resolve_training(
+                training_config, head, summary, settings.effort
+            )
+    return settings.model_copy(update={"training": training_configs})
 
 
 def _free_covariance(baseline: Baseline, solution: Solution) -> torch.Tensor | None:

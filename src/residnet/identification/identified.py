@@ -37,8 +37,10 @@ from residnet.identification.fitter import FittedModel, find_reference_names
 from residnet.identification.recipe import SINGLE_MODEL_NAME
 from residnet.identification.settings import FitSettings
 from residnet.io.sources import MeasuredLogs
-from residnet.manoeuvres.trials import SimulatedTrials, build_plant
-from residnet.preprocessing.prepare import PreparedLog, compute_channels
+from residnet.manoeuvres.trials import build_plant
+from residnet.manoeuvres.trials_config import SimulatedTrials
+from residnet.preprocessing.prepare import PreparedLog
+from residnet.preprocessing.samples import compute_channels
 
 if TYPE_CHECKING:
     import pandas as pd

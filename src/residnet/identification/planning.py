@@ -30,26 +30,22 @@ from residnet.core.layout import (
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.fitter import FittedModel
-from residnet.manoeuvres.actuated import (
-    ActuatedDynamics,
-    GivenActuators,
-    InputShare,
-    command_name_for,
-)
+from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators, command_name_for
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
+from residnet.manoeuvres.input_shares import InputShare
 from residnet.manoeuvres.open_loop import AccelerationDeceleration, MultiSine, ThreeTwoOneOne
 from residnet.manoeuvres.trials import (
-    DisturbanceConfig,
     ManoeuvreRun,
-    SensorsConfig,
     SimulatedVessel,
     TrialEnvironment,
     simulate_manoeuvres,
 )
-from residnet.physics.signals import SignalsConfig
+from residnet.manoeuvres.trials_config import DisturbanceConfig, SensorsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.training.left_out import RefitUncertainty
-from residnet.training.refit import RefitConfig, require_parametric_baseline, sensitivities
+from residnet.training.refit import require_parametric_baseline, sensitivities
+from residnet.training.refit_config import RefitConfig
 
 
 @torch.no_grad()

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.arrays import paged
 from residnet.core.errors import DataError
 from residnet.core.layout import DegreesOfFreedom
@@ -18,7 +17,6 @@ from residnet.evaluation.protocol import longest_segment_length
 from residnet.identification.settings import FitSettings
 from residnet.preprocessing.masks import UNEXPLAINED_IDLE
 from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
-from residnet.training.current import estimate_currents, through_water
 
 _MAX_SAMPLES = 500_000
 """Largest number of samples of a log that are prepared at once, which bounds the memory used."""
@@ -192,6 +190,9 @@ def convert_to_motion_through_water(
     Raises:
         FitError: if the logs do not determine their currents.
     """
+    from residnet.baselines.regressors import RegressorBaseline
+    from residnet.training.current import estimate_currents, through_water
+
     splits = {split: paged.PageReleasingList(split_logs) for split, split_logs in logs.items()}
     if settings.current is None:
         return splits, []

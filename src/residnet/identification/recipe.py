@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,17 +19,25 @@ from residnet.baselines.sets import (
 from residnet.core.layout import SURGE_SWAY_YAW, DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.core.model_names import CONSTANT_VELOCITY, ENSEMBLE
-from residnet.core.names import BOW_WIND_CHANNELS, CHANNEL_UNITS, WIND_INPUTS, azimuth_thrusters
-from residnet.core.samples import Samples
+from residnet.core.names import (
+    BOW_WIND_CHANNELS,
+    CHANNEL_UNITS,
+    FORCE_CHANNELS,
+    WIND_CHANNELS,
+    WIND_INPUTS,
+    azimuth_thrusters,
+)
 from residnet.core.stretches import find_runs
-from residnet.dynamics.base import Integrator
+from residnet.dynamics.time_steps import Integrator
 from residnet.evaluation.protocol import EvaluationConfig, WindowProtocol, longest_segment_length
-from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
 from residnet.physics.symmetry import get_dof, violates_symmetry
 from residnet.preprocessing.channel_values import bridge_spikes
 from residnet.preprocessing.masks import MaskRule, apply_masks, find_scored_samples
 from residnet.preprocessing.motion import remove_pauses
 from residnet.preprocessing.prepare import TAIL_SHARE, PrepareConfig, PreparedLog, prepare_log
+
+if TYPE_CHECKING:
+    from residnet.core.samples import Samples
 
 _MIN_RELATIVE_SPREAD = 1e-3
 """Smallest spread of a varying channel, as a share of its magnitude."""

@@ -1,4 +1,4 @@
-"""Settings of an identification, without the source of the logs and the output folder."""
+"""Settings of an identification: everything but where logs come from and where results go."""
 
 from __future__ import annotations
 
@@ -8,23 +8,21 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from residnet.baselines import BaselineConfig
-from residnet.baselines.base import ParametricBaseline
-from residnet.baselines.given import ZeroBaselineConfig
-from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.given_config import ZeroBaselineConfig
 from residnet.core.config import Config, validate_config
 from residnet.core.errors import ConfigError
 from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY, PLANT
 from residnet.core.names import suggest_name
-from residnet.dynamics.base import Integrator
+from residnet.dynamics.time_steps import Integrator
 from residnet.evaluation.band import BandsConfig
 from residnet.evaluation.protocol import EvaluationConfig
 from residnet.heads import HeadConfig
 from residnet.identification.recipe import PART_KEYS, TrainingDataSummary, make_portfolio
-from residnet.physics.signals import SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.prepare import PrepareConfig
 from residnet.training.config import TrainingConfig
-from residnet.training.current import CurrentConfig
-from residnet.training.refit import RefitConfig
+from residnet.training.current_config import CurrentConfig
+from residnet.training.refit_config import RefitConfig
 
 _RESERVED_NAMES = (CONSTANT_VELOCITY, BASELINE, PLANT)
 
@@ -101,7 +99,7 @@ class FitSettings(ModelPartsConfig):
                 f"recipe: standard sets {', '.join(PART_KEYS)}; remove"
                 f" '{specified_parts[0]}' or the recipe"
             )
-        return self.with_parts(TrainingDataSummary.from_channel_names(self.signals.build().names))
+        return self.with_parts(TrainingDataSummary.from_channel_names(self.signals.channel_names()))
 
     def with_parts(self, data_summary: TrainingDataSummary) -> Self:
         """Return the settings with the parts of the recipe for the given logs."""
@@ -165,25 +163,27 @@ class FitSettings(ModelPartsConfig):
         return self
 
     def check_parts_fit_together(self) -> None:
-        """Build every part once, so that incompatible parts are refused before any log is read."""
-        channel_names = self.signals.build().names
-        part_configs: dict[str, Any] = {**self.all_baselines, **self.heads}
+        """Refuse incompatible parts before any log is read."""
+        names = self.signals.channel_names()
+        baselines = self.all_baselines
+        part_configs: dict[str, Any] = {**baselines, **self.heads}
         for part_name, part_config in part_configs.items():
             try:
-                part_config.build(channel_names)
+                part_config.check_channels(names)
             except ConfigError as error:
                 raise ValueError(f"{part_name}: {error}") from None
-        for part_name, config in self.heads.items():
-            head = config.build(channel_names)
-            baseline = self.get_baseline_config(part_name).build(channel_names)
+        for part_name, head_config in self.heads.items():
+            baseline_config = self.get_baseline_config(part_name)
             try:
-                head.set_inertia(baseline.inertia_matrix())
+                head_config.check_inertia(
+                    names, has_inertia_matrix=baseline_config.has_inertia_matrix(names)
+                )
             except ConfigError as error:
                 raise ValueError(f"heads.{part_name}: {error}") from None
-        self._check_ensemble_members(channel_names)
-        self._check_refits_and_current(channel_names)
+        self._check_ensemble_members(names)
+        self._check_refits_and_current(names)
 
-    def _check_ensemble_members(self, channel_names: Sequence[str]) -> None:
+    def _check_ensemble_members(self, names: Sequence[str]) -> None:
         """Refuse heads that read an innovation as members of an ensemble.
 
         The accelerations of the members are averaged at one common state in each step. The
@@ -191,21 +191,18 @@ class FitSettings(ModelPartsConfig):
         """
         for ensemble, members in self.ensembles.items():
             for name in members:
-                if name not in self.heads:
-                    continue
-                head = self.heads[name].build(channel_names)
-                if head.innovation_time_constant > 0.0:
+                if name in self.heads and self.heads[name].has_innovations(names):
                     raise ValueError(
                         f"ensembles.{ensemble}: '{name}' reads the innovation of its own predicted"
                         " velocities, so that its accelerations cannot be averaged with those of"
                         " other models; list it under `means`, which averages trajectories"
                     )
 
-    def _check_refits_and_current(self, channel_names: Sequence[str]) -> None:
+    def _check_refits_and_current(self, names: Sequence[str]) -> None:
         """Refuse a refit or an estimate of currents with a baseline that does not support it."""
         baselines = self.all_baselines
         for name in self.refit:
-            if not isinstance(baselines[name].build(channel_names), ParametricBaseline):
+            if not baselines[name].is_parametric(names):
                 raise ValueError(
                     f"refit.{name}: a refit through rollouts needs a baseline of kind 'regressors',"
                     " 'linear_steady', 'mmg', 'nomoto' or 'nomoto_sideslip'"
@@ -213,7 +210,7 @@ class FitSettings(ModelPartsConfig):
         if self.current is not None:
             name = self.current.baseline
             check_known_names("current.baseline", (name,), baselines, "baseline")
-            if not isinstance(baselines[name].build(channel_names), RegressorBaseline):
+            if not baselines[name].has_regressors(names):
                 raise ValueError(
                     f"current.baseline: '{name}' has no regressors to estimate a current with;"
                     " name a baseline of kind 'regressors' or 'linear_steady'"

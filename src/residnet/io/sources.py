@@ -14,7 +14,7 @@ from residnet.core.log import Log
 from residnet.core.progress import report_progress
 from residnet.io.readers import ReaderConfig
 from residnet.io.split import SplitConfig, assign_log_names, check_leaks, split_logs
-from residnet.manoeuvres.trials import SimulatedTrials, simulate_trial_logs
+from residnet.manoeuvres.trials_config import SimulatedTrials
 
 LogsBySplit = dict[str, list[Log]]
 
@@ -42,6 +42,8 @@ def read_split_logs(config: MeasuredLogs | SimulatedTrials) -> LogsBySplit:
         ResidnetError: if a file is missing or cannot be used, or two splits share measurements.
     """
     if isinstance(config, SimulatedTrials):
+        from residnet.manoeuvres.trials import simulate_trial_logs
+
         manoeuvres = config.draw_manoeuvres()
         logs_by_split: LogsBySplit = {"train": [], "validation": [], "test": []}
         for log, split in zip(

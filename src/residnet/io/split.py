@@ -20,9 +20,7 @@ from residnet.core.config import Config, ConfigPath, Seconds, load_mapping, vali
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES, suggest_name
-from residnet.io.header_vocabulary import SPLIT_NAMES
 from residnet.io.readers.base import list_files
-from residnet.io.readers.detect import LOG_ENDINGS, detect_recording_format, is_text_table
 from residnet.preprocessing.motion import remove_pauses
 
 if TYPE_CHECKING:
@@ -358,6 +356,8 @@ def splits_from_names(logs: Sequence[Log]) -> list[str]:
     The list is empty unless all names contain a split, with at least two logs for training and
     validation and one log for the test.
     """
+    from residnet.io.header_vocabulary import SPLIT_NAMES
+
     split_names = []
     for log in logs:
         path = Path(str(log.meta.get("source", "")).lower())
@@ -520,6 +520,8 @@ def find_logs(folder: Path) -> list[Path]:
 
     Files with unknown extensions are tested by content if there are no others.
     """
+    from residnet.io.readers.detect import LOG_ENDINGS, detect_recording_format, is_text_table
+
     return _find_logs_recursively(
         folder, lambda path: path.suffix.lower() in LOG_ENDINGS
     ) or _find_logs_recursively(
@@ -528,6 +530,8 @@ def find_logs(folder: Path) -> list[Path]:
 
 
 def _find_logs_recursively(folder: Path, is_log: Callable[[Path], bool]) -> list[Path]:
+    from residnet.io.readers.detect import detect_recording_format
+
     if detect_recording_format(folder) is not None and not _contains_recordings(folder):
         return [folder]
     log_paths: list[Path] = []
@@ -642,6 +646,8 @@ def match_patterns(root: Path, patterns: Sequence[str], error_prefix: str) -> li
 
 def _glob(root: Path, pattern: str, error_prefix: str) -> list[Path]:
     """Return the files, otherwise the recordings, that match a pattern, in sorted order."""
+    from residnet.io.readers.detect import detect_recording_format
+
     reason_text = "it is an absolute path" if Path(pattern).is_absolute() else ""
     try:
         if not reason_text:

@@ -1,25 +1,26 @@
-"""A learned model in series with actuators, which receives commands like the vessel."""
+"""A learned model with actuators in series, which is driven by commands like the vessel."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Literal, final
+from typing import TYPE_CHECKING, Literal, final
 
 import torch
 from torch import Tensor, nn
 
 from residnet.core import columns
-from residnet.core.config import Config, Quantity
 from residnet.core.errors import ConfigError
-from residnet.core.names import CHANNEL_UNITS, suggest_name
+from residnet.core.layout import ROLLING_LAYOUT, SUBMERGED_LAYOUT
+from residnet.core.names import suggest_name
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.recorded_plant import RecordedPlantDynamics
-from residnet.physics.plant import ROLLING_LAYOUT, SUBMERGED_LAYOUT, Plant
+from residnet.physics.plant import Plant
 from residnet.physics.symmetry import get_dof
 
-_RATE_UNITS = {"rad": "rad/s", "1/s": "1/s^2", "m": "m/s", "-": "1/s"}
+if TYPE_CHECKING:
+    from residnet.manoeuvres.input_shares import InputShare
 
 
 class Actuators(nn.Module, ABC):
@@ -96,51 +97,6 @@ class PlantActuators(Actuators):
         zeros = torch.zeros(n_rows, dtype=torch.float64)
         names = (*hull, *self.state_names)
         return torch.stack([value_of_state.get(name, zeros) for name in names], dim=1)
-
-
-class InputShare(Config):
-    """The mapping from drive and steer of a manoeuvre to one input of a learned model.
-
-    Values are numbers in the SI unit of the input, or texts with a unit.
-
-    Attributes:
-        drive: value at full drive.
-        steer: value at full steer to starboard.
-        centre: value without demand.
-        limit: largest deviation from `centre` to both sides; None for the sum of drive and steer.
-        rate: largest change per second; None for no rate limit.
-    """
-
-    drive: float | str = 0.0
-    steer: float | str = 0.0
-    centre: float | str = 0.0
-    limit: float | str | None = None
-    rate: float | str | None = None
-
-    def to_si(self, name: str) -> list[float]:
-        """Return drive, steer, centre, limit and rate of the input `name` in SI.
-
-        Raises:
-            ConfigError: if a value has a wrong unit, or the input does not depend on drive and
-                steer.
-        """
-        unit = CHANNEL_UNITS.get(name, "-")
-        value = Quantity(unit)
-        rate = Quantity(_RATE_UNITS[unit]) if unit in _RATE_UNITS else None
-        max_rate = float("inf")
-        try:
-            drive, steer, centre = map(value.convert, (self.drive, self.steer, self.centre))
-            limit = abs(drive) + abs(steer) if self.limit is None else value.convert(self.limit)
-            if self.rate is not None:
-                max_rate = float(self.rate) if rate is None else rate.convert(self.rate)
-        except ValueError as error:
-            raise ConfigError(f"inputs.{name}: {error}") from None
-        if limit <= 0 or max_rate <= 0:
-            raise ConfigError(
-                f"inputs.{name}: limit and rate must be above zero, and drive or steer must not be"
-                f" zero; got a limit of {limit:g} and a rate of {max_rate:g}"
-            )
-        return [drive, steer, centre, limit, max_rate]
 
 
 @final

@@ -1,9 +1,9 @@
 """The interface of manoeuvres.
 
-A manoeuvre demands a normalised drive (mean thrust or revolutions) and steer (rudder, or difference
-of two propellers) over time, in open loop or by feedback of the motion. The vessel converts both to
-its commands, so that a manoeuvre applies to any plant and to any learned model with actuators. A
-manoeuvre with a stop condition ends its row of the rollout at this condition.
+A manoeuvre demands a normalised drive (mean thrust or revolutions) and steer (difference, or
+rudder) over time, open loop or by the motion that it sees. The vessel turns the two into its own
+commands, so one manoeuvre drives any plant and any learned model that has actuators. A manoeuvre
+with a stop condition ends its row of the rollout there.
 """
 
 from __future__ import annotations
@@ -11,28 +11,30 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, final
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
-import torch
 from pydantic import Field, model_validator
-from torch import Tensor
 
 from residnet.core.config import Config, Radians, Seconds
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
-from residnet.engine.rollout import Source
-from residnet.physics.actuators import ForceActuators, ForceCommands
-from residnet.physics.plant import HullPlant, Plant
+from residnet.physics.actuators.config import RUDDER_INPUTS
+from residnet.physics.plant_channels import PlantChannels
 
-DemandFunction = Callable[[Tensor, Tensor], Tensor]
-"""Converts drive [...] and steer [...] to commands [..., c], the first c columns of the inputs."""
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from residnet.engine.rollout import Source
+    from residnet.physics.plant import Plant
+
+    DemandFunction = Callable[[Tensor, Tensor], Tensor]
+    """Turns drive [...] and steer [...] into commands [..., c], the first columns of the inputs."""
+    BatchParameters = dict[str, Tensor]
+    """What rows of a batch are told by their manoeuvres, each [B] or [B, n]."""
 
 Range = tuple[float, float]
 """Lower and upper bound of a uniform distribution."""
-
-RUDDER_INPUTS = ("cmd_delta", "delta")
-"""Names that the input of a rudder angle may have."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +67,20 @@ class Helm:
         """
         commands = self.demand(drive, steer)
         for share in dive:
-            if self.dive_commands is None:
-                raise UsageError(
-                    "the manoeuvre demands a dive, but the vessel cannot dive; give a vessel with"
-                    " six degrees of freedom, or a manoeuvre without dive"
-                )
+            require_dive(can_dive=self.dive_commands is not None)
+            assert self.dive_commands is not None
             commands = commands + share.unsqueeze(-1) * self.dive_commands.to(commands.dtype)
         return commands
 
     @classmethod
     def from_plant(cls, plant: Plant) -> Helm:
         """Return the helm of a plant."""
+        import torch
+
+        from residnet.physics.actuators.base import ForceActuators
+        from residnet.physics.actuators.thrusters import ForceCommands
+        from residnet.physics.plant import HullPlant
+
         forces: Callable[[Tensor], Tensor] | None = None
         side_force: float | None = None
         if isinstance(plant, HullPlant) and isinstance(plant.actuators, ForceCommands):
@@ -99,16 +104,14 @@ class Helm:
         Raises:
             UsageError: if the vessel has no such state.
         """
-        if name not in self.state:
-            raise UsageError(
-                f"the manoeuvre needs the state '{name}', which the vessel does not have; its"
-                f" states are {', '.join(self.state)}"
-            )
+        require_state(name, self.state)
         return self.state.index(name)
 
     @property
     def max_rudder(self) -> float | None:
         """Rudder angle of full steer in rad; None for a vessel without rudder."""
+        import torch
+
         name = next((name for name in RUDDER_INPUTS if name in self.inputs), None)
         if name is None:
             return None
@@ -118,154 +121,38 @@ class Helm:
         return float(full_commands[0, self.inputs.index(name)])
 
 
-def replace_commands(command: Tensor, w: Tensor) -> Tensor:
-    """Return the inputs [B, m] with their first columns replaced by commands [B, c]."""
-    return torch.cat((command, w[:, command.shape[-1] :]), dim=-1)
+class RudderRange(Protocol):
+    """A vessel whose largest rudder angle is known: a `Helm`, or the channels of a plant."""
+
+    @property
+    def max_rudder(self) -> float | None:
+        """Rudder angle of full steer in rad; None for a vessel without rudder."""
 
 
-@final
-class ScheduleSource(Source):
-    """A source of precomputed open-loop commands [B, T, c]."""
+def require_state(name: str, state_names: Sequence[str]) -> None:
+    """Check that a vessel has a state that a manoeuvre observes.
 
-    def __init__(self, commands: Tensor) -> None:
-        super().__init__()
-        self.commands = commands
-
-    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        return replace_commands(self.commands[:, k].to(w.dtype), w), memory
-
-
-BatchParameters = dict[str, Tensor]
-"""Parameters or observed states of the rows of a batch by name, [B] or [B, n] each."""
-
-
-@final
-class ClosedLoopSource(Source):
-    """Closed-loop manoeuvres of one kind, one for each row of a batch."""
-
-    def __init__(self, manoeuvres: Sequence[ClosedLoopManoeuvre], helm: Helm, t: Tensor) -> None:
-        super().__init__()
-        self.manoeuvre_type = type(manoeuvres[0])
-        manoeuvre_parameters = [manoeuvre.law_parameters(helm) for manoeuvre in manoeuvres]
-        self.batch_parameters: BatchParameters = {
-            # lists of different length, such as the angles of spirals, are padded
-            name: torch.nn.utils.rnn.pad_sequence(
-                [torch.tensor(row[name], dtype=torch.float64) for row in manoeuvre_parameters],
-                batch_first=True,
-            )
-            if isinstance(manoeuvre_parameters[0][name], list)
-            else torch.tensor([row[name] for row in manoeuvre_parameters], dtype=torch.float64)
-            for name in manoeuvre_parameters[0]
-        }
-        self.batch_parameters["dt"] = t[1] - t[0]
-        self.state_columns = {
-            name: helm.state_column(name) for name in self.manoeuvre_type.observed_states
-        }
-        self.demand_commands = helm.commands_for
-        self.times = t.tolist()
-        self.can_stop = any(manoeuvre.end_condition is not None for manoeuvre in manoeuvres)
-
-    def initial(self, x: Tensor) -> Tensor:
-        return self.manoeuvre_type.initial_memory(*self._observe(x))
-
-    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m]; conditions are evaluated at the start of the step."""
-        motion, parameters = self._observe(x)
-        *demands, memory = self.manoeuvre_type.step_law(motion, parameters, self.times[k], memory)
-        return replace_commands(self.demand_commands(*demands), w), memory
-
-    def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Return whether the manoeuvre of each row has ended, [B] bool."""
-        return self.manoeuvre_type.has_ended(*self._observe(x), self.times[k], memory)
-
-    def _observe(self, x: Tensor) -> tuple[BatchParameters, BatchParameters]:
-        """Return the observed states, and the parameters in the precision of the states."""
-        motion = {name: x[:, column] for name, column in self.state_columns.items()}
-        return motion, {name: value.to(x.dtype) for name, value in self.batch_parameters.items()}
-
-
-@final
-class StackedSource(Source):
-    """Manoeuvres of several kinds in one batch; each source controls a block of rows."""
-
-    def __init__(self, sources: Sequence[Source], rows: Sequence[int]) -> None:
-        super().__init__()
-        self.sources: Sequence[Source] = torch.nn.ModuleList(sources)  # type: ignore[assignment]
-        self.row_counts = list(rows)
-        self.widths = [0] * len(self.row_counts)
-        self.can_stop = any(source.can_stop for source in sources)
-
-    def initial(self, x: Tensor) -> Tensor:
-        """Return the memories of all sources, padded to the widest, [B, k]."""
-        blocks = zip(self.sources, x.split(self.row_counts), strict=True)
-        memories = [source.initial(block) for source, block in blocks]
-        # a rollout has one memory tensor: narrower memories are padded
-        self.widths = [memory.shape[1] for memory in memories]
-        return torch.cat([self._pad_memory(memory, max(self.widths)) for memory in memories])
-
-    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m], each block of rows from its source."""
-        inputs = []
-        memories = []
-        for source, x_block, w_block, memory_block in zip(
-            self.sources,
-            x.split(self.row_counts),
-            w.split(self.row_counts),
-            self._split_memory(memory),
-            strict=True,
-        ):
-            source_inputs, next_memory = source(x_block, w_block, k, memory_block)
-            inputs.append(source_inputs)
-            memories.append(self._pad_memory(next_memory, memory.shape[1]))
-        return torch.cat(inputs), torch.cat(memories)
-
-    def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Return which rows [B] have finished, each block of rows by its source."""
-        blocks = zip(
-            self.sources, x.split(self.row_counts), self._split_memory(memory), strict=True
-        )
-        return torch.cat(
-            [
-                source.is_finished(x_block, k, memory_block)
-                for source, x_block, memory_block in blocks
-            ]
-        )
-
-    @staticmethod
-    def _pad_memory(memory: Tensor, width: int) -> Tensor:
-        return torch.nn.functional.pad(memory, (0, width - memory.shape[1]))
-
-    def _split_memory(self, memory: Tensor) -> list[Tensor]:
-        blocks = zip(memory.split(self.row_counts), self.widths, strict=True)
-        return [block[:, :width] for block, width in blocks]
-
-
-@final
-class StopRecorder(Source):
-    """A source that records the step at which each row stopped.
-
-    `stop_step` [B] is the number of this step; -1 for a row that did not stop.
+    Raises:
+        UsageError: if it has not.
     """
+    if name not in state_names:
+        raise UsageError(
+            f"the manoeuvre needs the state '{name}', which the vessel does not have; its"
+            f" states are {', '.join(state_names)}"
+        )
 
-    def __init__(self, source: Source, rows: int) -> None:
-        super().__init__()
-        self.source = source
-        self.can_stop = source.can_stop
-        self.stop_step = torch.full((rows,), -1)
 
-    def initial(self, x: Tensor) -> Tensor:
-        self.stop_step = torch.full((x.shape[0],), -1)
-        return self.source.initial(x)
+def require_dive(*, can_dive: bool) -> None:
+    """Check that a vessel can dive.
 
-    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        inputs_and_memory: tuple[Tensor, Tensor] = self.source(x, w, k, memory)
-        return inputs_and_memory
-
-    def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Return the rows that have stopped now or before."""
-        stops_now = self.source.is_finished(x, k, memory) & (self.stop_step < 0)
-        self.stop_step = torch.where(stops_now, k, self.stop_step)
-        return self.stop_step >= 0
+    Raises:
+        UsageError: if it cannot.
+    """
+    if not can_dive:
+        raise UsageError(
+            "the manoeuvre demands a dive, but the vessel cannot dive; give a vessel with"
+            " six degrees of freedom, or a manoeuvre without dive"
+        )
 
 
 class Manoeuvre(Config, ABC):
@@ -302,6 +189,16 @@ class Manoeuvre(Config, ABC):
     def marked_positions(self) -> Sequence[tuple[float, float]]:
         """Positions (north, east) in m that figures of the track mark, such as way-points."""
         return ()
+
+    def check_vessel(self, channels: PlantChannels) -> None:
+        """Check that a vessel has the states and commands that the manoeuvre needs.
+
+        The check of a config calls this; `build_source` checks the same at the start of a
+        simulation. The default accepts any vessel.
+
+        Raises:
+            UsageError: if the vessel lacks a state or a command.
+        """
 
     def duration_within(self, duration: float) -> float:
         """Return the duration of the manoeuvre in s, within trials of `duration` seconds."""
@@ -347,6 +244,10 @@ class ScheduledManoeuvre(Manoeuvre):
 
     @classmethod
     def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+        import torch
+
+        from residnet.manoeuvres.sources import ScheduleSource
+
         demands = [
             manoeuvre.demands_at(t)
             for manoeuvre in manoeuvres
@@ -366,7 +267,12 @@ class ClosedLoopManoeuvre(Manoeuvre):
     parameter_names: ClassVar[tuple[str, ...]] = ("drive", "start")
     """Attributes that are parameters of the control law without conversion."""
 
-    def law_parameters(self, helm: Helm) -> dict[str, Any]:
+    def check_vessel(self, channels: PlantChannels) -> None:
+        for name in self.observed_states:
+            require_state(name, channels.state_names)
+        self.law_parameters(channels)
+
+    def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
         """Return the parameters of the control law, numbers or lists of numbers."""
         return {name: getattr(self, name) for name in self.parameter_names}
 
@@ -390,10 +296,14 @@ class ClosedLoopManoeuvre(Manoeuvre):
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> Tensor:
         """Return whether each row has reached its goal, [B] bool."""
+        import torch
+
         return torch.zeros(len(memory), dtype=torch.bool)
 
     @classmethod
     def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+        from residnet.manoeuvres.sources import ClosedLoopSource
+
         return ClosedLoopSource(
             [m for m in manoeuvres if isinstance(m, ClosedLoopManoeuvre)], helm, t
         )
@@ -451,7 +361,7 @@ class SteeringConfig(Config):
         """Sign of the demanded steer or rudder, +1 or -1."""
         return -1.0 if (self.steer if self.steer is not None else self.rudder or 0.0) < 0 else 1.0
 
-    def steer_share(self, helm: Helm) -> float:
+    def steer_share(self, helm: RudderRange) -> float:
         """Return the share of full steer on a vessel.
 
         Raises:
@@ -461,7 +371,7 @@ class SteeringConfig(Config):
         return self.steer if self.steer is not None else rudder_share(self.rudder or 0.0, helm)
 
 
-def rudder_share(angle: float, helm: Helm) -> float:
+def rudder_share(angle: float, helm: RudderRange) -> float:
     """Return the share of full steer that commands a rudder angle [rad].
 
     Raises:

@@ -1,32 +1,39 @@
-"""Closed-loop manoeuvres: zigzag, turning circle, stopping, spiral, and manoeuvres in depth."""
+"""Manoeuvres that steer by the motion: zigzag, turning circle, stopping trial, spiral, and those
+in depth: helix, vertical zigzag and step.
+"""
 
 from __future__ import annotations
 
 import math
 from abc import ABC
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-import torch
 from pydantic import Field, model_validator
-from torch import Tensor
 
 from residnet.core.config import Config, Metres, Radians, Seconds
 from residnet.core.frames import to_level_axes
 from residnet.core.log import Log
 from residnet.manoeuvres import indices
 from residnet.manoeuvres.base import (
-    BatchParameters,
     ClosedLoopManoeuvre,
     Helm,
     Manoeuvre,
     ManoeuvreFamily,
     Range,
+    RudderRange,
     ScheduledManoeuvre,
     SteeringConfig,
+    require_dive,
     rudder_share,
     sample_uniform,
 )
+from residnet.physics.plant_channels import PlantChannels
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from residnet.manoeuvres.base import BatchParameters
 
 _FULL_RUDDER_DEG = 34.9
 """Rudder angle in deg above which the IMO limits of a turning circle apply (35 deg or maximum)."""
@@ -86,7 +93,7 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
                 return indices.zigzag_limits(nominal, length, speed)
         return {}
 
-    def law_parameters(self, helm: Helm) -> dict[str, Any]:
+    def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
         return super().law_parameters(helm) | {
             "steer": self.steer_share(helm),
             "bound": self.heading,
@@ -98,6 +105,8 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
     @classmethod
     def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
         """Return the side of the first execute, the current heading and zero reversals, [B, 3]."""
+        import torch
+
         psi = motion["psi"]
         return torch.stack((parameters["first"], psi, torch.zeros_like(psi)), dim=-1)
 
@@ -106,6 +115,8 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Reverse the steering if the heading has reached its bound."""
+        import torch
+
         command_sign, origin, count = memory.unbind(-1)
         # positive towards the current side of the steering
         heading_change = command_sign * parameters["sense"] * (motion["psi"] - origin)
@@ -178,11 +189,15 @@ class SteadyConfig(Config):
 
 def initial_steadiness(r: Tensor) -> Tensor:
     """Return the memory [B, 3] of a steady turn: mean of r, largest |r|, and time near the mean."""
+    import torch
+
     return torch.stack((r, r.abs(), torch.zeros_like(r)), dim=-1)
 
 
 def update_steadiness(r: Tensor, parameters: BatchParameters, memory: Tensor) -> Tensor:
     """Return the memory [B, 3] of a steady turn one step later, with yaw rate r [B]."""
+    import torch
+
     mean, max_rate, steady_time = memory.unbind(-1)
     mean = mean + (parameters["dt"] / parameters["window"]).clamp(max=1.0) * (r - mean)
     max_rate = torch.maximum(max_rate, r.abs())
@@ -199,6 +214,8 @@ def is_steady(parameters: BatchParameters, memory: Tensor) -> Tensor:
 
 def reset_steady_time(memory: Tensor, is_restarted: Tensor) -> Tensor:
     """Return the memory of a steady turn with the steady time set to zero in rows [B] bool."""
+    import torch
+
     return torch.cat(
         (memory[:, :2], memory[:, 2:].masked_fill(is_restarted.unsqueeze(-1), 0.0)), dim=-1
     )
@@ -245,13 +262,15 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
         is_full_rudder = share > 0.999 or angle > _FULL_RUDDER_DEG
         return indices.turning_limits(length) if is_full_rudder else {}
 
-    def law_parameters(self, helm: Helm) -> dict[str, Any]:
+    def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
         phase_parameters = {"steer": self.steer_share(helm), "after": 1.0 if self.pull_out else 2.0}
         return super().law_parameters(helm) | phase_parameters | dict(self.steady)
 
     @classmethod
     def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
         """Return the memory [B, 5] at the current heading, in the approach."""
+        import torch
+
         psi = motion["psi"]
         return torch.cat(
             (torch.stack((psi, psi * 0.0), -1), initial_steadiness(motion["r"])), dim=-1
@@ -262,6 +281,8 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Command the helm until the heading has changed, then amidships until r is steady."""
+        import torch
+
         origin = memory[:, 0]
         phase = memory[:, 1]
         steadiness = update_steadiness(motion["r"], parameters, memory[:, 2:])
@@ -344,6 +365,8 @@ class Stopping(ClosedLoopManoeuvre):
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Command astern drive after the order."""
+        import torch
+
         drive = torch.where(time >= parameters["start"], parameters["astern"], parameters["drive"])
         return drive, torch.zeros_like(drive), memory
 
@@ -424,7 +447,7 @@ class Spiral(ClosedLoopManoeuvre):
             spiral_indices["loop_height"] = max(amidships_rates) - min(amidships_rates)
         return spiral_indices
 
-    def law_parameters(self, helm: Helm) -> dict[str, Any]:
+    def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
         shares = [rudder_share(a, helm) if self.rudders else a for a in self.helm_angles]
         # after the last angle the helm goes amidships
         spiral_parameters = {"shares": [*shares, 0.0], "count": float(len(shares))}
@@ -432,6 +455,8 @@ class Spiral(ClosedLoopManoeuvre):
 
     @classmethod
     def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
+        import torch
+
         return torch.cat(
             (torch.zeros_like(motion["r"])[:, None], initial_steadiness(motion["r"])), dim=-1
         )
@@ -441,6 +466,8 @@ class Spiral(ClosedLoopManoeuvre):
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Advance to the next angle if the turn is steady."""
+        import torch
+
         is_steering = time >= parameters["start"]
         steadiness = reset_steady_time(
             update_steadiness(motion["r"], parameters, memory[:, 1:]), ~is_steering
@@ -476,7 +503,12 @@ class Helix(ScheduledManoeuvre):
     dive: float = Field(ge=-1, le=1)
     start: Seconds = Field(default=5.0, ge=0)
 
+    def check_vessel(self, channels: PlantChannels) -> None:
+        require_dive(can_dive=channels.can_dive)
+
     def demands_at(self, t: Tensor) -> tuple[Tensor, ...]:
+        import torch
+
         is_steering = (t >= self.start - 1e-9).to(t.dtype)
         return torch.full_like(t, self.drive), self.steer * is_steering, self.dive * is_steering
 
@@ -538,7 +570,11 @@ class VerticalZigzag(ClosedLoopManoeuvre):
     depth: Metres = Field(gt=0)
     start: Seconds = Field(default=5.0, ge=0)
 
-    def law_parameters(self, helm: Helm) -> dict[str, Any]:
+    def check_vessel(self, channels: PlantChannels) -> None:
+        super().check_vessel(channels)
+        require_dive(can_dive=channels.can_dive)
+
+    def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
         first_sign = -1.0 if self.dive < 0 else 1.0
         dive_parameters = {"dive": abs(self.dive), "first": first_sign, "bound": self.depth}
         return super().law_parameters(helm) | dive_parameters
@@ -546,6 +582,8 @@ class VerticalZigzag(ClosedLoopManoeuvre):
     @classmethod
     def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
         """Return the sign of the first dive and the current depth, [B, 2]."""
+        import torch
+
         return torch.stack((parameters["first"], motion["z"]), dim=-1)
 
     @classmethod
@@ -553,6 +591,8 @@ class VerticalZigzag(ClosedLoopManoeuvre):
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, ...]:
         """Reverse the dive if the depth has reached its bound."""
+        import torch
+
         dive_sign, origin = memory.unbind(-1)
         dive_sign = torch.where(
             dive_sign * (motion["z"] - origin) >= parameters["bound"], -dive_sign, dive_sign
@@ -606,6 +646,10 @@ class DepthStep(ClosedLoopManoeuvre):
     damping: float = Field(default=1.0, ge=0)
     pitch_damping: float = Field(default=1.0, ge=0)
 
+    def check_vessel(self, channels: PlantChannels) -> None:
+        super().check_vessel(channels)
+        require_dive(can_dive=channels.can_dive)
+
     @classmethod
     def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
         """Return the current depth, [B, 1]."""
@@ -616,6 +660,8 @@ class DepthStep(ClosedLoopManoeuvre):
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, ...]:
         """Return the dive demand: proportional to the depth error, damped by the depth rate."""
+        import torch
+
         ordered_change = torch.where(time >= parameters["start"], parameters["depth"], 0.0)
         depth_error = memory[:, 0] + ordered_change - motion["z"]
         descent = to_level_axes(*(motion[name] for name in ("u", "v", "w", "phi", "theta")))[2]

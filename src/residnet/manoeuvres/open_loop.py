@@ -1,4 +1,4 @@
-"""Open-loop manoeuvres: constant inputs, steps, random steps, multi-sines and replays.
+"""Manoeuvres of demands that are known in advance: steps, levels, random steps, sines, replays.
 
 Source: document 003 section 4.2.2.
 """
@@ -9,27 +9,30 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import product
-from typing import Annotated, Any, Literal, final
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-import torch
 from pydantic import AfterValidator, Field, PrivateAttr, model_validator
-from torch import Tensor
 
 from residnet.core.config import Config, ExistingPath, Hertz, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES, VELOCITY_NAMES, suggest_name
-from residnet.engine.rollout import Source
 from residnet.manoeuvres.base import (
     Helm,
     Manoeuvre,
     ManoeuvreFamily,
     Range,
     ScheduledManoeuvre,
-    ScheduleSource,
+    require_dive,
     sample_uniform,
 )
+from residnet.physics.plant_channels import PlantChannels
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from residnet.engine.rollout import Source
 
 
 class ConstantInput(ScheduledManoeuvre):
@@ -45,6 +48,8 @@ class ConstantInput(ScheduledManoeuvre):
     steer: float = Field(ge=-1, le=1)
 
     def demands_at(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        import torch
+
         return torch.full_like(t, self.drive), torch.full_like(t, self.steer)
 
 
@@ -85,6 +90,8 @@ class AccelerationDeceleration(ScheduledManoeuvre):
 
     def demands_at(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Return the stepped drive [T], zero before the first time; zero steer [T]."""
+        import torch
+
         index = torch.searchsorted(torch.tensor(self.times, dtype=t.dtype), t, right=True)
         return torch.tensor((0.0, *self.levels), dtype=t.dtype)[index], torch.zeros_like(t)
 
@@ -144,6 +151,8 @@ class ThreeTwoOneOne(ScheduledManoeuvre):
     repeat: bool = True
 
     def demands_at(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        import torch
+
         # rounding of the grid times must not select the previous unit
         unit_index = torch.floor((t - self.start) / self.unit + 1e-9).long()
         pattern = torch.tensor(_STEP_PATTERN, dtype=t.dtype)
@@ -223,12 +232,20 @@ class Excitation(ScheduledManoeuvre, ABC):
 
     def _delayed_wave(self, t: Tensor, wave_index: int) -> Tensor:
         """Return a wave [T] at times t [T] in s, zero before the start."""
+        import torch
+
         wave = self._demand_wave((t - self.start).clamp(min=0.0), wave_index)
         return torch.where(t >= self.start - 1e-9, wave, torch.zeros_like(t))
 
     def demands_at(self, t: Tensor) -> tuple[Tensor, Tensor]:
         drive = self.drive + self.drive_amplitude * self._delayed_wave(t, _DRIVE)
         return drive.clamp(-1.0, 1.0), self.steer_amplitude * self._delayed_wave(t, _STEER)
+
+    def check_vessel(self, channels: PlantChannels) -> None:
+        if self.dive_amplitude:
+            require_dive(can_dive=channels.can_dive)
+        if self.sway_amplitude:
+            _require_side_force(channels.max_side_force, channels.input_names)
 
     @classmethod
     def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
@@ -237,18 +254,17 @@ class Excitation(ScheduledManoeuvre, ABC):
         Raises:
             UsageError: if a sway force is demanded of a vessel whose commands are not forces.
         """
+        import torch
+
+        from residnet.manoeuvres.sources import ScheduleSource
+
         excitations = [manoeuvre for manoeuvre in manoeuvres if isinstance(manoeuvre, Excitation)]
         drive, steer = map(torch.stack, zip(*(m.demands_at(t) for m in excitations), strict=True))
         dive = torch.stack([m.dive_amplitude * m._delayed_wave(t, _DIVE) for m in excitations])
         commands = helm.commands_for(drive, steer, *([dive] if bool(dive.any()) else []))
         sway = torch.stack([m.sway_amplitude * m._delayed_wave(t, _SWAY) for m in excitations])
         if bool(sway.any()):
-            max_side_force = helm.side_force
-            if max_side_force is None or "tau_y" not in helm.inputs:
-                raise UsageError(
-                    "sway_amplitude: a manoeuvre demands a sway force, but the commands of the"
-                    f" vessel, {', '.join(helm.inputs[:2])}, are not forces; remove it"
-                )
+            max_side_force = _require_side_force(helm.side_force, helm.inputs)
             commands[..., helm.inputs.index("tau_y")] += max_side_force * sway
         if any(m.own_amplitude for m in excitations):
             full_commands = helm.demand(
@@ -266,6 +282,20 @@ class Excitation(ScheduledManoeuvre, ABC):
         return ScheduleSource(commands)
 
 
+def _require_side_force(max_side_force: float | None, input_names: Sequence[str]) -> float:
+    """Return the largest sway force in N.
+
+    Raises:
+        UsageError: if the commands of the vessel are no forces.
+    """
+    if max_side_force is None or "tau_y" not in input_names:
+        raise UsageError(
+            "sway_amplitude: a manoeuvre demands a sway force, but the commands of the"
+            f" vessel, {', '.join(input_names[:2])}, are not forces; remove it"
+        )
+    return max_side_force
+
+
 class RandomSteps(Excitation):
     """Steps of drive and steer to random levels.
 
@@ -276,6 +306,8 @@ class RandomSteps(Excitation):
     kind: Literal["random_steps"] = "random_steps"
 
     def _demand_wave(self, t: Tensor, wave_index: int) -> Tensor:
+        import torch
+
         generator = np.random.default_rng([self.seed, wave_index])
         duration = float(t[-1])
         times = [0.0]
@@ -302,6 +334,8 @@ class MultiSine(Excitation):
     tones: int = Field(default=8, ge=2, le=200)
 
     def _demand_wave(self, t: Tensor, wave_index: int) -> Tensor:
+        import torch
+
         # frequencies are assigned to the demands in turn
         n_demands = 3 if self.sway_amplitude else 2
         n_demands = max(n_demands, wave_index + 1)
@@ -477,6 +511,8 @@ class Replay(Manoeuvre):
         Raises:
             UsageError: if the log lacks a command.
         """
+        import torch
+
         no_demand = torch.zeros(1, dtype=torch.float64)
         n_commands = helm.demand(no_demand, no_demand).shape[-1]
         log_time = self.recorded.t - self.recorded.t[0]
@@ -523,19 +559,10 @@ class Replay(Manoeuvre):
 
     @classmethod
     def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+        import torch
+
+        from residnet.manoeuvres.sources import RecordedSource
+
         return RecordedSource(
             torch.stack([m.recorded_inputs(helm, t) for m in manoeuvres if isinstance(m, Replay)])
         )
-
-
-@final
-class RecordedSource(Source):
-    """A source of prescribed inputs [B, T, m]; NaN entries are taken from the environment."""
-
-    def __init__(self, values: Tensor) -> None:
-        super().__init__()
-        self.values = values
-
-    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        recorded_inputs = self.values[:, k].to(w.dtype)
-        return torch.where(torch.isnan(recorded_inputs), w, recorded_inputs), memory

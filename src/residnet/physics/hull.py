@@ -6,25 +6,26 @@ document 000 eqs. (6.6)-(6.8), corrections H1 to H5; document 004, section 5.2 w
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, final
 
-import torch
+import numpy as np
 from pydantic import AfterValidator, Field
-from torch import Tensor
 
 from residnet.core.config import Config, MetresPerSecond
+from residnet.core.layout import PLANAR_LAYOUT, ROLLING_LAYOUT, SUBMERGED_LAYOUT, StateLayout
 from residnet.core.names import VELOCITY_NAMES
 from residnet.physics.actuators import (
-    ActuatorConfig,
     ActuatorsConfig,
     RollingActuatorsConfig,
     SubmergedActuatorsConfig,
 )
-from residnet.physics.environment import GRAVITY, WindLoadsConfig
+from residnet.physics.actuators.config import ActuatorConfig, ServoSpec
+from residnet.physics.actuators.thrusters_config import AzimuthThrustersConfig, ForceCommandsConfig
+from residnet.physics.environment_config import WindLoadsConfig
 from residnet.physics.parameters import (
+    GRAVITY,
     Inertia,
     Length,
     Mass,
@@ -37,9 +38,16 @@ from residnet.physics.parameters import (
     parse_dimension,
     require_dimension,
 )
-from residnet.physics.plant import ROLLING_LAYOUT, SUBMERGED_LAYOUT, Hull, HullPlant
+from residnet.physics.plant_channels import (
+    PlantChannels,
+    list_exogenous_inputs,
+    require_invertible_mass,
+)
 from residnet.physics.terms import parse_axis_terms
 from residnet.physics.vessel_file import VesselFile
+
+if TYPE_CHECKING:
+    from residnet.physics.plant import Hull, HullPlant
 
 _METRE_POWER = {"X": 1, "Y": 1, "Z": 1, "K": 2, "M": 2, "N": 2, "u": 1, "v": 1, "r": 0}
 """Exponent of metre in the unit of the force or acceleration of each axis."""
@@ -143,6 +151,20 @@ def coefficient_rows(
     ]
 
 
+class HullCoefficients(NamedTuple):
+    """Coefficients of a hull M nu_dot = terms(motion) C + tau.
+
+    Attributes:
+        mass: mass matrix M with added mass [n][n].
+        force_rows: coefficients of the force of each axis by term; those of damping are negative.
+        channels: channels of the motion: velocities, then phi with roll and theta with pitch.
+    """
+
+    mass: list[list[float]]
+    force_rows: list[dict[str, float]]
+    channels: tuple[str, ...]
+
+
 class HullVessel(VesselFile, ABC):
     """Vessel with hull, actuators and wind loads.
 
@@ -156,13 +178,46 @@ class HullVessel(VesselFile, ABC):
     actuators: ActuatorConfig
     wind: WindLoadsConfig | None = None
 
+    layout: ClassVar[StateLayout] = PLANAR_LAYOUT
+    """Pose and velocities of the hull."""
+
     @abstractmethod
+    def hull_coefficients(self) -> HullCoefficients:
+        """Return mass and force coefficients of the hull."""
+
+    @final
     def build_hull(self) -> Hull:
         """Build the hull.
 
         Raises:
             ConfigError: if the mass matrix is not positive definite or is singular.
         """
+        from residnet.physics.plant import Hull
+
+        coefficients = self.hull_coefficients()
+        return Hull(coefficients.mass, coefficients.force_rows, coefficients.channels, self.name)
+
+    @final
+    def check_parameters(self) -> None:
+        require_invertible_mass(self.hull_coefficients().mass, self.name)
+
+    @final
+    def servo_specs(self) -> tuple[ServoSpec, ...]:
+        return self.actuators.servo_specs()
+
+    @final
+    def plant_channels(self) -> PlantChannels:
+        actuators = self.actuators
+        servo_states = tuple(name for spec in actuators.servo_specs() for name in spec.state_names)
+        return PlantChannels(
+            self.layout.state_names + servo_states,
+            actuators.command_names(),
+            list_exogenous_inputs(self.layout, has_wind=self.wind is not None),
+            actuators.max_rudder,
+            actuators.can_dive,
+            isinstance(actuators, ForceCommandsConfig | AzimuthThrustersConfig),
+            actuators.y_max if isinstance(actuators, ForceCommandsConfig) else None,
+        )
 
     def initial_speeds(self) -> Mapping[str, float]:
         """Return the nonzero initial states of trials by name."""
@@ -170,6 +225,8 @@ class HullVessel(VesselFile, ABC):
 
     @final
     def build(self) -> HullPlant:
+        from residnet.physics.plant import HullPlant
+
         return HullPlant(
             self.build_hull(), self.actuators.build(), self.wind, self.initial_speeds()
         )
@@ -199,8 +256,8 @@ class HullConfig(HullVessel, ABC):
         """Return the coefficient of r in the sway momentum of C(nu), in kg m, without the scale."""
 
     @final
-    def build_hull(self) -> Hull:
-        """Build the hull with the skew-symmetric Coriolis matrix of the mass matrix (Fossen).
+    def hull_coefficients(self) -> HullCoefficients:
+        """Return the coefficients with the skew-symmetric Coriolis matrix of the mass (Fossen).
 
         Coriolis forces of a symmetric mass matrix do no work.
         """
@@ -226,7 +283,7 @@ class HullConfig(HullVessel, ABC):
         ):
             for term, value in coriolis.items():
                 axis_coefficients[term] = axis_coefficients.get(term, 0.0) + value
-        return Hull(mass, coefficients, VELOCITY_NAMES, self.name)
+        return HullCoefficients(mass, coefficients, VELOCITY_NAMES)
 
 
 @final
@@ -342,20 +399,15 @@ class AccelerationHullConfig(HullVessel):
     terms: AccelerationRows
     actuators: ActuatorsConfig
 
-    def build_hull(self) -> Hull:
-        """Build the hull, whose masses are the reciprocals of the gains."""
+    def hull_coefficients(self) -> HullCoefficients:
+        """Return the coefficients, whose masses are the reciprocals of the gains."""
         # the terms are accelerations: multiplied by the mass they are forces, and the mass cancels
         mass = [1.0 / gain.value for gain in (self.gains.x, self.gains.y, self.gains.n)]
         force_rows = [
             {term: m * value for term, value in acceleration_row.items()}
             for m, acceleration_row in zip(mass, coefficient_rows(self.terms), strict=True)
         ]
-        return Hull(
-            torch.diag(torch.tensor(mass, dtype=torch.float64)).tolist(),
-            force_rows,
-            VELOCITY_NAMES,
-            self.name,
-        )
+        return HullCoefficients(np.diag(mass).tolist(), force_rows, VELOCITY_NAMES)
 
 
 class RollingBody(RigidBody):
@@ -420,6 +472,7 @@ class RollingHullConfig(HullVessel):
         forces: terms of the hydrodynamic forces; coefficients of damping are negative.
     """
 
+    layout: ClassVar[StateLayout] = ROLLING_LAYOUT
     kind: Literal["patrol"]
     speed: MetresPerSecond = Field(gt=0)
     hydrostatics: Hydrostatics
@@ -432,8 +485,8 @@ class RollingHullConfig(HullVessel):
         """Return the service speed, at which the thrust of the source balances the resistance."""
         return {"u": self.speed}
 
-    def build_hull(self) -> Hull:
-        """Build the hull with the rigid-body inertia about the origin (document 004 eq. (5.12)).
+    def hull_coefficients(self) -> HullCoefficients:
+        """Return the coefficients with the inertia about the origin (document 004 eq. (5.12)).
 
         Coriolis forces of the added mass are included only as terms of the source (X_vr).
         """
@@ -475,7 +528,7 @@ class RollingHullConfig(HullVessel):
         for axis_coefficients, added_terms in zip(coefficients, inertial_terms, strict=True):
             for term, value in added_terms.items():
                 axis_coefficients[term] = axis_coefficients.get(term, 0.0) + value
-        return Hull(mass, coefficients, ROLLING_CHANNELS, self.name)
+        return HullCoefficients(mass, coefficients, ROLLING_CHANNELS)
 
 
 class SubmergedBody(RollingBody):
@@ -538,6 +591,7 @@ class SubmergedHullConfig(HullVessel):
         speed: initial speed of trials.
     """
 
+    layout: ClassVar[StateLayout] = SUBMERGED_LAYOUT
     kind: Literal["submerged"]
     speed: MetresPerSecond = Field(default=0.0, ge=0)
     buoyancy: Buoyancy
@@ -549,8 +603,8 @@ class SubmergedHullConfig(HullVessel):
     def initial_speeds(self) -> Mapping[str, float]:
         return {"u": self.speed}
 
-    def build_hull(self) -> Hull:
-        """Build the hull with mass, Coriolis forces, weight and buoyancy.
+    def hull_coefficients(self) -> HullCoefficients:
+        """Return the coefficients with mass, Coriolis forces, weight and buoyancy.
 
         With linear momentum l and angular momentum h, the Coriolis force is -w x l and the moment
         is -v x l - w x h (Kirchhoff; Fossen 2021, section 6.3). Weight and buoyancy act along the
@@ -560,14 +614,9 @@ class SubmergedHullConfig(HullVessel):
         added_mass = self.added_mass
         buoyancy = self.buoyancy
         m, x, z = (parameter.value for parameter in (rigid_body.m, rigid_body.x_G, rigid_body.z_G))
-        mass = torch.diag(
-            torch.tensor(
-                [m, m, m, rigid_body.I_x.value, rigid_body.I_y.value, rigid_body.I_z.value],
-                dtype=torch.float64,
-            )
-            - torch.tensor(
-                [parameter.value for parameter in dict(added_mass).values()], dtype=torch.float64
-            )
+        mass = np.diag(
+            np.array([m, m, m, rigid_body.I_x.value, rigid_body.I_y.value, rigid_body.I_z.value])
+            - np.array([parameter.value for parameter in dict(added_mass).values()])
         )
         # the centre of gravity (x, 0, z) couples forces and moments: blocks -m S(r_G) and m S(r_G)
         for force, moment, lever in ((0, 4, z), (1, 3, -z), (1, 5, x), (2, 4, -x)):
@@ -613,43 +662,9 @@ class SubmergedHullConfig(HullVessel):
             add_term(3 + axis, vertical_direction[b], signs[b] * levers[a])
             add_term(3 + axis, vertical_direction[a], -signs[a] * levers[b])
         channels = (*SUBMERGED_LAYOUT.velocities, "phi", "theta")
-        return Hull(mass.tolist(), coefficients, channels, self.name)
+        return HullCoefficients(mass.tolist(), coefficients, channels)
 
 
 def _format_velocity_product(a: str, b: str) -> str:
     """Format the product of two velocities in a fixed order."""
     return f"{a}^2" if a == b else " ".join(sorted((a, b), key=SUBMERGED_LAYOUT.velocities.index))
-
-
-SpeedRegime = Literal["displacement", "semi_displacement", "planing"]
-SPEED_REGIMES: tuple[SpeedRegime, ...] = ("displacement", "semi_displacement", "planing")
-REGIME_BOUNDARIES = (0.4, 1.0)
-"""Froude numbers at the boundaries of the speed regimes (document 000, appendix D).
-
-In the document, planing begins between 1.0 and 1.2.
-"""
-
-
-def compute_froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
-    """Compute the Froude number sqrt(u^2 + v^2) / sqrt(g L) (9.10), any shape.
-
-    Args:
-        u: surge velocity in m/s.
-        v: sway velocity in m/s.
-        length: length of the hull in m.
-
-    Raises:
-        ValueError: if the length is not positive.
-    """
-    if not length > 0:
-        raise ValueError(f"the Froude number needs a positive length of the hull, got {length:g} m")
-    return torch.hypot(u, v) / math.sqrt(GRAVITY * length)
-
-
-def classify_speed_regime(froude: Tensor) -> Tensor:
-    """Return the index in `SPEED_REGIMES` at each Froude number, integers of the same shape.
-
-    A Froude number on a boundary belongs to the regime above it.
-    """
-    edges = torch.tensor(REGIME_BOUNDARIES, dtype=froude.dtype, device=froude.device)
-    return torch.bucketize(froude, edges, right=True)

@@ -126,3 +126,7 @@ def format_unit(metres: int, seconds: int, mass: int = 1) -> str:
 
     numerator = format_powers(1) or (["1"] if format_powers(-1) else ["-"])
     return " ".join(numerator) + "".join(f"/{name}" for name in format_powers(-1))
+
+
+GRAVITY = 9.81
+"""Acceleration of gravity in m/s^2."""

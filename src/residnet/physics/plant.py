@@ -9,27 +9,15 @@ from typing import Self, final
 import torch
 from torch import Tensor, nn
 
-from residnet.core.errors import ConfigError
 from residnet.core.frames import cross_product, horizontal_to_body, to_body, to_earth, to_level_axes
-from residnet.core.layout import PLANAR_LAYOUT, StateLayout
-from residnet.core.names import WIND_INPUTS
-from residnet.physics.actuators import ActuatorSystem
-from residnet.physics.environment import WindLoadConfig
-from residnet.physics.terms import TermLibrary
+from residnet.core.layout import PLANAR_LAYOUT, ROLLING_LAYOUT, SUBMERGED_LAYOUT
+from residnet.physics.actuators.base import ActuatorSystem
+from residnet.physics.environment_config import WindLoadConfig
+from residnet.physics.plant_channels import list_exogenous_inputs, require_invertible_mass
+from residnet.physics.term_library import TermLibrary
 
-ROLLING_LAYOUT = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))
-"""Surge, sway, roll and yaw, without heave and pitch (document 004 and its corrections)."""
-SUBMERGED_LAYOUT = StateLayout(
-    ("x", "y", "z", "phi", "theta", "psi"), ("u", "v", "w", "p", "q", "r")
-)
-"""Six degrees of freedom, z is the depth."""
 _LAYOUT_OF_DOF = {
     layout.n_dof: layout for layout in (PLANAR_LAYOUT, ROLLING_LAYOUT, SUBMERGED_LAYOUT)
-}
-_FORCE_AXES_OF_DOF = {
-    PLANAR_LAYOUT.n_dof: ("x", "y", "n"),
-    ROLLING_LAYOUT.n_dof: ("x", "y", "k", "n"),
-    SUBMERGED_LAYOUT.n_dof: ("x", "y", "z", "k", "m", "n"),
 }
 
 
@@ -94,20 +82,7 @@ def invert_mass(mass: Tensor, vessel: str) -> Tensor:
     Raises:
         ConfigError: if an eigenvalue has no positive real part, or the matrix is nearly singular.
     """
-    # identified mass matrices may be asymmetric, so that the eigenvalues can be complex
-    if bool((torch.linalg.eigvals(mass).real <= 0).any()):
-        raise ConfigError(
-            f"vessel {vessel}: the mass matrix is not positive definite; added mass (X_udot,"
-            " Y_vdot, N_rdot) is negative for a hull"
-        )
-    # scaled to unit diagonal, because kg and kg m^2 cannot be compared
-    scale = mass.diagonal().sqrt()
-    condition = float(torch.linalg.cond(mass / torch.outer(scale, scale)))
-    if condition > 1e8:
-        raise ConfigError(
-            f"vessel {vessel}: the mass matrix is singular (condition {condition:.1e} after"
-            " scaling); check the coupling terms x_G, Y_rdot, N_vdot"
-        )
+    require_invertible_mass(mass.tolist(), vessel)
     inverse: Tensor = torch.linalg.inv(mass)
     return inverse
 
@@ -227,12 +202,7 @@ class HullPlant(Plant):
         self.n_commands = len(actuators.command_names)
         self.input_names = (
             *actuators.command_names,
-            *(f"force_{axis}" for axis in _FORCE_AXES_OF_DOF[self.n_dof]),
-            "current_north",
-            "current_east",
-            "force_north",
-            "force_east",
-            *(WIND_INPUTS if wind is not None else ()),
+            *list_exogenous_inputs(_LAYOUT_OF_DOF[self.n_dof], has_wind=wind is not None),
         )
         self.initial_values = {
             self.state_names.index(n): value

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import final
 
+from residnet.core.errors import ConfigError
 from residnet.core.layout import SURGE_SWAY_YAW, DegreesOfFreedom
 from residnet.core.names import port_starboard_pairs
 from residnet.physics.terms import EVEN_FUNCTIONS, Factor, parse_term
@@ -149,6 +150,21 @@ def mirror_channels(names: Sequence[str]) -> tuple[list[int], list[float]] | Non
     ]
     known_signs = [float(sign) for sign in signs if sign is not None]
     return (index, known_signs) if len(known_signs) == len(names) else None
+
+
+def require_mirror_image(names: Sequence[str]) -> tuple[list[int], list[float]]:
+    """Return the mirror image of channels as source column and sign of each channel.
+
+    Raises:
+        ConfigError: if the image of a channel is unknown.
+    """
+    mirror = mirror_channels(names)
+    if mirror is None:
+        raise ConfigError(
+            f"mirror: the mirror image of some of the channels {', '.join(names)} is unknown"
+            " (the torque of a single propeller heels a vessel with roll); remove `mirror`"
+        )
+    return mirror
 
 
 def mirror_terms(terms: Sequence[str], names: Sequence[str]) -> dict[int, tuple[int, int]] | None:

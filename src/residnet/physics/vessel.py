@@ -11,7 +11,7 @@ from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.core.names import suggest_name
 from residnet.core.registry import find_vessel_files
-from residnet.physics.abkowitz import AbkowitzConfig
+from residnet.physics.abkowitz_config import AbkowitzConfig
 from residnet.physics.hull import (
     AccelerationHullConfig,
     FossenConfig,
@@ -19,7 +19,11 @@ from residnet.physics.hull import (
     RollingHullConfig,
     SubmergedHullConfig,
 )
-from residnet.physics.nomoto import NomotoConfig, SecondOrderNomotoConfig, SideslipNomotoConfig
+from residnet.physics.nomoto_config import (
+    NomotoConfig,
+    SecondOrderNomotoConfig,
+    SideslipNomotoConfig,
+)
 
 __all__ = ["AnyVessel", "VesselConfig", "VesselName", "find_vessel_files", "load_vessel"]
 

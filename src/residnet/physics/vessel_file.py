@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import ValidationInfo, model_validator
 
@@ -12,8 +12,12 @@ from residnet.core.config import Config, load_mapping
 from residnet.core.errors import ConfigError
 from residnet.core.names import suggest_name
 from residnet.core.registry import find_vessel_files
+from residnet.physics.actuators.config import ServoSpec
 from residnet.physics.parameters import Length, Positive
-from residnet.physics.plant import Plant
+from residnet.physics.plant_channels import PlantChannels
+
+if TYPE_CHECKING:
+    from residnet.physics.plant import Plant
 
 
 class VesselFile(Config, ABC):
@@ -35,6 +39,21 @@ class VesselFile(Config, ABC):
     @classmethod
     def _apply_base(cls, data: Any, info: ValidationInfo) -> Any:
         return merge_with_base(data, (info.context or {}).get("folder"))
+
+    @abstractmethod
+    def plant_channels(self) -> PlantChannels:
+        """Return the states and inputs of the plant."""
+
+    @abstractmethod
+    def servo_specs(self) -> tuple[ServoSpec, ...]:
+        """Return the servos of the actuators."""
+
+    def check_parameters(self) -> None:
+        """Check that the plant can be built.
+
+        Raises:
+            ConfigError: if the parameters are invalid, for example a singular mass matrix.
+        """
 
     @abstractmethod
     def build(self) -> Plant:

@@ -10,7 +10,8 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from residnet.preprocessing.windows import WINDOW_COLUMNS, WindowStage, WindowStore
+from residnet.preprocessing.window_index import WINDOW_COLUMNS, WindowStage
+from residnet.preprocessing.windows import WindowStore, make_samplers
 
 
 class EpochDataModule(L.LightningDataModule, ABC):
@@ -142,7 +143,7 @@ class WindowsDataModule(EpochDataModule):
         # a method, because spawned processes receive it pickled
         self._get_stage = get_stage or self._single_stage
         self._samplers = [
-            stage_settings.make_samplers(store, n_batches) if stage_settings else []
+            make_samplers(stage_settings, store, n_batches) if stage_settings else []
             for stage_settings in self.stages
         ]
 

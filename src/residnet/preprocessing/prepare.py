@@ -7,18 +7,15 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from pydantic import Field
 
 from residnet.core.arrays import paged
-from residnet.core.columns import with_depth_rate
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
 from residnet.core.layout import POSE, SURGE_SWAY_YAW, DegreesOfFreedom
 from residnet.core.log import Log
-from residnet.core.samples import Samples
+from residnet.core.sample_origins import SampleOrigins
 from residnet.core.stretches import number_runs
-from residnet.physics.signals import Signals
 from residnet.preprocessing.align import GridConfig, align_to_grid
 from residnet.preprocessing.channel_values import SPIKE_REASON, bridge_spikes, is_implausible
 from residnet.preprocessing.derivatives import DerivativeConfig, SavitzkyGolay
@@ -234,6 +231,11 @@ def prepare_log(
     if dof.has_roll:
         # the derivative of an angle follows from the kinematics
         nu = smoothed[:, dof.dynamic_columns]
+        # roll is rare: planar logs are prepared, and configs checked, without PyTorch
+        import torch
+
+        from residnet.core.columns import with_depth_rate
+
         kinematic_rates = nu @ dof.angle_rate_matrix().numpy()
         if dof.is_six_dof:
             kinematic_rates = with_depth_rate(
@@ -258,70 +260,33 @@ def _step_means(w: np.ndarray, segment: np.ndarray) -> np.ndarray:
     return means
 
 
-def compute_channels(
-    log: PreparedLog, signals: Signals, is_selected: np.ndarray | None = None
-) -> torch.Tensor:
-    """Compute the channels z [T, nz] of a model at the samples of a log.
-
-    States are smoothed, and inputs are those of the derivatives (`PreparedLog.rate_inputs`): the
-    derivative at an instant depends on the inputs at that instant, whereas a rollout uses the
-    inputs over each step (`PreparedLog.w`). Comparisons with measured accelerations use these
-    channels.
-
-    Args:
-        log: prepared log.
-        signals: signals of the model, float64.
-        is_selected: selected samples [T] bool; None for all, with 0 in gaps.
-    """
-    states = log.smoothed
-    inputs = log.rate_inputs
-    states, inputs = (
-        (np.nan_to_num(states), np.nan_to_num(inputs))
-        if is_selected is None
-        else (states[is_selected], inputs[is_selected])
-    )
-    with torch.no_grad():
-        channel_values: torch.Tensor = signals(
-            torch.from_numpy(states), signals.prepare(torch.from_numpy(inputs))
-        )
-    return channel_values
-
-
-def make_samples(logs: Sequence[PreparedLog], signals: Signals) -> Samples:
-    """Collect the trainable samples of prepared logs, float64.
-
-    The samples contain smoothed channels and measured accelerations.
+def require_trainable(logs: Sequence[PreparedLog]) -> None:
+    """Check that some log has a trainable sample.
 
     Raises:
-        DataError: if no log has trainable samples.
+        DataError: if none has.
     """
     if not any(log.trainable.any() for log in logs):
         raise DataError(
             f"none of {len(logs)} training logs has a trainable sample; check whether the logs are"
             " shorter than the window of the derivative"
         )
-    n_trainable = [int(log.trainable.sum()) for log in logs]
-    n_samples = sum(n_trainable)
-    dof = logs[0].dof
-    channel_values, target, time = (
-        paged.allocate_rows(n_samples, *shape)
-        for shape in ((len(signals.names),), (dof.n_dynamic,), ())
+
+
+def find_sample_origins(logs: Sequence[PreparedLog]) -> SampleOrigins:
+    """Return manoeuvre and time of the trainable samples of prepared logs.
+
+    Raises:
+        DataError: if no log has trainable samples.
+    """
+    require_trainable(logs)
+    return SampleOrigins(
+        np.concatenate(
+            [np.full(int(log.trainable.sum()), index) for index, log in enumerate(logs)]
+        ),
+        np.concatenate([log.log.t[log.trainable] - log.log.t[0] for log in logs]),
+        tuple(log.log.manoeuvre for log in logs),
     )
-    group = paged.allocate_rows(n_samples, dtype=torch.int64)
-    row_start = 0
-    for log_index, (log, n_rows) in enumerate(zip(logs, n_trainable, strict=True)):
-        row_slice = slice(row_start, row_start + n_rows)
-        channel_values[row_slice] = compute_channels(log, signals, log.trainable)
-        target[row_slice] = torch.from_numpy(log.nu_dot[log.trainable])
-        if dof.has_roll:
-            # the rate of an angle follows from the kinematics and is not learned
-            target[row_slice] *= dof.equation_mask()
-        group[row_slice] = log_index
-        time[row_slice] = torch.from_numpy(log.log.t[log.trainable] - log.log.t[0])
-        row_start += n_rows
-        paged.release_pages()
-    manoeuvre_kinds = tuple(log.log.manoeuvre for log in logs)
-    return Samples(channel_values, target, group, time, manoeuvre_kinds, signals.names)
 
 
 def compute_training_ranges(logs: Sequence[PreparedLog]) -> tuple[np.ndarray, np.ndarray]:

@@ -10,10 +10,14 @@ import torch
 from torch import Tensor
 
 from residnet.core.arrays import paged
-from residnet.core.errors import DataError
 from residnet.core.layout import POSITION
-from residnet.core.stretches import find_run_bounds
 from residnet.preprocessing.prepare import PreparedLog
+from residnet.preprocessing.window_index import (
+    WINDOW_COLUMNS,
+    WindowIndex,
+    WindowStage,
+    count_segment_samples,
+)
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,6 @@ class WindowStore:
         """
         lengths = [len(log) for log in logs]
         n_samples = sum(lengths)
-        segment_labels = np.empty(n_samples, dtype=np.int64)
         columns: dict[str, Tensor] = {}
         for name in WINDOW_COLUMNS:
             first_values: np.ndarray = getattr(logs[0], name)
@@ -62,7 +65,7 @@ class WindowStore:
                 n_samples, *first_values.shape[1:], dtype=column_dtype
             )
         row_start = 0
-        for log_index, (log, length) in enumerate(zip(logs, lengths, strict=True)):
+        for log, length in zip(logs, lengths, strict=True):
             row_slice = slice(row_start, row_start + length)
             origin = np.zeros_like(log.y[0])
             origin[POSITION] = log.y[0, POSITION]
@@ -71,19 +74,13 @@ class WindowStore:
                     getattr(log, name) - origin if name in ("y", "smoothed") else getattr(log, name)
                 )
                 values[row_slice] = torch.from_numpy(np.nan_to_num(values_of_log)).to(values.dtype)
-            segment_labels[row_slice] = np.where(
-                # segment numbers must differ between logs; a log has fewer than a million segments
-                log.segment >= 0,
-                log.segment + 1_000_000 * log_index,
-                -1,
-            )
             row_start += length
             paged.release_pages()
-        segment_starts, segment_ends = find_run_bounds(segment_labels)
+        n_remaining, n_elapsed = count_segment_samples([log.segment for log in logs])
         return cls(
             **columns,
-            n_remaining=torch.from_numpy(segment_ends - np.arange(n_samples)),
-            n_elapsed=torch.from_numpy(np.arange(n_samples) - segment_starts),
+            n_remaining=torch.from_numpy(n_remaining),
+            n_elapsed=torch.from_numpy(n_elapsed),
             log_index=torch.from_numpy(np.repeat(np.arange(len(logs)), lengths)),
         )
 
@@ -128,51 +125,23 @@ class WindowStore:
             },
         )
 
+    @property
+    def index(self) -> WindowIndex:
+        """The samples at which windows may start."""
+        return WindowIndex(
+            self.usable.numpy(),
+            self.trainable.numpy(),
+            self.n_remaining.numpy(),
+            self.n_elapsed.numpy(),
+        )
+
     def find_starts(self, length: int, min_usable_share: float = 0.5) -> Tensor:
-        """Return the rows [S] at which a window may start.
-
-        A window is within one segment, its first sample is trainable, and a minimum share of its
-        samples is usable.
-
-        Args:
-            length: samples in a window.
-            min_usable_share: smallest share of usable samples.
-
-        Raises:
-            DataError: if no log has such a window.
-        """
-        cumulative_usable = torch.nn.functional.pad(self.usable.cumsum(0), (1, 0))
-        is_long_enough = self.trainable & (self.n_remaining >= length)
-        start_rows = torch.nonzero(is_long_enough).squeeze(1)
-        start_rows = start_rows[
-            (cumulative_usable[start_rows + length] - cumulative_usable[start_rows])
-            >= min_usable_share * length
-        ]
-        if start_rows.numel() == 0:
-            raise DataError(
-                f"no training log holds a window of {length} samples without a gap; shorten the"
-                " horizon or give longer logs"
-            )
-        return start_rows
+        """Return the rows [S] at which a window may start; see `WindowIndex.find_starts`."""
+        return torch.from_numpy(self.index.find_starts(length, min_usable_share))
 
     def find_segment_starts(self, length: int, n_lead: int) -> Tensor:
-        """Return the rows [S], `n_lead` samples after the start of a segment, of valid windows.
-
-        Args:
-            length: samples in a window.
-            n_lead: samples between the start of the segment and the window.
-
-        Raises:
-            DataError: if no log has such a window.
-        """
-        start_rows = self.find_starts(length)
-        start_rows = start_rows[self.n_elapsed[start_rows] == n_lead]
-        if start_rows.numel() == 0:
-            raise DataError(
-                f"no training log holds a window of {length} samples that starts {n_lead} samples"
-                " after the start of a segment; shorten the window or remove `beginnings`"
-            )
-        return start_rows
+        """Return the rows [S] of windows `n_lead` samples after the start of a segment."""
+        return torch.from_numpy(self.index.find_segment_starts(length, n_lead))
 
     def take_windows(self, values: Tensor, starts: Tensor, length: int) -> Tensor:
         """Return windows [B, length, ...] of one of the tensors that begin at rows `starts` [B]."""
@@ -227,53 +196,25 @@ class WindowSampler:
         return self.starts[shuffled_indices].reshape(self.n_batches, self.batch_size)
 
 
-WINDOW_COLUMNS = ("y", "smoothed", "nu_dot", "w", "rate_inputs", "usable", "trainable")
-"""Attributes of `WindowStore` that windows contain by default."""
+def make_samplers(stage: WindowStage, store: WindowStore, n_batches: int) -> list[WindowSampler]:
+    """Create the samplers of windows at any row and of windows near segment starts.
 
+    Args:
+        stage: settings of the windows.
+        store: samples of all logs.
+        n_batches: number of batches per epoch.
 
-@dataclass(frozen=True)
-class WindowStage:
-    """Settings of the windows in one stage of a training.
-
-    Attributes:
-        n_window_samples: samples in a window.
-        batch_size: windows in a batch.
-        n_history: samples before a window that are provided with it; if the segment is shorter, its
-            first sample is repeated.
-        n_segment_start_windows: windows of a batch that begin near the start of a segment, as a
-            free run does.
-        n_lead: samples between the start of the segment and these windows; their history has the
-            same length, at least one sample.
-        columns: attributes of the store that the windows contain; others are empty.
+    Raises:
+        DataError: if no log is long enough.
     """
-
-    n_window_samples: int
-    batch_size: int
-    n_history: int = 1
-    n_segment_start_windows: int = 0
-    n_lead: int = 0
-    columns: Sequence[str] = WINDOW_COLUMNS
-
-    def make_samplers(self, store: WindowStore, n_batches: int) -> list[WindowSampler]:
-        """Create the samplers of windows at any row and of windows near segment starts.
-
-        Args:
-            store: samples of all logs.
-            n_batches: number of batches per epoch.
-
-        Raises:
-            DataError: if no log is long enough.
-        """
-        samplers = [
-            WindowSampler(
-                store.find_starts(self.n_window_samples),
-                self.batch_size - self.n_segment_start_windows,
-                n_batches,
-            )
-        ]
-        if self.n_segment_start_windows:
-            segment_start_rows = store.find_segment_starts(self.n_window_samples, self.n_lead)
-            samplers.append(
-                WindowSampler(segment_start_rows, self.n_segment_start_windows, n_batches)
-            )
-        return samplers
+    samplers = [
+        WindowSampler(
+            store.find_starts(stage.n_window_samples),
+            stage.batch_size - stage.n_segment_start_windows,
+            n_batches,
+        )
+    ]
+    if stage.n_segment_start_windows:
+        segment_start_rows = store.find_segment_starts(stage.n_window_samples, stage.n_lead)
+        samplers.append(WindowSampler(segment_start_rows, stage.n_segment_start_windows, n_batches))
+    return samplers

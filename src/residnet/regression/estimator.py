@@ -16,6 +16,7 @@ from torch import Tensor
 from residnet.core.arrays import paged
 from residnet.core.arrays.paged import iterate_row_chunks, release_pages
 from residnet.core.errors import FitError
+from residnet.regression.folds import count_default_folds, require_folds
 
 
 class Ratio(NamedTuple):
@@ -296,14 +297,9 @@ def require_overdetermined(x: Regressors, subject: str) -> None:
         )
 
 
-DEFAULT_FOLDS = 5
-"""Default number of folds of a cross-validation."""
-
-
 def default_fold_count(groups: Tensor) -> int | None:
     """Return `DEFAULT_FOLDS`, or the number of groups if it is lower; None for a single group."""
-    n_groups = torch.unique(groups).numel()
-    return min(DEFAULT_FOLDS, n_groups) if n_groups > 1 else None
+    return count_default_folds(torch.unique(groups).numel())
 
 
 def assign_group_folds(groups: Tensor | None, n_folds: int | None) -> Tensor:
@@ -316,15 +312,7 @@ def assign_group_folds(groups: Tensor | None, n_folds: int | None) -> Tensor:
     Raises:
         FitError: if there are fewer groups than folds, or fewer than two.
     """
-    unique_groups = torch.unique(groups) if groups is not None else torch.zeros(0)
-    if groups is None or (n_folds is None and unique_groups.numel() < 2):
-        raise FitError(
-            "cross-validation needs at least two runs or segments, but the data have one; give more"
-            " runs, or a fixed order or penalty"
-        )
-    if n_folds is not None and unique_groups.numel() < n_folds:
-        raise FitError(
-            f"{n_folds} folds need at least {n_folds} manoeuvres, but the training data have"
-            f" {unique_groups.numel()}; lower `folds`"
-        )
+    unique_groups = torch.zeros(0) if groups is None else torch.unique(groups)
+    require_folds(unique_groups.numel(), n_folds)
+    assert groups is not None
     return torch.searchsorted(unique_groups, groups) % (n_folds or unique_groups.numel())

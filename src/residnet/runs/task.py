@@ -21,7 +21,6 @@ from residnet.core.errors import DataError, ExportError, ResidnetError, UsageErr
 from residnet.core.files import stage_files
 from residnet.core.names import suggest_name
 from residnet.core.processes import retain_freed_memory
-from residnet.report.blocks import EXPORTS
 from residnet.runs.folder import Provenance, RunFolder, require_apart, write_checksums
 
 if TYPE_CHECKING:
@@ -312,6 +311,8 @@ class Task(Config):
             ResidnetError: if the work fails, or its outcome fails a check.
             ExportError: if the run is complete, but a model could not be exported.
         """
+        from residnet.report.blocks import EXPORTS
+
         provenance.write(folder)
         # exports of an earlier run in this folder must not appear in the new report
         folder.manifest.remove_if_owned(folder.path / EXPORTS)
@@ -408,7 +409,7 @@ class PackageTask(Task):
 
     A config is then read without importing what its work needs. `execute` lies beside the module
     of the class and has the functions `execute(config, folder)`, optionally `check(config)`, and
-    one for each command of the task.
+    one for each command of the task. A check that needs no PyTorch is a method of the config.
     """
 
     @final
@@ -454,6 +455,8 @@ def _write_exports(
 
     If one model cannot be exported, the other exports and the run still complete.
     """
+    from residnet.report.blocks import EXPORTS
+
     files = list[Path]()
     errors = list[ResidnetError]()
     rows = []

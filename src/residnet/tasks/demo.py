@@ -15,7 +15,8 @@ from residnet.core.files import atomic_write
 from residnet.core.log import Log
 from residnet.core.ownership import Manifest, record_folder
 from residnet.core.progress import report_progress
-from residnet.manoeuvres.trials import SimulatedTrials, simulate_trial_logs
+from residnet.manoeuvres.trials import simulate_trial_logs
+from residnet.manoeuvres.trials_config import SimulatedTrials
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -166,12 +166,12 @@ def _load_logs_task(config: Path) -> tuple[Any, FitConfig | None]:
     # torch is not needed to inspect logs without a config
     from residnet.io.sources import MeasuredLogs
     from residnet.tasks.fit.config import FitConfig
-    from residnet.tasks.import_logs import ImportConfig
     from residnet.tasks.registry import load_task
 
     task = load_task(config)
     is_measured_fit = isinstance(task, FitConfig) and isinstance(task.data, MeasuredLogs)
-    if not is_measured_fit and not isinstance(task, ImportConfig):
+    # a task of another package may have a reader, such as `import` of examples/residnet_tasks
+    if not is_measured_fit and not hasattr(task, "reader"):
         raise ConfigError(
             f"{config}: has no channel map (data.kind is not 'measured'); leave --config out for"
             " logs that describe themselves"
@@ -200,7 +200,8 @@ def _split_of_logs(fit_config: FitConfig, names: Mapping[Path, str]) -> dict[str
 def _check_regressor_conditioning(logs: Sequence[Log], fit_config: FitConfig) -> list[Finding]:
     """Return findings on the condition number of the regressors of each baseline."""
     from residnet.baselines.regressors import RegressorBaseline
-    from residnet.preprocessing.prepare import make_samples, prepare_log
+    from residnet.preprocessing.prepare import prepare_log
+    from residnet.preprocessing.samples import make_samples
 
     try:
         signals = fit_config.signals

@@ -37,17 +37,13 @@ from residnet.export import EXPORT_FORMATS
 from residnet.heads import HeadConfig
 from residnet.io.readers import ReaderConfig
 from residnet.manoeuvres import ManoeuvreConfig
-from residnet.report.blocks import build_table
 from residnet.runs.folder import RunFolder, require_recorded, write_checksums
 from residnet.runs.task import Task
 
 _TASK_BASE = "residnet.runs.task:Task"
 SINGLE_TASKS = {
     "fit": "residnet.tasks.fit.config:FitConfig",
-    "import": "residnet.tasks.import_logs:ImportConfig",
-    "simulate": "residnet.tasks.simulate:SimulateConfig",
-    "study": "residnet.tasks.study:StudyConfig",
-    "actuators": "residnet.tasks.actuators:ActuatorsTaskConfig",
+    "simulate": "residnet.tasks.simulate.config:SimulateConfig",
 }
 """Tasks of the core but the sweep, which varies any task; wings add their own."""
 _ALL_TASKS = {**SINGLE_TASKS, "sweep": "residnet.tasks.sweep.config:SweepConfig"}
@@ -207,6 +203,8 @@ def list_runs(folder: Path) -> list[dict[str, Any]]:
 
 def format_runs(folder: Path, entries: Sequence[Mapping[str, Any]]) -> str:
     """Format the list of runs as a table for the terminal."""
+    from residnet.report.blocks import build_table
+
     if not entries:
         return f"{folder}: no runs"
 

@@ -9,7 +9,7 @@ import copy
 import functools
 import math
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,10 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines import BaselineConfig
-from residnet.baselines.base import IdentifiedConfig
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.base import Baseline, ParametricBaseline
+from residnet.baselines.config import IdentifiedConfig
+from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.config import Config, validate_config
 from residnet.core.errors import ExportError, ResidnetError, UsageError
 from residnet.core.layout import PLANAR_LAYOUT, ROLL_LAYOUT, SIX_DOF_LAYOUT
@@ -38,27 +40,27 @@ from residnet.export.guard import GuardedDynamics
 from residnet.export.torchscript import trace_function
 from residnet.export.vessel import ExportedVessel
 from residnet.heads import HeadConfig
-from residnet.heads.base import ClosedFormHead, FeatureConfig, ResidualHead
+from residnet.heads.base import ClosedFormHead, ResidualHead
+from residnet.heads.config import BaseHeadConfig
 from residnet.heads.linear import RidgeConfig
-from residnet.heads.lstm import LstmConfig
+from residnet.heads.lstm_config import LstmConfig
 from residnet.io.readers.base import LogReader
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.trials import (
-    DisturbanceConfig,
     ManoeuvreRun,
-    SensorsConfig,
-    SimulatedTrials,
     SimulatedVessel,
     TrialEnvironment,
     make_manoeuvre_source,
     simulate_manoeuvres,
     simulate_trials,
 )
-from residnet.physics.signals import SignalsConfig
+from residnet.manoeuvres.trials_config import DisturbanceConfig, SensorsConfig, SimulatedTrials
+from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.symmetry import get_dof
 from residnet.physics.vessel import load_vessel
-from residnet.preprocessing.prepare import PrepareConfig, make_samples, prepare_log
+from residnet.preprocessing.prepare import PrepareConfig, prepare_log
+from residnet.preprocessing.samples import make_samples
 
 EXAMPLE_SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").with_thrusters()
 """Signals of the example models: revolutions of two propellers and their forces."""
@@ -133,7 +135,7 @@ def make_example_samples(
 
 
 def make_example_spec(
-    head: FeatureConfig | None, signals: SignalsConfig = EXAMPLE_SIGNALS
+    head: BaseHeadConfig | None, signals: SignalsConfig = EXAMPLE_SIGNALS
 ) -> ModelSpec:
     """Return the specification of a model with a regression baseline and a head.
 
@@ -260,7 +262,7 @@ def _check_round_trip(config: Config, config_union: Any, subject: str) -> None:
     )
 
 
-def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) -> None:
+def check_head(config: BaseHeadConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) -> None:
     """Check the contracts of a residual head.
 
     The checks cover shapes and dtypes, a nonzero residual, deterministic results, independence of
@@ -280,6 +282,7 @@ def check_head(config: FeatureConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) 
     _check_round_trip(config, HeadConfig, subject)
     fitted_model = make_example_model(spec)
     samples = make_example_samples(signals=signals).z
+    _check_head_config(config, fitted_model.head, signals.channel_names(), subject)
     # a copy, since the checks change the precision; the original is stored and compared below
     model = copy.deepcopy(fitted_model)
     # rows from different manoeuvres, and not from rest at their starts
@@ -495,6 +498,21 @@ def _check_storage(case: _HeadCase, spec: ModelSpec, fitted_model: HybridDynamic
     assert_close(stored_residuals, fitted_residuals, 0.0, message)
 
 
+def _check_head_config(
+    config: BaseHeadConfig, head: ResidualHead, names: Sequence[str], subject: str
+) -> None:
+    """Check that what a config states without PyTorch is true of the head that it builds."""
+    config.check_channels(names)
+    assert_true(
+        config.has_closed_form(names) == isinstance(head, ClosedFormHead),
+        f"{subject}: has_closed_form of its config differs from the head",
+    )
+    assert_true(
+        config.has_innovations(names) == (head.innovation_time_constant > 0.0),
+        f"{subject}: has_innovations of its config differs from the head",
+    )
+
+
 def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> None:
     """Check the contracts of a baseline.
 
@@ -515,6 +533,7 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
     n_dynamic = get_dof(training_samples.names).n_dynamic
     # two fits: a random start or an order of a set would give different coefficients
     baseline, refitted = (resolved.build(training_samples.names) for _ in range(2))
+    _check_baseline_config(resolved, baseline, training_samples, subject)
     table = resolved.fit_preferred(baseline, training_samples)
     assert_true(
         resolved.fit_preferred(refitted, training_samples) == table,
@@ -564,6 +583,30 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
     _check_round_trip(resolved, BaselineConfig, subject)
 
 
+def _check_baseline_config(
+    config: IdentifiedConfig, baseline: Baseline, samples: Samples, subject: str
+) -> None:
+    """Check that what a config states without PyTorch is true of the baseline that it builds."""
+    names = samples.names
+    config.check_channels(names)
+    config.validate_samples(samples.origins)
+    statements = {
+        "is_parametric": (
+            config.is_parametric(names),
+            isinstance(baseline, ParametricBaseline),
+        ),
+        "has_regressors": (config.has_regressors(names), isinstance(baseline, RegressorBaseline)),
+        "has_inertia_matrix": (
+            config.has_inertia_matrix(names),
+            baseline.inertia_matrix() is not None,
+        ),
+    }
+    for method, (statement, fact) in statements.items():
+        assert_true(
+            statement == fact, f"{subject}: {method} of its config differs from the baseline"
+        )
+
+
 def check_vessel(name: str, time_step: float = 0.1) -> None:
     """Check the contracts of a vessel file.
 
@@ -583,7 +626,13 @@ def check_vessel(name: str, time_step: float = 0.1) -> None:
         "\n" not in vessel.description.strip(), f"{subject}: its description is not one line"
     )
     assert_true(vessel.length.value > 0, f"{subject}: its length is not positive")
+    vessel.check_parameters()
+    channels = vessel.plant_channels()
     plant = vessel.build()
+    assert_true(
+        channels.state_names == plant.state_names and channels.input_names == plant.input_names,
+        f"{subject}: plant_channels differs from the plant",
+    )
     assert_true(plant.n_commands > 0, f"{subject}: has no commands")
     dynamics = PlantDynamics(plant, time_step)
     x = plant.make_initial_state(3)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from residnet.preprocessing.windows import WindowStage
+from residnet.preprocessing.window_index import WindowStage
 
 
 def cosine_learning_rate(rate: float, final: float, epoch: int, epochs: int) -> float:
@@ -282,7 +280,6 @@ class TrainingConfig(MachineConfig):
 
     def windows(self, dt: float) -> list[WindowStage | None]:
         """Return the windows of each stage for a step of dt seconds; None without epochs."""
-        from residnet.preprocessing.windows import WindowStage
 
         def count_segment_starts(batch: int) -> int:
             """Return the number of windows of a batch that begin with a segment."""

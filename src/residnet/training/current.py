@@ -11,44 +11,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from residnet.baselines.regressors import RegressorBaseline
-from residnet.core.config import Config, MetresPerSecond
 from residnet.core.errors import FitError
 from residnet.core.layout import HEADING, POSITION, VELOCITIES, YAW_RATE
 from residnet.physics.signals import Signals
 from residnet.preprocessing.prepare import PreparedLog
 
+if TYPE_CHECKING:
+    from residnet.training.current_config import CurrentConfig
+
 _MAX_ROUNDS = 4
 """Most rounds of grid search and Gauss-Newton; the first without a gain is the last."""
 _SEARCH_STRIDE = 10
 """Every how many samples the grid search uses."""
-
-
-class CurrentConfig(Config):
-    """Settings for logs that each ran in a constant current which nobody measured.
-
-    The currents are estimated first; what follows fits and chooses models on these logs as motion
-    through the water, without current. Logs that are kept for tests are moved too: each by the
-    current that the coefficients of the fitted logs see in it, so that nothing of them is fitted.
-
-    Attributes:
-        baseline: name of the baseline whose regressors explain the accelerations while the currents
-            are estimated.
-        spread: standard deviation that each component of a current is expected to have; keeps logs
-            that say little near zero.
-        iterations: at most.
-    """
-
-    baseline: str = "baseline"
-    spread: MetresPerSecond = Field(default=0.5, gt=0)
-    iterations: int = Field(default=40, ge=1, le=10_000)
 
 
 def estimate_currents(

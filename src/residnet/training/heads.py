@@ -14,8 +14,8 @@ from residnet.baselines.given import FixedBaseline
 from residnet.core.arrays import paged
 from residnet.core.columns import all_but_pose, dynamic_states, pose
 from residnet.core.samples import Samples
-from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.time_steps import Integrator
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import TRAINING_STEPS, FreeRun, Rollout
 from residnet.heads.recurrent import GRUEnsembleHead

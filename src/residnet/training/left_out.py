@@ -19,13 +19,13 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.preprocessing.windows import WindowStore
 from residnet.training.refit import (
     Problem,
-    RefitConfig,
     build_problem,
     estimate_initial_states,
     normal_equations,
     require_parametric_baseline,
     simulate,
 )
+from residnet.training.refit_config import RefitConfig
 
 
 class RefitUncertainty(NamedTuple):

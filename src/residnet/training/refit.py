@@ -12,15 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from residnet.baselines.base import ParametricBaseline
 from residnet.core.columns import all_but_pose, pose
-from residnet.core.config import Config, Seconds
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
@@ -30,6 +28,9 @@ from residnet.preprocessing.channel_values import estimate_noise_std
 from residnet.preprocessing.windows import WindowStore
 from residnet.regression.least_squares import DescentResult, minimize_levenberg_marquardt
 
+if TYPE_CHECKING:
+    from residnet.training.refit_config import RefitConfig
+
 _ROWS_PER_BATCH = 1_024  # Jacobians held in memory at once
 _REGULARISATION = 1e-8  # of a parameter's own information: keeps the Hessian definite
 _MIN_NOISE = 1e-9  # SI, for channels that show none
@@ -38,40 +39,6 @@ _SIGN_ROUNDS = 8  # times that terms of the wrong sign are fixed at zero
 _UNIDENTIFIABLE = 0.5  # share of a parameter's information that is the prior's
 _DIVERGED = 1e3  # error in scales beyond which a free run gives no search direction
 _RUNS_PER_FIT = 10  # about; decides whether compiling the rollout pays
-
-
-class RefitConfig(Config):
-    """Settings of the Gauss-Newton refit of a baseline's parameters.
-
-    Attributes:
-        horizon: length of the free runs in s.
-        every: time between the starts of successive free runs in s.
-        prior: weight of the least-squares solution, as a share of its own information.
-        asymmetric: weight of the prior that shrinks terms towards zero if port-starboard symmetry
-            excludes them; 0 for no such prior.
-        robust: error, in units of the scales, above which the loss of a window is linear instead
-            of quadratic.
-        correlation: correlation time of free-run errors in s. The duration of the logs divided by
-            this time is the number of independent errors, which determines the standard errors
-            and the weight of the data relative to the prior of the baseline.
-        iterations: maximum number of iterations for each estimate of the initial states.
-        starts: initial states of free runs. `measured`: the measured states, as in the metrics.
-            In a lightly damped vessel their noise persists and biases damping upwards.
-            `estimated`: estimated jointly with the parameters, with the measurement noise as
-            prior; gives less biased coefficients.
-    """
-
-    horizon: Seconds = Field(default=20.0, gt=0)
-    every: Seconds = Field(default=10.0, gt=0)
-    prior: float = Field(default=1e-2, ge=0)
-    asymmetric: float = Field(default=0.0, ge=0)
-    robust: float = Field(default=0.05, gt=0)
-    correlation: Seconds = Field(default=10.0, gt=0)
-    iterations: int = Field(default=10, ge=1, le=10_000)
-    starts: Literal["measured", "estimated"] = "measured"
-
-    def with_prior(self, prior: float) -> RefitConfig:
-        return self.model_copy(update={"prior": prior})
 
 
 @dataclass(frozen=True)
@@ -200,16 +167,7 @@ def find_free_run_starts(store: WindowStore, config: RefitConfig, dt: float) -> 
     Raises:
         FitError: if no log is long enough.
     """
-    steps = round(config.horizon / dt)
-    steps_between_starts = max(round(config.every / dt), 1)
-    starts = store.find_starts(steps + 1)
-    starts = starts[store.n_elapsed[starts] % steps_between_starts == 0]
-    if starts.numel() == 0:
-        raise FitError(
-            f"no training log holds a free run of {config.horizon:g} s for the refit; shorten"
-            " `horizon`"
-        )
-    return starts
+    return torch.from_numpy(config.find_free_run_starts(store.index, dt))
 
 
 def build_problem(

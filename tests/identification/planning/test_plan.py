@@ -7,7 +7,7 @@ import pytest
 import torch
 from made_system import LINEAR, SCALES, STEP, model_of, trials
 
-from residnet.baselines.regressors import RegressorsConfig
+from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.errors import DataError, UsageError
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.fitter import FittedModel
@@ -21,13 +21,15 @@ from residnet.identification.planning import (
     plan_trials,
     update_covariance,
 )
-from residnet.manoeuvres.actuated import InputShare
+from residnet.manoeuvres.input_shares import InputShare
 from residnet.manoeuvres.open_loop import ConstantInput
-from residnet.physics.signals import SignalsConfig
-from residnet.preprocessing.prepare import compute_training_ranges, make_samples
+from residnet.physics.signals_config import SignalsConfig
+from residnet.preprocessing.prepare import compute_training_ranges
+from residnet.preprocessing.samples import make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.training.left_out import RefitUncertainty, estimate_refit_covariance
-from residnet.training.refit import RefitConfig, refit
+from residnet.training.refit import refit
+from residnet.training.refit_config import RefitConfig
 
 CONFIG = RefitConfig(horizon=4.0, every=4.0, iterations=3)
 SHARES = {"tau_x": InputShare(drive=1.0), "tau_n": InputShare(steer=0.3)}

@@ -7,7 +7,8 @@ from typing import Literal, final
 
 from torch import Tensor, nn
 
-from residnet.heads.base import BaseHeadConfig, Features, ResidualHead, ResidualScale
+from residnet.heads.base import Features, ResidualHead, ResidualScale
+from residnet.heads.config import BaseHeadConfig
 
 
 class CrowdedConfig(BaseHeadConfig):

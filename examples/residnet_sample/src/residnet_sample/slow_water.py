@@ -10,7 +10,8 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.config import Seconds
-from residnet.heads.base import BaseHeadConfig, Features, ResidualHead, ResidualScale
+from residnet.heads.base import Features, ResidualHead, ResidualScale
+from residnet.heads.config import BaseHeadConfig
 
 
 class SlowWaterConfig(BaseHeadConfig):

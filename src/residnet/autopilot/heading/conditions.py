@@ -25,10 +25,10 @@ from residnet.autopilot.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ExportError, FitError
 from residnet.core.frames import wrap_angle
-from residnet.dynamics.simulated import check_steps
+from residnet.dynamics.time_steps import check_steps
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import FreeRun, Rollout, Source
-from residnet.physics.environment import JonswapSpectrumConfig
+from residnet.physics.environment_config import JonswapSpectrumConfig
 
 if TYPE_CHECKING:
     from residnet.engine.compiled import CompiledRollout

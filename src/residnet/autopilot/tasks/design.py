@@ -19,7 +19,7 @@ from residnet.autopilot.heading.turning import (
     SteeringResponse,
     fit_response,
 )
-from residnet.autopilot.tasks.autopilot import REFERENCE_STEERING, minimum_turn_time
+from residnet.autopilot.tasks.autopilot.config import REFERENCE_STEERING, minimum_turn_time
 from residnet.core.config import (
     Config,
     MetresPerSecond,

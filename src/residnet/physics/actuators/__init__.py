@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from residnet.physics.actuators.base import ActuatorConfig, ActuatorSystem, ForceActuators
+from residnet.physics.actuators.config import ActuatorConfig
 from residnet.physics.actuators.rudders import (
     FoilRuddersConfig,
     LinearRuddersConfig,
@@ -14,13 +14,10 @@ from residnet.physics.actuators.rudders import (
     TorpedoFinsConfig,
     WaterJetsConfig,
 )
-from residnet.physics.actuators.thrusters import (
-    AzimuthThrusters,
+from residnet.physics.actuators.thrusters_config import (
     AzimuthThrustersConfig,
     DifferentialThrustConfig,
-    ForceCommands,
     ForceCommandsConfig,
-    Thrusters,
     ThrustersConfig,
     VectoredThrustersConfig,
 )
@@ -45,16 +42,11 @@ SubmergedActuatorsConfig = Annotated[
 
 __all__ = [
     "ActuatorConfig",
-    "ActuatorSystem",
     "ActuatorsConfig",
-    "AzimuthThrusters",
     "AzimuthThrustersConfig",
     "DifferentialThrustConfig",
-    "ForceActuators",
-    "ForceCommands",
     "ForceCommandsConfig",
     "RollingActuatorsConfig",
     "SubmergedActuatorsConfig",
-    "Thrusters",
     "ThrustersConfig",
 ]

@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Annotated, Literal, final
+from typing import TYPE_CHECKING, Annotated, Literal, final
 
-import torch
 from pydantic import AfterValidator, Field
-from torch import Tensor
 
 from residnet.core.config import Config, Metres, Newtons, Radians, RevsPerSecond
-from residnet.physics.actuators.base import (
+from residnet.physics.actuators.config import (
     CommandSpec,
-    Servo,
     ServoConfig,
+    ServoSpec,
     ShaftConfig,
     SteeredConfig,
     SteeringGearConfig,
@@ -31,6 +29,9 @@ from residnet.physics.parameters import (
     SquareMetres,
     require_dimension,
 )
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 class RudderConfig(SteeringGearConfig):
@@ -70,6 +71,8 @@ class PropellerShaftConfig(ShaftConfig, ThrustConfig):
 
     def thrust_at(self, n: Tensor, u: Tensor) -> Tensor:
         """Return the thrust [N] at n [1/s] and speed through the water u [m/s], any shape."""
+        import torch
+
         forward = self.forward
         reverse = self.reverse
         forward_thrust = (forward[0] + n * (forward[1] + n * forward[2])).clamp(min=0.0)
@@ -110,10 +113,12 @@ class RudderPropellerConfig(SteeredConfig):
             CommandSpec("cmd_n", "drive", self.propeller.n_max),
         )
 
-    def build_servos(self) -> tuple[Servo, ...]:
-        return self.rudder.build_servo("delta"), self.propeller.build_servo("n")
+    def servo_specs(self) -> tuple[ServoSpec, ...]:
+        return self.rudder.servo_spec("delta"), self.propeller.servo_spec("n")
 
     def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        import torch
+
         rudder = self.rudder
         propeller = self.propeller
         delta = position[..., 0]
@@ -183,8 +188,8 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
             CommandSpec("cmd_thrust", "drive", self.thrust, 0.0),
         )
 
-    def build_servos(self) -> tuple[Servo, ...]:
-        return (self.build_servo("delta"),)
+    def servo_specs(self) -> tuple[ServoSpec, ...]:
+        return (self.servo_spec("delta"),)
 
     def servo_commands(self, command: Tensor) -> Tensor:
         """Return the rudder command [..., 1]; thrust has no dynamics."""
@@ -192,6 +197,8 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
 
     @final
     def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        import torch
+
         thrust = command[..., 1].clamp(0.0, self.thrust)
         lift, drag = self.lift_and_drag(position[..., 0], nu[..., 0], nu[..., 1], thrust)
         return torch.stack((thrust - drag, -lift, self.z * lift, -self.x * lift), dim=-1)
@@ -228,6 +235,8 @@ class FoilRuddersConfig(SternRuddersConfig):
     def lift_and_drag(
         self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor
     ) -> tuple[Tensor, Tensor]:
+        import torch
+
         disc_area = 0.25 * math.pi * self.diameter**2
         # C_Th V^2 per newton of total thrust, which the propellers share equally
         thrust_loading = 2.0 / (self.propellers * self.density * disc_area)
@@ -266,6 +275,8 @@ class LinearRuddersConfig(SternRuddersConfig):
     def lift_and_drag(
         self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor
     ) -> tuple[Tensor, Tensor]:
+        import torch
+
         return self.Y_delta_uu * u * u * delta, torch.zeros_like(delta)
 
 
@@ -340,11 +351,13 @@ class WaterJetsConfig(SteeredConfig):
             CommandSpec("cmd_nozzle", "steer", max_nozzle_angle),
         )
 
-    def build_servos(self) -> tuple[Servo, ...]:
-        return self.motor.build_servo("n"), self.nozzle.build_servo("nozzle")
+    def servo_specs(self) -> tuple[ServoSpec, ...]:
+        return self.motor.servo_spec("n"), self.nozzle.servo_spec("nozzle")
 
     def servo_commands(self, command: Tensor) -> Tensor:
         """Return the commands [..., 2] without negative revolutions."""
+        import torch
+
         return torch.stack((command[..., 0].clamp(min=0.0), command[..., 1]), dim=-1)
 
     def jet_thrust(self, n: Tensor, u: Tensor) -> Tensor:
@@ -364,6 +377,8 @@ class WaterJetsConfig(SteeredConfig):
         return reference_thrust * revolutions_share
 
     def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        import torch
+
         n, angle = position.unbind(-1)
         total_thrust = self.jets * self.jet_thrust(n, nu[..., 0])
         side_force = total_thrust * torch.sin(angle)
@@ -417,13 +432,15 @@ class TorpedoFinsConfig(ServoConfig, SteeredConfig):
             CommandSpec("cmd_n", "drive", self.n_max, 0.0),
         )
 
-    def build_servos(self) -> tuple[Servo, ...]:
+    def servo_specs(self) -> tuple[ServoSpec, ...]:
         return (
-            self.build_limited_servo(self.limit, None, "delta", "delta_s"),
-            self.build_limited_servo(self.n_max, None, "n"),
+            self.limited_servo(self.limit, None, "delta", "delta_s"),
+            self.limited_servo(self.n_max, None, "n"),
         )
 
     def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        import torch
+
         delta, delta_s, n = position.unbind(-1)
         dynamic_pressure = 0.5 * self.density * nu[..., 0].square()
         side_force = -dynamic_pressure * self.rudder * delta

@@ -2,128 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Annotated, Literal, final
+from typing import TYPE_CHECKING, final
 
-import numpy as np
 import torch
-from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from residnet.core.config import (
-    Config,
-    Metres,
-    NewtonMetres,
-    Newtons,
-    Radians,
-    RadiansPerSecond,
-    RevRate,
-)
-from residnet.physics.actuators.base import (
-    ActuatorConfig,
-    ActuatorSystem,
-    CurveRange,
-    FirstOrderConfig,
-    ForceActuators,
-    ImmediateConfig,
-    SecondOrderConfig,
-    Servo,
-    ServoConfig,
-    ShaftConfig,
-    ThrustConfig,
-    require_curve_covers_range,
-)
+from residnet.physics.actuators.base import ActuatorSystem, ForceActuators
+
+if TYPE_CHECKING:
+    from residnet.physics.actuators.config import ActuatorConfig
+    from residnet.physics.actuators.thrusters_config import (
+        AzimuthThrustersConfig,
+        ForceCommandsConfig,
+        ThrusterConfig,
+        VectoredThrustersConfig,
+    )
 
 _TABLE_POINTS = 401
 """Number of points of the table that initialises the inverse of the thrust curve."""
 _NEWTON_STEPS = 4
 """Number of Newton steps of the inverse; each doubles the digits of the interpolation."""
-
-
-def _require_unique_names(names: Sequence[str]) -> None:
-    if duplicates := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"two thrusters are named '{duplicates[0]}'")
-
-
-class ThrusterPositionConfig(Config):
-    """Name and position of a thruster.
-
-    Attributes:
-        name: suffix of the names of its channels, for example `port`.
-        x: distance forward of the body origin in m.
-        y: distance to starboard of the body origin in m.
-    """
-
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]*$")
-    x: Metres = 0.0
-    y: Metres = 0.0
-
-
-class ThrusterConfig(ThrusterPositionConfig, ShaftConfig, ThrustConfig):
-    """Fixed thruster.
-
-    Attributes:
-        name: suffix of its channels n_<name> and cmd_<name>.
-        angle: direction of positive thrust, clockwise from the bow; 90 deg for a bow thruster with
-            thrust to starboard.
-    """
-
-    angle: Radians = 0.0
-
-
-class ThrustersConfig(ActuatorConfig):
-    """Fixed thrusters at any positions of the hull.
-
-    Drive acts on each thruster in proportion to the surge component of its direction. Steer acts on
-    it with the sign of its lever about the origin.
-
-    Attributes:
-        thrusters: the thrusters, in the order of the commands.
-    """
-
-    kind: Literal["thrusters"] = "thrusters"
-    thrusters: Annotated[tuple[ThrusterConfig, ...], Field(min_length=1)]
-
-    @model_validator(mode="after")
-    def _validate_names(self) -> ThrustersConfig:
-        _require_unique_names([thruster.name for thruster in self.thrusters])
-        return self
-
-    def build(self) -> Thrusters:
-        thrusters = self.thrusters
-        return Thrusters(
-            thrusters, [thruster.build_servo(f"n_{thruster.name}") for thruster in thrusters]
-        )
-
-
-class DifferentialThrustConfig(ThrustConfig, ActuatorConfig):
-    """Two fixed thrusters for differential thrust (document 003 section 4.1).
-
-    The thrust curve is clipped to the sign of the rotation, which removes the discontinuity of the
-    published polynomials at zero (correction W5).
-
-    Attributes:
-        spacing: lateral distance between the thrusters in m.
-        n_rate: maximum rate of change of the revolutions in 1/s^2.
-    """
-
-    kind: Literal["differential_thrust"] = "differential_thrust"
-    spacing: Metres = Field(gt=0)
-    n_rate: RevRate = Field(gt=0)
-
-    def build(self) -> Thrusters:
-        """Build the port and the starboard thruster, in this order."""
-        thrusters = [
-            ThrusterConfig(
-                name=name, y=y, n_max=self.n_max, forward=self.forward, reverse=self.reverse
-            )
-            for name, y in (("port", -0.5 * self.spacing), ("stbd", 0.5 * self.spacing))
-        ]
-        return Thrusters(
-            thrusters,
-            [thrusters[0].build_limited_servo(self.n_max, self.n_rate, "n_port", "n_stbd")],
-        )
 
 
 @final
@@ -171,9 +70,9 @@ class Thrusters(ActuatorSystem):
 
     depends_on_speed = False
 
-    def __init__(self, thrusters: Sequence[ThrusterConfig], servos: Sequence[Servo]) -> None:
-        super().__init__(*servos)
-        self.command_names = tuple(f"cmd_{thruster.name}" for thruster in thrusters)
+    def __init__(self, thrusters: Sequence[ThrusterConfig], config: ActuatorConfig) -> None:
+        super().__init__(*config.servo_specs())
+        self.command_names = config.command_names()
         self.thruster_forces = ThrusterForces(thrusters)
         surge_share, _, lever = self.thruster_forces.thrust_configuration.unbind(-1)
         # contribution of each thruster to surge and sign of its contribution to yaw; components at
@@ -198,83 +97,14 @@ class Thrusters(ActuatorSystem):
         return force
 
 
-class AzimuthConfig(ServoConfig):
-    """Azimuth drive of a thruster, with a limited angle to either side of the bow.
-
-    Attributes:
-        limit: maximum angle from the bow in rad.
-        rate: maximum azimuth rate in rad/s; None for no limit.
-    """
-
-    limit: Radians = Field(default=math.pi, gt=0)
-    rate: RadiansPerSecond | None = Field(default=None, gt=0)
-
-
-class AzimuthThrustersConfig(ActuatorConfig):
-    """Equal azimuth thrusters, commanded by revolutions and angles.
-
-    The commands are cmd_n_<name> [1/s], then cmd_alpha_<name> [rad] clockwise from the bow.
-
-    Attributes:
-        places: names and positions of the thrusters.
-        thrust: coefficients c0, c1, ... of the thrust T = c0 + c1 n + c2 n^2 + ... in N, n in 1/s.
-        curve_range: range of revolutions (astern, ahead) in which the curve was measured; it must
-            increase between +-n_max.
-        shaft: dynamics and limits of the revolutions.
-        azimuth: dynamics and limits of the angles.
-    """
-
-    kind: Literal["azimuth_thrusters"]
-    places: Annotated[tuple[ThrusterPositionConfig, ...], Field(min_length=1)]
-    thrust: Annotated[tuple[float, ...], Field(min_length=2)]
-    curve_range: CurveRange | None = None
-    shaft: ShaftConfig
-    azimuth: AzimuthConfig = AzimuthConfig()
-
-    @model_validator(mode="after")
-    def _validate_thrusters(self) -> AzimuthThrustersConfig:
-        _require_unique_names([thruster_position.name for thruster_position in self.places])
-        require_curve_covers_range(self.curve_range, self.shaft.n_max)
-        # allocation inverts the thrust curve, which must therefore be monotonic
-        n = np.linspace(-self.shaft.n_max, self.shaft.n_max, _TABLE_POINTS)
-        decreasing = n[np.polynomial.Polynomial(self.thrust).deriv()(n) <= 0]
-        if len(decreasing):
-            raise ValueError(
-                f"thrust decreases with the revolutions at {decreasing[0] * 60:.0f} rpm, so that"
-                " its inverse is not unique; lower n_max"
-            )
-        if (
-            len({(thruster_position.x, thruster_position.y) for thruster_position in self.places})
-            == 1
-        ):
-            raise ValueError(
-                "thrusters at one position cannot produce surge, sway and yaw independently; give"
-                " two positions"
-            )
-        return self
-
-    def build(self) -> AzimuthThrusters:
-        return AzimuthThrusters(self)
-
-
 @final
 class AzimuthThrusters(ForceActuators):
     """Forces tau [..., 3] of k azimuth thrusters (document 002 eqs. (5.1), (5.2))."""
 
     def __init__(self, config: AzimuthThrustersConfig) -> None:
-        shaft = config.shaft
-        azimuth = config.azimuth
-        names = [thruster_position.name for thruster_position in config.places]
-        super().__init__(
-            shaft.build_servo(*(f"n_{name}" for name in names)),
-            azimuth.build_limited_servo(
-                azimuth.limit, azimuth.rate, *(f"alpha_{name}" for name in names)
-            ),
-        )
-        self.command_names = tuple(
-            f"cmd_{quantity}_{name}" for quantity in ("n", "alpha") for name in names
-        )
-        self.n_thrusters = len(names)
+        super().__init__(*config.servo_specs())
+        self.command_names = config.command_names()
+        self.n_thrusters = len(config.places)
         self.coefficients = list(config.thrust)
         self.slope_coefficients = [i * c for i, c in enumerate(config.thrust)][1:]
         # tau = map [3, 2k] of the components forward, then to starboard, of every thruster
@@ -292,9 +122,8 @@ class AzimuthThrusters(ForceActuators):
         self.allocation_matrix = nn.Buffer(
             torch.linalg.pinv(self.thrust_configuration), persistent=False
         )
-        revolutions_grid = torch.linspace(
-            -shaft.n_max, shaft.n_max, _TABLE_POINTS, dtype=torch.float64
-        )
+        n_max = config.shaft.n_max
+        revolutions_grid = torch.linspace(-n_max, n_max, _TABLE_POINTS, dtype=torch.float64)
         self.thrust_table = nn.Buffer(
             torch.stack((revolutions_grid, self.thrust_at(revolutions_grid))), persistent=False
         )
@@ -374,28 +203,6 @@ def _evaluate_polynomial(coefficients: Sequence[float], x: Tensor) -> Tensor:
     return value
 
 
-class ForceCommandsConfig(ActuatorConfig):
-    """Commanded forces tau_x, tau_y [N] and moment tau_n [N m] with limits.
-
-    Attributes:
-        x_max: maximum surge force in either direction in N.
-        y_max: maximum sway force to either side in N.
-        n_max: maximum yaw moment to either side in N m.
-        response: dynamic response of the forces; immediate by default.
-    """
-
-    kind: Literal["forces"] = "forces"
-    x_max: Newtons = Field(gt=0)
-    y_max: Newtons = Field(ge=0)
-    n_max: NewtonMetres = Field(gt=0)
-    response: Annotated[
-        ImmediateConfig | FirstOrderConfig | SecondOrderConfig, Field(discriminator="kind")
-    ] = ImmediateConfig()
-
-    def build(self) -> ForceCommands:
-        return ForceCommands(self)
-
-
 @final
 class ForceCommands(ForceActuators):
     """Forces tau [..., 3] that follow saturated commands [..., 3].
@@ -406,13 +213,7 @@ class ForceCommands(ForceActuators):
     command_names = ("tau_x", "tau_y", "tau_n")
 
     def __init__(self, config: ForceCommandsConfig) -> None:
-        # a lag of second order may overshoot the limits of the commands
-        servo = ServoConfig(response=config.response)
-        super().__init__(
-            servo.build_limited_servo(
-                math.inf, None, *(f"acting_{name}" for name in self.command_names)
-            )
-        )
+        super().__init__(*config.servo_specs())
         limit = torch.tensor([config.x_max, config.y_max, config.n_max], dtype=torch.float64)
         self.limit = nn.Buffer(limit, persistent=False)
 
@@ -435,42 +236,6 @@ class ForceCommands(ForceActuators):
         return torch.maximum(torch.minimum(command, limit), -limit)
 
 
-class VectoredThrusterConfig(ThrusterPositionConfig):
-    """Fixed thruster with any direction of thrust, whose thrust is commanded.
-
-    Attributes:
-        name: suffix of its command cmd_thrust_<name> in N.
-        z: distance below the body origin in m.
-        push: direction of positive thrust (forward, starboard, down), normalised to length one.
-    """
-
-    z: Metres = 0.0
-    push: tuple[float, float, float]
-
-
-class VectoredThrustersConfig(ActuatorConfig):
-    """Equal thrusters of a vessel in six degrees of freedom.
-
-    The command is the thrust, because the motor drives invert the thrust curve.
-
-    Attributes:
-        thrusters: the thrusters, in the order of the commands.
-        limit: maximum thrust of each thruster in either direction.
-    """
-
-    kind: Literal["vectored_thrusters"] = "vectored_thrusters"
-    thrusters: Annotated[tuple[VectoredThrusterConfig, ...], Field(min_length=1)]
-    limit: Newtons = Field(gt=0)
-
-    @model_validator(mode="after")
-    def _validate_names(self) -> VectoredThrustersConfig:
-        _require_unique_names([thruster.name for thruster in self.thrusters])
-        return self
-
-    def build(self) -> VectoredThrusters:
-        return VectoredThrusters(self)
-
-
 @final
 class VectoredThrusters(ActuatorSystem):
     """Forces and moments tau [..., 6] of vectored thrusters with thrust T [..., c] in N.
@@ -481,9 +246,8 @@ class VectoredThrusters(ActuatorSystem):
     depends_on_speed = False
 
     def __init__(self, config: VectoredThrustersConfig) -> None:
-        names = [f"thrust_{thruster.name}" for thruster in config.thrusters]
-        super().__init__(ServoConfig().build_limited_servo(config.limit, None, *names))
-        self.command_names = tuple(f"cmd_{name}" for name in names)
+        super().__init__(*config.servo_specs())
+        self.command_names = config.command_names()
         position = torch.tensor(
             [[thruster.x, thruster.y, thruster.z] for thruster in config.thrusters],
             dtype=torch.float64,

@@ -27,6 +27,7 @@ from residnet.report.figure import (
 )
 from residnet.report.figure_files import write_figures
 from residnet.report.run_reader import JsonObject, RunFiles
+from residnet.report.sections.variants import VARIANTS_FILE, variant_sections
 
 _MAX_SHOWN_TRIALS = 15
 """Trials in the first table, the best ones, which fit on a screen; the last section has all."""
@@ -176,6 +177,8 @@ def _wrap_key(key: str) -> str:
 
 def sections(run: RunFiles) -> list[Section]:
     """Return the sections with the best trials, the figures in the folder and all trials."""
+    if (run.path / VARIANTS_FILE).is_file():
+        return variant_sections(run)
     content = run.read_json("sweep.json")
     figures = []
     if content["best"] is not None:

@@ -14,7 +14,7 @@ from residnet.core import progress
 from residnet.core.config import Config, Seconds, apply_override, validate_config
 from residnet.core.errors import ConfigError, require_package
 from residnet.core.format import DASH, format_number
-from residnet.heads.genetic import GeneticConfig
+from residnet.heads.genetic_config import GeneticConfig
 from residnet.regression.expressions import Algebra, format_product
 from residnet.regression.genetic import evolve_equation, expression_limits, validation_mask
 from residnet.report.blocks import Cell, Section, Text, build_table

@@ -28,24 +28,15 @@ from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.evaluation.goodness import OneStepResiduals
 from residnet.evaluation.goodness import build_goodness_table as goodness_table
 from residnet.heads.base import ClosedFormHead
-from residnet.heads.genetic import GeneticConfig
-from residnet.heads.symbolic import SymbolicConfig
+from residnet.heads.genetic_config import GeneticConfig
+from residnet.heads.symbolic_config import SymbolicConfig
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.manoeuvres.open_loop import AccelerationDeceleration
-from residnet.manoeuvres.trials import (
-    DisturbanceConfig,
-    SensorsConfig,
-    SimulatedVessel,
-    TrialEnvironment,
-    simulate_manoeuvres,
-)
-from residnet.physics.hull import (
-    SPEED_REGIMES,
-    AccelerationHullConfig,
-    classify_speed_regime,
-    compute_froude_number,
-)
+from residnet.manoeuvres.trials import SimulatedVessel, TrialEnvironment, simulate_manoeuvres
+from residnet.manoeuvres.trials_config import DisturbanceConfig, SensorsConfig
+from residnet.physics.froude import SPEED_REGIMES, classify_speed_regime, compute_froude_number
+from residnet.physics.hull import AccelerationHullConfig
 from residnet.physics.vessel import load_vessel
 from residnet.report.blocks import Block, Bullets, Cell, Section, Table, Text, build_table
 from residnet.report.figure import (

@@ -20,22 +20,23 @@ from torch import Tensor
 from residnet.autopilot.evaluation import mean_squares_by_axis
 from residnet.autopilot.guidance import CrossingConfig
 from residnet.autopilot.motion import ReferenceFilterConfig
-from residnet.baselines.given import BelievedConfig, HullEquations
+from residnet.baselines.given_config import BelievedConfig, HullEquations
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError, FitError, UsageError
 from residnet.core.files import read_json
 from residnet.core.format import DEGREES_PER_RADIAN, format_number
 from residnet.core.frames import wrap_angle
 from residnet.core.layout import ACCELERATIONS, HEADING, POSE, POSITION, VELOCITIES
-from residnet.core.names import STATE_NAMES, suggest_name
+from residnet.core.names import FORCE_CHANNELS, STATE_NAMES, suggest_name
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.rollout import Rollout
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.heads.base import ZeroHead
 from residnet.manoeuvres.closed_loop import ZigzagFamily
-from residnet.manoeuvres.trials import SimulatedTrials, simulate_trials
+from residnet.manoeuvres.trials import simulate_trials
+from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.physics.force_model import ForceCorrection, ForceModel
-from residnet.physics.signals import FORCE_CHANNELS, SignalsConfig
+from residnet.physics.signals_config import SignalsConfig
 from residnet.report.blocks import Block, Cell, Section, Table, build_table
 from residnet.report.figure import DASHED_STYLE, SOLID_STYLE, Case, Figure, Panel, style_family
 from residnet.runs.folder import RunFolder

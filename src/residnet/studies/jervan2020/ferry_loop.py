@@ -46,7 +46,7 @@ from residnet.dynamics.simulated import PlantDynamics
 from residnet.engine.compiled import CompiledRollout
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import FreeRun, Rollout, Source
-from residnet.physics.actuators import ForceActuators
+from residnet.physics.actuators.base import ForceActuators
 from residnet.physics.force_model import ForceModel
 from residnet.physics.hull import HullConfig
 from residnet.physics.plant import HullPlant

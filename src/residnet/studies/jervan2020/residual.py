@@ -22,24 +22,23 @@ from torch import Tensor
 from residnet.autopilot.actuator_lag import fit_lag, simulate_lagged_force
 from residnet.autopilot.evaluation import mean_squares_by_axis
 from residnet.autopilot.motion import ActuatorLag
-from residnet.baselines.given import BelievedConfig, HullEquations
+from residnet.baselines.given_config import BelievedConfig, HullEquations
 from residnet.core.config import Config
 from residnet.core.errors import FitError
 from residnet.core.format import format_number
 from residnet.core.frames import to_body
 from residnet.core.layout import ACCELERATIONS, HEADING, POSE, VELOCITIES
-from residnet.core.names import ACCELERATION_NAMES, VELOCITY_NAMES
+from residnet.core.names import ACCELERATION_NAMES, FORCE_CHANNELS, VELOCITY_NAMES
 from residnet.physics.force_model import (
-    FERRY_TERMS,
-    MOTION_CHANNELS,
     ForceCorrection,
     ForceModel,
     augment_mass,
     weighted_column_std,
 )
-from residnet.physics.signals import FORCE_CHANNELS
+from residnet.physics.force_terms import FERRY_TERMS, MOTION_CHANNELS
 from residnet.physics.symmetry import compute_term_parity
-from residnet.physics.terms import TermLibrary, parse_term
+from residnet.physics.term_library import TermLibrary
+from residnet.physics.terms import parse_term
 from residnet.regression.estimator import Estimator, validate_data
 from residnet.regression.least_squares import CentredLeastSquares, ElasticNet
 from residnet.regression.shrinkage import PLSR, Ridge, pls_path

@@ -15,20 +15,22 @@ from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES, suggest_name
 from residnet.dynamics.ensemble import SampledDynamics
 from residnet.evaluation.booklet import BookletConfig, BookletPage, build_booklet
-from residnet.identification.fitter import FittedModel
-from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators, InputShare
+from residnet.identification.fitter import FitStore, FittedModel, Fitter
+from residnet.identification.prepared import PreparedSplits
+from residnet.identification.settings import FitSettings
+from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import Zigzag
 from residnet.manoeuvres.indices import identify_zigzag
+from residnet.manoeuvres.input_shares import InputShare
 from residnet.manoeuvres.trials import (
-    DisturbanceConfig,
     ManoeuvreRun,
-    SensorsConfig,
     SimulatedVessel,
     TrialEnvironment,
     make_manoeuvre_source,
     simulate_manoeuvres,
 )
+from residnet.manoeuvres.trials_config import DisturbanceConfig, SensorsConfig
 from residnet.preprocessing.prepare import PreparedLog
 from residnet.runs.folder import RunFolder
 
@@ -114,16 +116,23 @@ def write_booklet(
     )
 
 
-def require_flyable(config: BookletConfig, fitted_model: FittedModel) -> None:
+def require_flyable(config: BookletConfig, logs: PreparedSplits, settings: FitSettings) -> None:
     """Check that a model has the inputs and states of the booklet, without a simulation.
+
+    Args:
+        config: settings of the booklet.
+        logs: prepared logs by split.
+        settings: settings of the fit, with the parts of a recipe.
 
     Raises:
         ConfigError: if the model lacks an input or a state of the config.
         UsageError: if the model lacks a state that a manoeuvre needs.
     """
-    craft = _build_craft(config, fitted_model, config.inputs)
+    fitter = Fitter(logs, settings, FitStore(), resolve_recipe=False)
+    spec = fitter.build_spec(config.model, "baseline", settings.all_baselines[config.model])
+    craft = _build_craft(config, FittedModel(spec, spec.build(), {}), config.inputs)
     make_manoeuvre_source(
-        config.manoeuvres, craft.helm, torch.arange(2, dtype=torch.float64) * fitted_model.spec.dt
+        config.manoeuvres, craft.helm, torch.arange(2, dtype=torch.float64) * spec.dt
     )
     for manoeuvre in config.manoeuvres:
         manoeuvre.initial_state(craft.initial_state[0], craft.helm.state)

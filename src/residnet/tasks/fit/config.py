@@ -12,14 +12,13 @@ from residnet.core.config import Config
 from residnet.evaluation.booklet import BookletConfig
 from residnet.identification.settings import FitSettings, check_known_names
 from residnet.io.sources import DataConfig, LogsBySplit, list_input_files, read_split_logs
-from residnet.manoeuvres.trials import SimulatedTrials
-from residnet.report.blocks import Section
+from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.report.fit_studies import find_fit_study
-from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, ExportRequest, FinishedRun, PackageTask
 
 if TYPE_CHECKING:
+    from residnet.report.blocks import Section
     from residnet.tasks.fit.service import MonitoredLog, NextTrials, RefitResult
 
 
@@ -94,6 +93,16 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
                 )
         return self
 
+    def check(self) -> None:
+        """Check that the logs contain all that the parts of the fit need, without fitting.
+
+        Raises:
+            ResidnetError: if the run would refuse the config or its logs.
+        """
+        from residnet.tasks.fit.check import check
+
+        check(self)
+
     def input_files(self) -> list[Path]:
         return list_input_files(self.data)
 
@@ -117,6 +126,7 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         from residnet.report.fit import fit_sections, write_fit_figures
+        from residnet.report.run_reader import RunFiles
 
         files = RunFiles(run.path)
         write_fit_figures(files)

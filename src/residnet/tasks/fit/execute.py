@@ -20,7 +20,6 @@ from residnet.evaluation.soundness import build_sanity_file
 from residnet.evaluation.verdict import list_model_objections, rate_model, write_verdict
 from residnet.export.vessel import ExportedVessel
 from residnet.identification.fit import fit_models
-from residnet.identification.fitter import FittedModel, check_fit
 from residnet.identification.identified import (
     build_goodness_rows,
     build_residual_table,
@@ -33,14 +32,13 @@ from residnet.identification.prepared import (
     convert_to_motion_through_water,
     prepare_splits,
 )
-from residnet.io.sources import LogsBySplit
-from residnet.manoeuvres.trials import SimulatedTrials, make_dummy_logs
+from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.verdict import collect_evidence
 from residnet.runs.folder import Provenance, RunFolder, require_apart
 from residnet.runs.model_store import RunModelStore
 from residnet.runs.task import ExportRequest, FinishedRun, TaskOutcome
-from residnet.tasks.fit.booklet import require_flyable, write_booklet
+from residnet.tasks.fit.booklet import write_booklet
 from residnet.tasks.fit.outcome import (
     EXTERNAL_SPLIT,
     build_fit_outcome,
@@ -51,40 +49,11 @@ from residnet.tasks.fit.outcome import (
 )
 
 if TYPE_CHECKING:
-    from residnet.identification.settings import FitSettings
     from residnet.tasks.fit.config import FitConfig
     from residnet.tasks.fit.service import MonitoredLog, NextTrials, RefitResult
 
 _MODEL_ALIASES = ("predictor", "selected")
 """Names that stand for a model: the model reported first, and the single model chosen."""
-
-
-def check(config: FitConfig) -> None:
-    """Check that the logs contain all that the parts of the fit need, without fitting.
-
-    Measured logs are read. Simulated trials, whose simulation takes long, are replaced by logs of
-    the same channels, lengths and manoeuvres.
-
-    Raises:
-        ResidnetError: if the run would refuse the config or its logs.
-    """
-    settings: FitSettings = config
-    if isinstance(config.data, SimulatedTrials):
-        logs: LogsBySplit = {"train": [], "validation": [], "test": []}
-        split_names = config.data.assign_splits(config.data.draw_manoeuvres())
-        for log, split in zip(make_dummy_logs(config.data), split_names, strict=True):
-            logs[split].append(log)
-        # the effect of masks is unknown before the trials are simulated
-        prepare = config.prepare.model_copy(update={"masks": ()})
-        settings = config.model_copy(update={"prepare": prepare})
-    else:
-        logs = config.load_logs()
-        config.cache_logs(logs)
-    fitter = check_fit(prepare_splits(logs, settings), config)
-    if config.booklet is not None:
-        name = config.booklet.model
-        spec = fitter.build_spec(name, "baseline", config.all_baselines[name])
-        require_flyable(config.booklet, FittedModel(spec, spec.build(), {}))
 
 
 def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:

@@ -20,7 +20,7 @@ from residnet.identification.prepared import compute_velocity_limits
 from residnet.io.drafting.reading import find_log_files
 from residnet.io.readers.base import CanonicalConfig
 from residnet.io.split import assign_log_names
-from residnet.manoeuvres.trials import SimulatedTrials
+from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.preprocessing.masks import SpikeMask
 from residnet.preprocessing.prepare import PreparedLog, prepare_log
 from residnet.report.run_reader import RunFiles

@@ -47,7 +47,7 @@ from residnet.identification.recursive_refit import (
     make_refitted_model,
     refit_recursively,
 )
-from residnet.preprocessing.prepare import make_samples
+from residnet.preprocessing.samples import make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.report.blocks import Section, Table, build_table, flag_cell
 from residnet.report.figure import (

@@ -20,7 +20,7 @@ from residnet.core.names import suggest_name
 from residnet.core.processes import InlineExecutor, IsolatedProcessPool, worker_limit
 from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import PackageTask, Task
+from residnet.runs.task import PackageTask, PartName, Task
 from residnet.tasks.registry import SweepableConfig
 
 _MAX_TRIALS = 100_000
@@ -146,6 +146,38 @@ class TpeSearch(RandomSearch):
 
     kind: Literal["tpe"]  # type: ignore[assignment]
     startup: int = Field(default=10, ge=1)
+
+
+class VariantSearch(Config):
+    """Ablation: named variants of a fit, each over several seeds, compared window by window.
+
+    Attributes:
+        kind: kind of the search.
+        variants: overrides of the base by name of the variant.
+        reference: variant with which the others are compared.
+        model: model whose free-run errors are compared; `selected` for the model that each run
+            selects on validation data.
+        split: split of the compared windows.
+        seeds: seeds with which each variant is fitted.
+    """
+
+    kind: Literal["variants"]
+    variants: dict[PartName, tuple[str, ...]] = Field(min_length=2)
+    reference: str
+    model: str = "selected"
+    split: Literal["validation", "test"] = "test"
+    seeds: tuple[Annotated[int, Field(ge=0)], ...] = Field(default=(0, 1, 2), min_length=1)
+
+    @model_validator(mode="after")
+    def _validate_reference(self) -> VariantSearch:
+        if self.reference not in self.variants:
+            raise ValueError(
+                "reference: no variant is named"
+                f" '{self.reference}'{suggest_name(self.reference, self.variants)}"
+            )
+        if len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds: each only once, given {list(self.seeds)}")
+        return self
 
 
 class PruningConfig(Config):
@@ -402,7 +434,9 @@ class _RayExecutor(Executor):
         return future
 
 
-SearchConfig = Annotated[GridSearch | RandomSearch | TpeSearch, Field(discriminator="kind")]
+SearchConfig = Annotated[
+    GridSearch | RandomSearch | TpeSearch | VariantSearch, Field(discriminator="kind")
+]
 ObjectiveConfig = Annotated[FreeRunObjective | FigureObjective, Field(discriminator="kind")]
 RunnerConfig = Annotated[ProcessesConfig | RayConfig, Field(discriminator="kind")]
 
@@ -415,9 +449,10 @@ class SweepConfig(PackageTask):
         base: config of any task but a sweep: a path, or the name of a config that comes with
             residnet, such as `quickstart`; paths in it are relative to its own folder.
         common: overrides of the base for all trials.
-        space: values by key of the base, such as `heads.mlp.hidden`.
-        search: search method.
-        objective: optimised quantity.
+        space: values by key of the base, such as `heads.mlp.hidden`; empty with
+            `search: {kind: variants}`.
+        search: search method, or `variants` of a fit.
+        objective: optimised quantity; not used by `variants`.
         pruning: early end of poor trials; null for none.
         runner: processes that run the trials.
     """
@@ -427,7 +462,7 @@ class SweepConfig(PackageTask):
     task: Literal["sweep"]
     base: BaseConfig
     common: tuple[str, ...] = ()
-    space: dict[str, SearchValues] = Field(min_length=1)
+    space: dict[str, SearchValues] = Field(default_factory=dict)
     search: SearchConfig
     objective: ObjectiveConfig = FreeRunObjective()
     pruning: PruningConfig | None = None
@@ -435,6 +470,16 @@ class SweepConfig(PackageTask):
 
     @model_validator(mode="after")
     def _validate_sweep(self) -> SweepConfig:
+        if isinstance(self.search, VariantSearch):
+            if self.space or self.pruning is not None:
+                raise ValueError(
+                    "search.kind: variants are compared as they are; leave space and pruning out"
+                )
+            if not isinstance(self.runner, ProcessesConfig):
+                raise ValueError("runner: variants are fitted in processes of this machine")
+            return self
+        if not self.space:
+            raise ValueError("space: missing; give values by key of the base")
         if isinstance(self.search, GridSearch):
             for key, values in self.space.items():
                 try:
@@ -455,7 +500,34 @@ class SweepConfig(PackageTask):
         """Number of trials of the search; for a grid, the number of combinations."""
         if isinstance(self.search, GridSearch):
             return math.prod(len(values.grid_values()) for values in self.space.values())
+        if isinstance(self.search, VariantSearch):
+            return len(self.search.variants) * len(self.search.seeds)
         return self.search.trials
+
+    def build_variant(self, variant: str, seed: int) -> tuple[Any, list[str]]:
+        """Return the fit of a variant with a seed, and the overrides of its base.
+
+        Raises:
+            ConfigError: if the config is not valid.
+            UsageError: if the base is no fit, or has no model of the compared name.
+        """
+        assert isinstance(self.search, VariantSearch)
+        overrides = [
+            *self.common,
+            *self.search.variants[variant],
+            f"name={self.name}.{variant}.{seed}",
+            f"seed={seed}",
+        ]
+        task = load_config(self.base, overrides, SweepableConfig)
+        if task.task != "fit":
+            raise UsageError(f"search: variants are compared of a fit, and {self.base} is no fit")
+        models = ("selected", *task.model_names)
+        if self.search.model not in models:
+            raise UsageError(
+                f"variant {variant}: no model is named"
+                f" '{self.search.model}'{suggest_name(self.search.model, models)}"
+            )
+        return task, overrides
 
     def build_trial(self, values: Mapping[str, Any], name: str) -> tuple[Any, list[str]]:
         """Return the task of a trial and the overrides of its base.
@@ -482,6 +554,10 @@ class SweepConfig(PackageTask):
         Raises:
             ResidnetError: if a config is not valid, or the objective does not fit the task.
         """
+        if isinstance(self.search, VariantSearch):
+            for variant in self.search.variants:
+                self.build_variant(variant, self.search.seeds[0])[0].check()
+            return
         require_package("optuna", "task sweep", "sweep")
         self.runner.require_available()
         first_values = {key: values.boundary_values()[0] for key, values in self.space.items()}
@@ -498,4 +574,6 @@ class SweepConfig(PackageTask):
         return [self.base, *base.input_files()]
 
     def provenance_seed(self) -> int:
+        if isinstance(self.search, VariantSearch):
+            return self.search.seeds[0]
         return 0 if isinstance(self.search, GridSearch) else self.search.seed

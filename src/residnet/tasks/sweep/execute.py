@@ -1,4 +1,4 @@
-"""Carry out the task `sweep`.
+"""Carry out the task `sweep`; `variants.py` carries out the search `variants`.
 
 Optuna records the trials in a journal, so that an interrupted sweep can be resumed. Each trial is a
 run in its own process.
@@ -23,7 +23,8 @@ from residnet.core.progress import Progress, log_message, on_progress, report_pr
 from residnet.report.sections.sweep import trials_table
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import SummaryMetric, TaskOutcome
-from residnet.tasks.sweep.config import GridSearch, TpeSearch
+from residnet.tasks.sweep.config import GridSearch, TpeSearch, VariantSearch
+from residnet.tasks.sweep.variants import compare_variants_of_fit
 
 if TYPE_CHECKING:
     import optuna
@@ -47,6 +48,8 @@ def execute(config: SweepConfig, folder: RunFolder) -> TaskOutcome:
     Raises:
         ResidnetError: if a trial cannot be run, or the journal is damaged.
     """
+    if isinstance(config.search, VariantSearch):
+        return compare_variants_of_fit(config, config.search, folder)
     journal = folder.path / JOURNAL_FILE
     for file in (journal, journal.with_name(f"{JOURNAL_FILE}.lock")):
         folder.manifest.record(file, None)

@@ -72,7 +72,7 @@ from residnet.runs.model_store import RunModelStore
 from residnet.runs.task import ExportRequest, SummaryMetric, TaskOutcome
 
 if TYPE_CHECKING:
-    from residnet.autopilot.tasks.autopilot import (
+    from residnet.autopilot.tasks.autopilot.config import (
         AnyController,
         AutopilotConfig,
         EvaluationConditions,
@@ -82,7 +82,7 @@ Controllers = dict[str, tuple[str, Policy]]
 """Role (policy, classical, floor and others) and controller by name."""
 
 
-def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
+def execute(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
     """Tune, train and compare."""
     config = config.with_scaled_times()
     vessel = config.steered_vessel
@@ -156,7 +156,7 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
         *_summarize(config, rows),
         "\n\n".join(table.to_text() for table in tables),
         exports={
-            name: partial(export_policy, config, ExportRequest(folder, name))
+            name: partial(export_model, config, ExportRequest(folder, name))
             for name in config.policies
         },
     )
@@ -458,7 +458,7 @@ def _summarize(
     return sentences, summary_metrics
 
 
-def export_policy(config: AutopilotConfig, request: ExportRequest) -> Path:
+def export_model(config: AutopilotConfig, request: ExportRequest) -> Path:
     """Write a policy of a run, with its rows of metrics.json in the card; returns the file.
 
     Raises:

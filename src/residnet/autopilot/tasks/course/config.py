@@ -14,7 +14,7 @@ from residnet.autopilot.courses.config import BuoyCourseConfig, plan_course, sma
 from residnet.autopilot.courses.course_check import Protocol
 from residnet.autopilot.guidance import AnyLineOfSight
 from residnet.autopilot.heading.steering_variation import Vessels
-from residnet.autopilot.tasks.autopilot import AnyController, AutopilotConfig
+from residnet.autopilot.tasks.autopilot.config import AnyController, AutopilotConfig
 from residnet.core.config import (
     Config,
     ExistingPath,
@@ -25,9 +25,9 @@ from residnet.core.config import (
 )
 from residnet.core.errors import ConfigError
 from residnet.core.names import suggest_name
-from residnet.dynamics.simulated import check_steps
+from residnet.dynamics.time_steps import check_steps
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, ExportRequest, PartName, TaskOutcome
+from residnet.runs.task import ComputingTask, ExportRequest, PackageTask, PartName
 
 
 class CourseSpreadConfig(Config):
@@ -78,7 +78,7 @@ class CourseSpreadConfig(Config):
 
 
 @final
-class CourseTaskConfig(ComputingTask):
+class CourseTaskConfig(PackageTask, ComputingTask):
     """A course past buoys, the compared controllers, and line-of-sight laws without a plan.
 
     Attributes:
@@ -188,19 +188,7 @@ class CourseTaskConfig(ComputingTask):
             except ConfigError as error:
                 raise ConfigError(f"course.buoys, protocol {protocol}: {error}") from error
 
-    def execute(self, folder: RunFolder) -> TaskOutcome:
-        """Train the policy if necessary, plan the courses, simulate and compare.
-
-        Raises:
-            ConfigError: if no course is possible with the turns of the vessel.
-            FitError: if training fails.
-        """
-        from residnet.autopilot.tasks.course_run import run_course
-
-        return run_course(self, folder)
-
     def export_model(self, request: ExportRequest) -> Path:
         """Write a policy with the guidance of a course, named after both; returns the file."""
-        from residnet.autopilot.tasks.course_run import export_course
-
-        return export_course(self, request)
+        file: Path = self.call_executor("export_model", request)
+        return file

@@ -30,13 +30,12 @@ from residnet.autopilot.training.config import PolicyTraining
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.progress import log_message
-from residnet.dynamics.simulated import check_steps
 from residnet.dynamics.store import load_model, resolve_model_name
-from residnet.manoeuvres.trials import DisturbanceConfig, WindConfig
-from residnet.physics.environment import WavesConfig
+from residnet.dynamics.time_steps import check_steps
+from residnet.manoeuvres.trials_config import DisturbanceConfig, WindConfig
+from residnet.physics.environment_config import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
-from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, ExportRequest, PartName, TaskOutcome
+from residnet.runs.task import ComputingTask, ExportRequest, PackageTask, PartName
 
 AnyController = Annotated[ClassicalController | DocumentConfig, Field(discriminator="kind")]
 
@@ -166,7 +165,7 @@ class StepTestConfig(Config):
 
 
 @final
-class AutopilotConfig(ComputingTask):
+class AutopilotConfig(PackageTask, ComputingTask):
     """Policies of heading or depth trained through the vessel, compared with tuned controllers.
 
     Attributes:
@@ -464,27 +463,14 @@ class AutopilotConfig(ComputingTask):
         }
         return self.model_copy(update=updates)
 
-    def execute(self, folder: RunFolder) -> TaskOutcome:
-        """Train, tune and compare.
-
-        Raises:
-            FitError: if tuning or training fails.
-        """
-        from residnet.autopilot.tasks.autopilot_run import run_autopilot
-
-        return run_autopilot(self, folder)
-
     def export_model(self, request: ExportRequest) -> Path:
         """Export a policy of a finished run for controllers; returns the file."""
-        from residnet.autopilot.tasks.autopilot_run import export_policy
-
-        return export_policy(self, request)
+        file: Path = self.call_executor("export_model", request)
+        return file
 
 
 _PUSH_STD_FACTOR = 2.0
 """Standard deviations of the slow push that the rudder must be able to hold."""
-
-
 _REFERENCE_STEP = math.radians(30.0)
 REFERENCE_STEERING = NomotoModel(3.47, 3.94, 3.2), math.radians(5.0)
 """K, T and rudder of the vessel of document 004; times in configs refer to it at a pace of one."""

@@ -37,8 +37,8 @@ from residnet.autopilot.heading.policies import HeadingPolicy
 from residnet.autopilot.heading.steering_variation import NOMINAL, Vessels
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.report.course import COURSES_FILE, SPREAD_FILE, TRACKS_FILE, tables_text
-from residnet.autopilot.tasks.autopilot import AnyController, AutopilotConfig
-from residnet.autopilot.tasks.autopilot_run import load_trained_policy
+from residnet.autopilot.tasks.autopilot.config import AnyController, AutopilotConfig
+from residnet.autopilot.tasks.autopilot.execute import load_trained_policy
 from residnet.autopilot.training.predictor import load_predictive_controller
 from residnet.core.errors import ExportError
 from residnet.core.files import read_json
@@ -50,7 +50,7 @@ from residnet.runs.folder import RunFolder
 from residnet.runs.task import ExportRequest, SummaryMetric, TaskOutcome
 
 if TYPE_CHECKING:
-    from residnet.autopilot.tasks.course import CourseTaskConfig
+    from residnet.autopilot.tasks.course.config import CourseTaskConfig
 
 _COLUMN_UNITS = {
     "course_time": "s",
@@ -65,7 +65,7 @@ _COLUMN_UNITS = {
 }
 
 
-def run_course(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
+def execute(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
     """Train the policy if necessary, plan the courses, simulate and compare."""
     if not config.autopilot.is_dir() and not RunFolder(folder.path / "autopilot").is_finished:
         config.load_autopilot_config().run(
@@ -104,7 +104,7 @@ def run_course(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
                     results,
                 )
         request = ExportRequest(folder, f"{config.policy}_{protocol}")
-        exports[request.model] = partial(export_course, config, request, (planned_course, guidance))
+        exports[request.model] = partial(export_model, config, request, (planned_course, guidance))
     metrics_json = {
         "schema": SCHEMA,
         "run": config.name,
@@ -493,7 +493,7 @@ def _replan_and_verify(
     return planned_course, guidance
 
 
-def export_course(
+def export_model(
     config: CourseTaskConfig,
     request: ExportRequest,
     existing_plan: tuple[PlannedCourse, CourseGuidance] | None = None,

@@ -1,0 +1,105 @@
+"""Configuration of the MMG standard model of a ship."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from residnet.baselines.config import IdentifiedConfig, require_channels
+from residnet.baselines.mmg_parameters import (
+    PARAMETER_NAMES,
+    MMGHull,
+    MMGPropeller,
+    MMGRudder,
+    ParameterPrior,
+    default_priors,
+)
+from residnet.core.names import VELOCITY_NAMES, suggest_name
+from residnet.core.sample_origins import SampleOrigins
+
+if TYPE_CHECKING:
+    from residnet.baselines.base import Baseline
+    from residnet.baselines.mmg import MMGBaseline
+    from residnet.core.samples import Samples
+    from residnet.regression.estimator import Solution
+
+
+class MMGConfig(IdentifiedConfig):
+    """MMG standard model of a ship with one propeller and one rudder.
+
+    The model follows Yasukawa and Yoshimura (2015). Every parameter has a prior with a mean and
+    a standard deviation, which default to usual values. The fit is the maximum a posteriori
+    estimate from the measured accelerations. A `refit` of this baseline on free runs continues from
+    it and yields the standard errors of the prediction intervals.
+
+    Attributes:
+        hull: particulars of the hull.
+        propeller: particulars of the propeller.
+        rudder: particulars of the rudder.
+        beliefs: prior mean and standard deviation by non-dimensional parameter, for parameters that
+            differ from the defaults; a standard deviation of 0 fixes the parameter.
+        revolutions: channel of the propeller revolutions, 1/s.
+        angle: channel of the rudder angle, rad, positive to starboard.
+        correlation: number of successive acceleration samples with the information of one
+            independent sample.
+        manoeuvres: kinds of manoeuvre to fit on; empty for all.
+    """
+
+    kind: Literal["mmg"] = "mmg"
+    hull: MMGHull
+    propeller: MMGPropeller
+    rudder: MMGRudder
+    beliefs: dict[str, tuple[float, Annotated[float, Field(ge=0)]]] = Field(default_factory=dict)
+    revolutions: str = "n"
+    angle: str = "delta"
+    correlation: int = Field(default=100, ge=1, le=100_000)
+    manoeuvres: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _validate_beliefs(self) -> MMGConfig:
+        for name in self.beliefs:
+            if name not in PARAMETER_NAMES:
+                raise ValueError(
+                    f"beliefs: no parameter '{name}'{suggest_name(name, PARAMETER_NAMES)}"
+                )
+        return self
+
+    def check_channels(self, names: Sequence[str]) -> None:
+        require_channels(names, self.required_channels, "the baseline 'mmg'")
+
+    def is_parametric(self, names: Sequence[str]) -> bool:
+        return True
+
+    def has_regressors(self, names: Sequence[str]) -> bool:
+        return False
+
+    def has_inertia_matrix(self, names: Sequence[str]) -> bool:
+        return False
+
+    @property
+    def required_channels(self) -> tuple[str, ...]:
+        """Channels of velocities, propeller revolutions and rudder angle."""
+        return (*VELOCITY_NAMES, self.revolutions, self.angle)
+
+    def build(self, names: Sequence[str]) -> MMGBaseline:
+        """Build the baseline for channels `names`, with every parameter at its prior mean."""
+        from residnet.baselines.mmg import MMGBaseline, MMGForces
+
+        self.check_channels(names)
+        columns = [list(names).index(name) for name in self.required_channels]
+        configured_priors = {
+            name: ParameterPrior(*mean_and_std, "") for name, mean_and_std in self.beliefs.items()
+        }
+        priors = (default_priors(self.hull) | configured_priors).values()
+        return MMGBaseline(MMGForces(self.hull, self.propeller, self.rudder, columns), priors)
+
+    def validate_samples(self, samples: SampleOrigins) -> None:
+        samples.require_manoeuvres(self.manoeuvres)
+
+    def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+        from residnet.baselines.mmg import MMGBaseline, fit_mmg
+
+        assert isinstance(baseline, MMGBaseline)
+        return [fit_mmg(self, baseline, samples)]

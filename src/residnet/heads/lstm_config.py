@@ -1,0 +1,98 @@
+"""Configuration of the LSTM head (document 003 eq. (17), correction W4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field, model_validator
+
+from residnet.core.errors import ConfigError
+from residnet.heads.config import FeatureConfig, NetworkConfig
+from residnet.physics.symmetry import get_dof, require_mirror_image
+
+if TYPE_CHECKING:
+    from residnet.heads.base import ResidualHead
+
+
+class LstmConfig(NetworkConfig):
+    """LSTM for all axes, or an LSTM per axis.
+
+    Attributes:
+        hidden_size: number of hidden units.
+        readout: number of units of a tanh layer between (hidden state, features) and the residual;
+            0 for a linear readout of the hidden state, as in document 003.
+        memory: features that the LSTM receives; empty for all. An LSTM of the commands only has the
+            same states in a free run and in teacher forcing: it can represent actuator dynamics but
+            not infer measured accelerations. Needs `readout`, which receives all features.
+        activation: activation of block input and output; softsign in document 003 instead of tanh.
+        dropout: dropout probability of the hidden outputs before the readout.
+        per_axis: whether surge, sway and yaw have a network each, as in document 003.
+        axis_features: channels of the network of each axis if they differ; needs `per_axis`.
+        mirror: whether the residual is mirror-symmetric between port and starboard by construction.
+        restoring: whether a restoring acceleration acts on velocities outside their training range,
+            so that a network without a baseline cannot diverge.
+    """
+
+    kind: Literal["lstm"] = "lstm"
+    hidden_size: int = Field(default=32, ge=1, le=10_000)
+    readout: int = Field(default=32, ge=0, le=10_000)
+    memory: tuple[str, ...] = ()
+    activation: Literal["tanh", "softsign"] = "tanh"
+    dropout: float = Field(default=0.0, ge=0, lt=1)
+    per_axis: bool = False
+    axis_features: dict[Literal["u", "v", "r"], tuple[str, ...]] | None = None
+    mirror: bool = False
+    restoring: bool = False
+
+    @model_validator(mode="after")
+    def _validate_axes(self) -> LstmConfig:
+        if self.axis_features is not None:
+            if not self.per_axis:
+                raise ValueError("axis_features needs per_axis: true")
+            if set(self.axis_features) != {"u", "v", "r"}:
+                raise ValueError(
+                    f"axis_features: expected all of u, v, r, got {sorted(self.axis_features)}"
+                )
+        if self.memory and not self.readout:
+            raise ValueError(
+                "memory needs a readout layer, which receives the other features; set readout"
+            )
+        return self
+
+    def check_channels(self, names: Sequence[str]) -> None:
+        for feature_names, _ in self.network_specs(names):
+            self.select_memory(feature_names)
+        if self.mirror:
+            require_mirror_image(names)
+
+    def select_memory(self, feature_names: Sequence[str]) -> tuple[str, ...]:
+        """Return the features that the LSTM receives.
+
+        Raises:
+            ConfigError: if one of `memory` is not a feature.
+        """
+        return FeatureConfig(features=self.memory).select_features(feature_names)
+
+    def build(self, names: Sequence[str]) -> ResidualHead:
+        """Build the head for channels `names`."""
+        from residnet.heads.lstm import LstmHead
+        from residnet.heads.mirror import MirroredHead
+
+        head = LstmHead(self, names)
+        return MirroredHead(head, names) if self.mirror else head
+
+    def network_specs(self, names: Sequence[str]) -> list[tuple[tuple[str, ...], int]]:
+        """Return (features, number of outputs) of each network."""
+        if not self.per_axis:
+            return [(self.select_features(names), get_dof(names).n_dynamic)]
+        if get_dof(names).has_roll:
+            raise ConfigError(
+                "per_axis: supports surge, sway and yaw, but the model has roll; remove per_axis"
+            )
+        if self.axis_features is None:
+            return [(self.select_features(names), 1)] * get_dof(names).n_dynamic
+        return [
+            (FeatureConfig(features=self.axis_features[axis]).select_features(names), 1)
+            for axis in ("u", "v", "r")
+        ]

@@ -1,0 +1,54 @@
+"""Shares of drive and steer of the inputs of a learned model."""
+
+from __future__ import annotations
+
+from residnet.core.config import Config, Quantity
+from residnet.core.errors import ConfigError
+from residnet.core.names import CHANNEL_UNITS
+
+_RATE_UNITS = {"rad": "rad/s", "1/s": "1/s^2", "m": "m/s", "-": "1/s"}
+
+
+class InputShare(Config):
+    """The mapping from drive and steer of a manoeuvre to one input of a learned model.
+
+    Values are numbers in the SI unit of the input, or texts with a unit.
+
+    Attributes:
+        drive: value at full drive.
+        steer: value at full steer to starboard.
+        centre: value without demand.
+        limit: largest deviation from `centre` to both sides; None for the sum of drive and steer.
+        rate: largest change per second; None for no rate limit.
+    """
+
+    drive: float | str = 0.0
+    steer: float | str = 0.0
+    centre: float | str = 0.0
+    limit: float | str | None = None
+    rate: float | str | None = None
+
+    def to_si(self, name: str) -> list[float]:
+        """Return drive, steer, centre, limit and rate of the input `name` in SI.
+
+        Raises:
+            ConfigError: if a value has a wrong unit, or the input does not depend on drive and
+                steer.
+        """
+        unit = CHANNEL_UNITS.get(name, "-")
+        value = Quantity(unit)
+        rate = Quantity(_RATE_UNITS[unit]) if unit in _RATE_UNITS else None
+        max_rate = float("inf")
+        try:
+            drive, steer, centre = map(value.convert, (self.drive, self.steer, self.centre))
+            limit = abs(drive) + abs(steer) if self.limit is None else value.convert(self.limit)
+            if self.rate is not None:
+                max_rate = float(self.rate) if rate is None else rate.convert(self.rate)
+        except ValueError as error:
+            raise ConfigError(f"inputs.{name}: {error}") from None
+        if limit <= 0 or max_rate <= 0:
+            raise ConfigError(
+                f"inputs.{name}: limit and rate must be above zero, and drive or steer must not be"
+                f" zero; got a limit of {limit:g} and a rate of {max_rate:g}"
+            )
+        return [drive, steer, centre, limit, max_rate]

@@ -1,0 +1,159 @@
+"""The report of the variants of a fit: errors of each, and paired differences to the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from residnet.core.format import format_count, format_signed
+from residnet.report.blocks import (
+    Cell,
+    Column,
+    Section,
+    Table,
+    Text,
+    build_table,
+    format_paired_interval,
+)
+from residnet.report.figure import (
+    BLUE,
+    Case,
+    Figure,
+    GlyphStyle,
+    Panel,
+    error_bars,
+    join_with_gaps,
+    tick_labels,
+)
+from residnet.report.figure_files import write_figures
+from residnet.report.run_reader import JsonObject, RunFiles
+
+VARIANTS_FILE = "variants.json"
+"""File of a run folder with the errors of all variants."""
+
+
+def variant_sections(files: RunFiles) -> list[Section]:
+    """Return the sections of the report, and draw the figure."""
+    content = files.read_json(VARIANTS_FILE)
+    rows = content["rows"]
+    figure_blocks = write_figures(
+        files.path / "figures", [plot_differences(rows, content["reference"])]
+    )
+    explanation = [
+        f"Free-run NRMSE of model {content['model']} on {content['split']} data, mean over the"
+        f" windows and {format_count(rows[0]['seeds'], 'seed')}.",
+        f"Difference: to {content['reference']} over the same windows, seeds averaged first;"
+        " negative is better, and a bold interval excludes 0. Its 95 % interval comes from"
+        " blocks of windows.",
+    ]
+    table = tabulate_variants(rows, content["reference"])
+    return [Section("", [table, *figure_blocks, Text(explanation, is_secondary=True)])]
+
+
+def plot_differences(rows: Sequence[JsonObject], reference: str) -> Figure:
+    """Plot the differences to the reference with intervals, one panel for each protocol.
+
+    Args:
+        reference: name of the reference variant.
+    """
+    protocols = list(dict.fromkeys(row["protocol"] for row in rows))
+    names = [name for name in dict.fromkeys(row["variant"] for row in rows) if name != reference]
+    panel_curves = []
+    panels = []
+    for protocol in protocols:
+        protocol_rows = [
+            row for row in rows if row["protocol"] == protocol and row["variant"] != reference
+        ]
+        positions = [names.index(row["variant"]) for row in protocol_rows]
+        interval_spans = [
+            (position, *row["difference_ci95"])
+            for position, row in zip(positions, protocol_rows, strict=True)
+            if row["difference_ci95"]
+        ]
+        interval_lines = join_with_gaps(
+            [
+                error_bars(*[[part] for part in interval_span])[::-1]
+                for interval_span in interval_spans
+            ]
+        )
+        points = (
+            np.array([row["difference"] for row in protocol_rows]),
+            np.array(positions, dtype=float),
+        )
+        panel_curves.append(
+            {"interval": interval_lines, "difference": points, "zero": (np.zeros(1), np.zeros(1))}
+        )
+        label = f"{protocol}: NRMSE minus that of {reference} [-]"
+        panels.append(
+            Panel(
+                "",
+                label,
+                height=80 + 31 * len(names),
+                group=protocol,
+                y_names=tick_labels(names),
+                y_limits=(len(names) - 0.5, -0.5),
+            )
+        )
+    return Figure(
+        "variants",
+        "Variants of the recipe",
+        f"Free-run error of each variant minus that of {reference}, mean over windows and seeds."
+        " The bars are 95 % intervals over logs.",
+        {
+            "zero": GlyphStyle("", "#666666", width=0.8, kind="upright", z_order=1),
+            "interval": GlyphStyle("95 % interval", width=1.2),
+            "difference": GlyphStyle("difference", BLUE, kind="points", size=4.5, z_order=4),
+        },
+        panels,
+        [Case("", panel_curves)],
+        columns=len(protocols),
+    )
+
+
+def tabulate_variants(rows: Sequence[JsonObject], reference: str) -> Table:
+    """Return the table of variants with error and difference under each protocol.
+
+    Args:
+        reference: name of the reference variant.
+    """
+    by_variant: dict[str, dict[str, JsonObject]] = {}
+    for row in rows:
+        by_variant.setdefault(row["variant"], {})[row["protocol"]] = row
+    protocols = list(dict.fromkeys(row["protocol"] for row in rows))
+
+    def format_error(row: JsonObject) -> Cell:
+        # results of earlier versions have no count of diverged windows
+        n_diverged = int(row.get("diverged", 0))
+        note = f"{n_diverged} diverged" if n_diverged else ""
+        protocol_rows = [other for other in rows if other["protocol"] == row["protocol"]]
+        is_lowest = row["nrmse_mean"] == min(other["nrmse_mean"] for other in protocol_rows)
+        return Cell(
+            f"{row['nrmse_mean']:.4f}", note, "bad" if n_diverged else "best" if is_lowest else ""
+        )
+
+    protocol_columns: list[Column] = [
+        ("NRMSE", format_error),
+        ("sd of seeds", lambda row: row["nrmse_sd"], 4),
+        (
+            "difference",
+            lambda row: format_signed(row["difference"]) if row["difference_ci95"] else "",
+            str,
+        ),
+        ("95 % interval", lambda row: format_paired_interval(row["difference_ci95"], "")),
+    ]
+    return build_table(
+        by_variant.values(),
+        [
+            ("variant", lambda row: row[protocols[0]]["variant"]),
+            *(
+                (title, lambda row, name=name, of=cell_function: of(row[name]), *number_format)
+                for name in protocols
+                for title, cell_function, *number_format in protocol_columns
+            ),
+            ("run [s]", f"{protocols[0]}.seconds", 0),
+            ("what changes", lambda row: ", ".join(row[protocols[0]]["overrides"])),
+        ],
+        groups=[*((f"protocol {name}", len(protocol_columns)) for name in protocols), ("", 2)],
+        is_selected=lambda row: row[protocols[0]]["variant"] == reference,
+    )
