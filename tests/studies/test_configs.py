@@ -16,18 +16,22 @@ GRID = "halvorsen2019/table_5_2"
 TRIAL = "halvorsen2019/standard_model"
 FAST = "rows={key: head.evolution.crossover, values: [0.1, 0.9]}"
 REFUSED: tuple[tuple[str, tuple[str, ...], str], ...] = (
-    (FERRY, ("true=wam_v_cal",), "actuators push in surge, sway and yaw"),
+    (FERRY, ("true=wam_v_cal",), "actuators for surge, sway and yaw"),
     (FERRY, ("models.lag_ridge.on=nothing",), "no preceding model"),
     (FERRY, ("models.lag_ridge.terms=[u_dott]",), "u_dott"),
     (FERRY, ("course.interval=0.05",), "whole number of steps"),
     (SEA, ("models.ridge.lag=true",), "set force to 'commanded'"),
-    (SEA, ("models.ridge.fit={kind: surface, choose: test}",), "judge a model choose it"),
+    (
+        SEA,
+        ("models.ridge.fit={kind: surface, choose: test}",),
+        "selected on the samples of its evaluation",
+    ),
     (SEA, ("models.ridge.terms=[u_dott]",), "u_dott"),
     (SEA, ("models.zero={fit: {kind: ols}}",), "is reserved for a reference model"),
     (SEA, ("believed=nomoto_mariner",), "a believed hull needs"),
     (SEA, ("models.ols.fit.order=3",), "an option of kind plsr"),
     (SEA, ("validation.gap=0",), "at least one step"),
-    (SEA, ("prepare.hold=mean",), "leave it out"),
+    (SEA, ("prepare.hold=mean",), "nothing is simulated"),
     (GRID, ("rows.key=head.evolution.populaton",), "did you mean 'population'"),
     (
         GRID,

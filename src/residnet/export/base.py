@@ -43,7 +43,7 @@ from residnet.evaluation.assessment import Assessment
 NumberArray = npt.NDArray[Any]
 SINGLE_TOLERANCE = 1e-5
 DOUBLE_TOLERANCE = 1e-12
-"""Largest difference in each precision, as a share of a channel's range."""
+"""Largest difference in each precision, relative to the range of a channel."""
 Attempt = TypeVar("Attempt")
 
 
@@ -54,10 +54,11 @@ class RoundingError(ExportError):
 
 
 class LoadedExport(ABC):
-    """A file that was written, loaded back; arrays of one row.
+    """An exported file that was loaded again; arrays have one row.
 
     Attributes:
-        reorders_sums: whether it adds up in another order than torch, so that rounding may grow.
+        reorders_sums: whether sums are computed in another order than in torch, so that rounding
+            errors may grow.
     """
 
     reorders_sums: bool = True
@@ -75,15 +76,16 @@ class LoadedExport(ABC):
         return tuple(map(np.stack, results))
 
     def initial_memory(self, *measured_past: NumberArray) -> NumberArray | None:
-        """Return the memory that a past leaves; None where the format has only steps.
+        """Return the memory after a measured past; None for a format that has only steps.
 
-        It is measured states [T, nx] and inputs [T, m] of a vessel, and the first measurement of a
-        controller.
+        Args:
+            measured_past: states [T, nx] and inputs [T, m] for a vessel, the first measurement for
+                a controller.
         """
         return None
 
     def rollout(self, *rollout_arguments: NumberArray) -> NumberArray | None:
-        """Return the states of a free run of one row; None where the format has only steps."""
+        """Return the states of a free run of one row; None for a format that has only steps."""
         return None
 
 
@@ -116,10 +118,10 @@ class Exportable(ABC):
     assessment: Assessment | None = None
 
     def require_finite_numbers(self) -> None:  # noqa: B027 (policies are built from finite numbers)
-        """Refuse what holds numbers that are not finite.
+        """Check that all parameters are finite.
 
         Raises:
-            ExportError: that names the first such number.
+            ExportError: if a number is not finite; names the first one.
         """
 
     @abstractmethod
@@ -173,7 +175,7 @@ class Exportable(ABC):
             if key not in ("exported", "metrics", "versions")
         }
         digest.update(json.dumps(settings, sort_keys=True, default=str).encode())
-        # a module of TorchScript may be a trace, whose numbers have no names
+        # not from the TorchScript module: numbers in a trace have no names
         module = self.build_step_module(self.precisions[-1])
         numbers = {**dict(module.named_parameters()), **dict(module.named_buffers())}
         for name, value in sorted(numbers.items()):
@@ -208,11 +210,11 @@ class Exporter(ABC):
     subclass without arguments.
 
     Attributes:
-        name: what `residnet export --format` knows it by.
-        suffix: what follows the model's name in the file's name, for example `.pt`.
+        name: name in `residnet export --format`.
+        suffix: suffix of the file name after the name of the model, for example `.pt`.
         about: one line for `residnet list formats`.
-        default_name_from_run: whether a file that is not named takes the name of its run, because
-            the file's name becomes part of symbols that must be unique in a program.
+        default_name_from_run: whether the default file name is the name of the run, because it
+            becomes part of symbols that must be unique in a program.
     """
 
     name: ClassVar[str]
@@ -262,7 +264,7 @@ def require_releasable(
 def run_in_sufficient_precision(
     exported: Exportable, attempt: Callable[[torch.dtype], Attempt]
 ) -> tuple[torch.dtype, Attempt]:
-    """Return the first precision that determines the answers, and what an attempt gave in it."""
+    """Return the first precision in which rounding has no effect, and the result of the attempt."""
     for dtype in exported.precisions[:-1]:
         try:
             return dtype, attempt(dtype)
@@ -272,7 +274,7 @@ def run_in_sufficient_precision(
 
 
 def get_dtype_name(dtype: torch.dtype) -> str:
-    """Return a precision as cards name it."""
+    """Return the name of a precision in cards."""
     return "float64" if dtype == torch.float64 else "float32"
 
 

@@ -33,16 +33,16 @@ from residnet.physics.force_terms import MOTION_CHANNELS
 FADE_SHARE = 0.25
 """Share of the width of a training range, beyond its edge, over which a correction fades out."""
 MAX_FORCE_RATIO = 1.2
-"""Most force outside the training range, in forces of the believed model, axis by axis."""
+"""Largest force of an axis outside the training range, relative to that of the believed model."""
 _TOLERANCE = 1e-9
-"""Largest difference of a file, as a share of each force's range."""
+"""Largest difference of an exported file, relative to the range of each force."""
 _EDGE_SHARE = 0.05
-"""Share of the width of a training range, within its edge, over which that limit sets in."""
+"""Share of the width of a training range, within its edge, over which this limit is blended in."""
 
 
 @final
 class BelievedForce(nn.Module):
-    """The force [B, 3] that a baseline believes a motion needs: M (nu_dot - nu_dot_0), SI.
+    """The force [B, 3] of a motion according to the baseline: M (nu_dot - nu_dot_0), SI.
 
     nu_dot_0 is its acceleration without forces.
     """
@@ -75,10 +75,9 @@ class ResidualForce(nn.Module):
 class RequiredForce(nn.Module):
     """The force tau [B, 3] = F(nu_dot [B, 3], nu [B, 3]) of a believed model and its correction.
 
-    A vessel is the same to port and starboard, while a correction that was fitted to a log is not
-    quite: with `is_mirrored` it is the mean of itself and its mirror image, so that a straight
-        course
-    needs neither sway force nor yaw moment.
+    A vessel is symmetric, but a correction that was fitted to a log is not exactly. With
+    `is_mirrored` it is averaged with its mirror image, so that a straight course needs neither sway
+    force nor yaw moment.
     """
 
     def __init__(self, believed: nn.Module, correction: nn.Module, *, is_mirrored: bool) -> None:
@@ -136,7 +135,7 @@ class GuardedForce(nn.Module):
     def forward(self, nu_dot: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
         """Return the force tau [B, 3] in N, N, N m and `outside` [B].
 
-        `outside` is True where a motion is beyond the training range or no number.
+        `outside` is True for a motion beyond the training range or with NaN.
         """
         motion = torch.cat((nu_dot, nu), dim=-1).to(torch.float64)
         lower = self.ranges.lower
@@ -145,14 +144,15 @@ class GuardedForce(nn.Module):
         believed_force, correction_force = self.model.split_forces(
             replaced_motion[:, : self.n_dof], replaced_motion[:, self.n_dof :]
         )
-        # how deep inside the range in widths, the least of all channels; negative outside
+        # distance from the nearest edge of the range, in widths, of the worst channel; negative
+        # outside
         depth = torch.minimum(
             (motion - lower) / self.range_width, (upper - motion) / self.range_width
         )
         depth = torch.nan_to_num(depth, nan=-1.0).amin(dim=-1, keepdim=True)
         force = believed_force + (1.0 + depth / self.fade_width).clamp(0.0, 1.0) * correction_force
         unlimited_share = (depth / self.edge_width).clamp(0.0, 1.0)
-        # a motion that was replaced may itself need less than what stands in its place
+        # the force of the original motion may be smaller than that of the replaced one
         force_of_motion: Tensor = self.model.believed(
             motion[:, : self.n_dof], motion[:, self.n_dof :]
         )
@@ -195,7 +195,7 @@ def build_feed_forward(
     """Return the feed-forward of a model, with the ranges of nu_dot and nu that it was fitted on.
 
     Raises:
-        UsageError: where the model is not in force space, or its inputs are not the forces.
+        UsageError: if the model is not in force space, or its inputs are not the forces.
     """
     head = model.head
     if not isinstance(head, ForceHead):
@@ -226,10 +226,10 @@ class ExportedForce(Exportable):
     """A feed-forward (tau, outside) = F(nu_dot, nu), in double precision.
 
     Args:
-        name: of the model that it comes from.
+        name: name of the model.
         model: the believed force and its correction.
-        ranges: of nu_dot and nu in the data that identified the correction, six.
-        thruster_lag: of the thrusters, for the card; None where it was not fitted.
+        ranges: ranges of nu_dot and nu in the identification data (six).
+        thruster_lag: lag of the thrusters, for the card; None if it was not fitted.
     """
 
     dt = None
@@ -263,14 +263,14 @@ class ExportedForce(Exportable):
         """Compare the force at random motions, in and far beyond the training ranges.
 
         Raises:
-            ExportError: where it differs, or a flag does.
+            ExportError: if a force or a flag differs.
         """
         lower, upper = torch.tensor(self.ranges, dtype=torch.float64).T
         generator = torch.Generator().manual_seed(0)
         range_share = torch.rand(
             200, 2 * PLANAR_LAYOUT.n_dof, generator=generator, dtype=torch.float64
         )
-        # a tenth is replaced by what no vessel does
+        # a tenth of the motions is far outside of any training range
         range_share[180:] = 1e6 * (range_share[180:] - 0.5)
         motion = lower + range_share * (upper - lower)
         motion[190:195, 0] = torch.nan

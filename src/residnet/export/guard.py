@@ -12,9 +12,8 @@ All formats follow these rules, so that a bad sample never yields a non-finite r
 - A memory with a non-finite entry, or an entry beyond the limits of its head, is replaced by the
   initial memory.
 - If the result of a step is NaN or leaves the accepted range, velocities are clamped to the
-accepted
-  range (NaN is replaced by the previous value), and the pose is integrated with the velocities
-  before the step.
+  accepted range (NaN is replaced by the previous value), and the pose is integrated with the
+  velocities before the step.
 
 The flag `outside` is true for each row to which one of these rules was applied, and for each row
 with an entry beyond the training range. The rules are stateless: the next good sample is processed
@@ -42,7 +41,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 
 ACCEPTED_RANGE_FACTOR = 2.0
-"""How far beyond the training range a value is accepted, in largest magnitudes of that range."""
+"""Extension of the accepted range beyond the training range, in its largest magnitudes."""
 _FLOAT32_MAX = float(torch.finfo(torch.float32).max)
 _MAX_POSITION = 1e5
 """Largest north and east in m."""
@@ -53,11 +52,13 @@ _FULL_TURN = 2.0 * math.pi
 
 @final
 class GuardRanges(nn.Module):
-    """Training range [low, high] and accepted range [least, most] of values [k].
+    """Training range [lower, upper] and accepted range of values [k].
 
     Args:
-        margin: how far beyond the training range a value is accepted [k].
-        dtype: of the numbers.
+        lower: lower limits of the training range [k].
+        upper: upper limits of the training range [k].
+        margin: extension of the accepted range beyond the training range [k].
+        dtype: precision of the limits.
     """
 
     def __init__(self, lower: Tensor, upper: Tensor, margin: Tensor, dtype: torch.dtype) -> None:
@@ -69,16 +70,16 @@ class GuardRanges(nn.Module):
         self.midpoint = nn.Buffer((0.5 * (lower + upper)).to(dtype))
 
     def is_in_training_range(self, values: Tensor) -> Tensor:
-        """Return which rows [...] of values [..., k] lie in the training range."""
+        """Return which rows [...] of values [..., k] are in the training range."""
         return ((values >= self.lower) & (values <= self.upper)).all(dim=-1)
 
     def is_accepted(self, values: Tensor) -> Tensor:
         """Return which rows [...] of values [..., k] are accepted."""
-        # comparisons with what is no number are false
+        # comparisons with NaN are false
         return ((values >= self.accepted_lower) & (values <= self.accepted_upper)).all(dim=-1)
 
     def replace_unaccepted(self, values: Tensor) -> Tensor:
-        """Return values [..., k] with those that are no measurements replaced, as stated above."""
+        """Return values [..., k] with unaccepted ones replaced, see the rules of this module."""
         is_measurement = (values >= self.accepted_lower) & (values <= self.accepted_upper)
         clamped = torch.minimum(torch.maximum(values, self.lower), self.upper)
         return torch.where(
@@ -113,7 +114,7 @@ class GuardedDynamics(Dynamics):
         pose_limit = torch.full((len(PLANAR_LAYOUT.pose),), _MAX_POSITION, dtype=torch.float64)
         pose_limit[POSITION.stop :] = _MAX_HEADING
         if model.spatial:
-            # no training range bounds the depth
+            # the depth does not affect the motion, so that its training range is no limit
             depth_index = spec.signals.dof.dynamic_states.index("z")
             lower[depth_index], upper[depth_index], margin[depth_index] = (
                 -_MAX_POSITION,
@@ -129,7 +130,7 @@ class GuardedDynamics(Dynamics):
             lower[:n_states], upper[:n_states], margin[:n_states], torch.float32
         )
         memory_minimum, memory_maximum = model.memory_bounds()
-        # finite, so that comparisons alone tell what is no number
+        # finite limits, so that comparisons also exclude infinity and NaN
         memory_lower = (memory_minimum - 1e-3 * memory_minimum.abs()).clamp(min=-_FLOAT32_MAX)
         memory_upper = (memory_maximum + 1e-3 * memory_maximum.abs()).clamp(max=_FLOAT32_MAX)
         self.memory_lower = nn.Buffer(memory_lower.to(torch.float32))
@@ -156,7 +157,7 @@ class GuardedDynamics(Dynamics):
         measured_values = torch.cat((x, w), dim=-1)
         replaced_values = self.ranges.replace_unaccepted(measured_values)
         is_inside = self.ranges.is_in_training_range(measured_values)
-        # no reductions over nothing: not every format has them
+        # without memory no reduction over an empty dimension, which some formats do not support
         if self.n_state > 0:
             is_memory_valid = self.is_valid_memory(s)
             is_inside = is_inside & is_memory_valid
@@ -169,7 +170,7 @@ class GuardedDynamics(Dynamics):
         )
 
     def is_valid_memory(self, s: Tensor) -> Tensor:
-        """Return which rows [B] of a memory [B, n_state] the head can have come to."""
+        """Return which rows [B] of a memory [B, n_state] are within the limits of the head."""
         return ((s >= self.memory_lower) & (s <= self.memory_upper)).all(dim=-1)
 
     def replace_bad_result(
@@ -201,7 +202,7 @@ class GuardedDynamics(Dynamics):
                 ~is_state_accepted.squeeze(-1),
             )
         is_memory_finite = (s.abs() <= self.float_max).all(dim=-1, keepdim=True)
-        # a head of another package may leave what it says of its memory
+        # a head of another package may exceed the limits that it declares
         s = torch.minimum(torch.maximum(s, self.memory_lower), self.memory_upper)
         s = torch.where(is_memory_finite, s, torch.zeros_like(s))
         return (
@@ -241,16 +242,17 @@ class GuardedDynamics(Dynamics):
 
 
 def hold_measured(y: Tensor, w: Tensor, good: Tensor) -> tuple[Tensor, Tensor]:
-    """Replace samples that are no measurements by the last measurement before them.
+    """Replace invalid samples by the last valid sample before them.
 
-    Samples before the first measurement are replaced by that one. TorchScript compiles this.
+    Samples before the first valid one are replaced by it. TorchScript compiles this function.
 
     Args:
         y: states [B, T, nx], oldest first; T at least 1.
         w: inputs [B, T, m].
-        good: which samples are measurements [B, T].
+        good: whether samples are valid [B, T].
     """
     index = torch.arange(good.shape[1]).unsqueeze(0).expand_as(good)
+    # index of the last valid sample so far, as a running maximum; -1 before the first one
     last = torch.where(good, index, torch.full_like(index, -1)).cummax(dim=1)[0]
     first = good.to(torch.long).argmax(dim=1, keepdim=True).expand_as(last)
     chosen = torch.where(last >= 0, last, first).unsqueeze(-1)
@@ -258,12 +260,12 @@ def hold_measured(y: Tensor, w: Tensor, good: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def accepted_margin(lower: float, upper: float) -> float:
-    """Return how far beyond its training range a value is accepted, in its own unit."""
+    """Return the extension of the accepted range beyond a training range."""
     return ACCEPTED_RANGE_FACTOR * (max(abs(lower), abs(upper)) or 0.5)
 
 
 def _accepted_margins(spec: ModelSpec) -> list[float]:
-    """Return how far beyond the training range each velocity and input is accepted."""
+    """Return the extension of the accepted range of each velocity and input."""
     units = spec.signals.channel_units()
     return [
         max(accepted_margin(lower, upper), _FULL_TURN if units[name] == "rad" else 0.0)

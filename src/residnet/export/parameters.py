@@ -31,8 +31,9 @@ from residnet.export.vessel import ExportedVessel
 
 Matrix = npt.NDArray[np.float64]
 _N_SAMPLES = 4000
-"""Velocities that damping is fitted to; chosen by hand, for at most four coefficients an axis."""
-# surge is damped by itself, sway and yaw by both
+"""Number of random velocities for the fit of the damping, with at most four coefficients per axis.
+"""
+# damping of surge depends on u, damping of sway and yaw on v and r
 _DAMPING_VELOCITIES = ((0,), (1, 2), (1, 2))
 
 
@@ -43,9 +44,9 @@ class VesselCoefficients:
     Attributes:
         mass: M [3, 3], rigid body and added mass together.
         linear: D [3, 3].
-        quadratic: D_n [3, 3], of |nu| nu.
-        left_out: share of the baseline's force that the form cannot hold, by axis.
-        terms_left_out: terms of the baseline that the form has no place for, by axis.
+        quadratic: D_n [3, 3], coefficients of |nu| nu.
+        left_out: share of the force of the baseline that is not represented, by axis.
+        terms_left_out: terms of the baseline that are not in the form, by axis.
     """
 
     mass: Matrix
@@ -69,7 +70,7 @@ def identify_coefficients(spec: ModelSpec, model: HybridDynamics) -> VesselCoeff
     """Return the coefficients of a model's baseline.
 
     Raises:
-        UsageError: where the baseline is no sum of terms of velocities and forces.
+        UsageError: if the baseline is not a sum of terms of velocities and forces.
     """
     theta, terms = _baseline_terms(spec, model)
     force_columns = [terms.index(name) if name in terms else -1 for name in FORCE_CHANNELS]
@@ -85,6 +86,7 @@ def identify_coefficients(spec: ModelSpec, model: HybridDynamics) -> VesselCoeff
             f" ({', '.join(missing) or 'the forces act alike'} is not among the baseline's terms);"
             " fit a baseline of kind believed, or one of regressors with tau_x, tau_y and tau_n"
         )
+    # nu_dot = M^-1 (tau - ...): the coefficients of the forces are the inverse of the mass matrix
     mass: Matrix = np.linalg.inv(force_columns_theta).astype(np.float64)
     lower = np.array(spec.low[:3])
     upper = np.array(spec.high[:3])
@@ -119,7 +121,7 @@ def identify_coefficients(spec: ModelSpec, model: HybridDynamics) -> VesselCoeff
 
 
 def _baseline_terms(spec: ModelSpec, model: HybridDynamics) -> tuple[Matrix, list[str]]:
-    """Return the coefficients [3, J] of the accelerations and the terms that they belong to."""
+    """Return the coefficients [3, J] of the accelerations and their terms."""
     baseline = model.baseline
     if isinstance(baseline, RegressorBaseline):
         theta = (baseline.theta * baseline.term_mask).detach().double().numpy()
@@ -149,9 +151,9 @@ def _unplaced_terms(theta: Matrix, terms: list[str]) -> dict[str, list[str]]:
 
 
 _PLANAR_INDICES = (0, 1, 5)
-"""Of surge, sway and yaw among six degrees of freedom."""
+"""Indices of surge, sway and yaw in six degrees of freedom."""
 _VRX_NAMES = ("xDotU", "yDotV", "nDotR", "xU", "yV", "nR")
-"""What VRX knows under the names that Gazebo has for it."""
+"""Names of coefficients that VRX and Gazebo share, with different definitions."""
 
 
 def render_simulator_files(
@@ -259,7 +261,7 @@ def _read_rigid_body(file: Path) -> dict[str, float]:
     """Return the masses of the rigid body.
 
     Raises:
-        UsageError: where the file is missing or holds something else.
+        UsageError: if the file is missing or has other contents.
     """
     required_keys = ", ".join(f"{name} ({unit})" for name, unit in _RIGID_BODY_UNITS.items())
     instruction = (

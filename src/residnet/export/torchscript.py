@@ -60,57 +60,59 @@ _EXECUTOR_SETTINGS = {
 
 
 def get_size(tensor: Tensor, dimensions: int, dimension: int) -> int:
-    """Return the size of one dimension of a tensor, 1 where the tensor has not so many.
+    """Return the size of one dimension, or 1 if the tensor has another number of dimensions.
 
-    TorchScript compiles it.
+    TorchScript compiles this function. The following check of the shape then fails with its own
+    message instead of an index error.
     """
     return tensor.shape[dimension] if tensor.dim() == dimensions else 1
 
 
 def require_shape(name: str, tensor: Tensor, shape: list[int]) -> None:
-    """Refuse a tensor of another shape, which arithmetic might broadcast.
+    """Check the shape of a tensor, since arithmetic might broadcast another one.
 
-    TorchScript compiles it: Python sees `torch.jit.Error`, C++ an exception, with this text.
+    TorchScript compiles this function: Python raises `torch.jit.Error`, C++ an exception, with this
+    message.
 
     Raises:
-        ValueError: that names the argument and both shapes.
+        ValueError: if the shape differs; names the argument and both shapes.
     """
     if list(tensor.shape) != shape:
         raise ValueError(f"{name} has the shape {tensor.shape}, expected {shape}")
 
 
 def trace_function(function: Callable[..., Any], examples: tuple[Tensor, ...], what: str) -> Any:
-    """Record a function of batches as a TorchScript function.
+    """Trace a function of batches as a TorchScript function.
 
-    Numbers that the function reads elsewhere become constants.
+    Values that are not arguments become constants.
 
     Args:
-        function: of the tensors `examples`, without decisions by values.
+        function: function of the tensors `examples`, without branches that depend on values.
         examples: batches [B, size] of at least two rows.
-        what: is exported, for messages.
+        what: name of the exported part, for messages.
 
     Raises:
-        ExportError: where Python decides by values, or another number of rows is answered wrongly.
+        ExportError: if a branch depends on values, or results differ for another number of rows.
     """
     other_batches = [
         tuple(part[:1] for part in examples),
         tuple(torch.cat((part, part[:1])) for part in examples),
     ]
-    # CasADi, which the recorder needs, is not imported where nothing is exported
+    # imported here because it imports CasADi, which only exports need
     from residnet.engine.trace import record_graph
 
-    # a trace would take the branch of the examples always
+    # finds branches that depend on values; a trace would always take the branch of the examples
     record_graph(function, examples, what)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=DeprecationWarning)
-        # sizes that become constants are found by the other batches
+        # the warning is about sizes that become constants, which the other batches below reveal
         warnings.filterwarnings("ignore", category=TracerWarning)
         try:
-            # a function of its own: torch refuses methods of modules
+            # a lambda, since torch does not trace methods of modules as functions
             graph: Any = torch.jit.trace(lambda *x: function(*x), examples, check_trace=False)
             for batch in other_batches:
                 torch.testing.assert_close(graph(*batch), function(*batch), equal_nan=True)
-        except Exception as error:  # torch raises whatever it likes
+        except Exception as error:  # torch documents no exception classes for tracing
             line = (str(error).strip() or type(error).__name__).splitlines()[0]
             raise ExportError(
                 f"{what}: its step cannot be traced for any number of rows ({line}); take sizes"
@@ -163,10 +165,9 @@ class TorchScriptExporter(Exporter):
         exported.require_finite_numbers()
         dtype = exported.precisions[0]
         module = exported.build_module(dtype)
-        # freezing loses the methods where a program has switched the executor's optimisation off
+        # with the optimisation of the executor switched off, freezing would lose the methods
         with warnings.catch_warnings(), optimized_execution(True):
-            # TorchScript still works in torch 2.13 but announces its end; every export depends on
-            # it here alone
+            # TorchScript works in torch 2.13 but is deprecated; only this module depends on it
             warnings.filterwarnings("ignore", category=DeprecationWarning)
             warnings.filterwarnings("ignore", category=FutureWarning)
             warnings.filterwarnings("ignore", message=".*torch.jit.*")
@@ -174,18 +175,18 @@ class TorchScriptExporter(Exporter):
                 torch.jit.script(module), preserved_attrs=list(exported.methods)
             )
             for method in exported.methods:
-                # the executor would do so while it runs, but its settings that make the first call
-                # quick leave graphs as they are
+                # the executor would optimise graphs at run time, but not with the settings for a
+                # fast first call, so that it is done here
                 graph = scripted._c._get_method(method).graph
                 passes = torch._C
                 passes._jit_pass_inline(graph)
-                # what one round has joined lets the next one join more
+                # each round enables further simplifications in the next one
                 for _ in range(3):
                     passes._jit_pass_constant_propagation(graph)
                     passes._jit_pass_peephole(graph)
                     passes._jit_pass_cse(graph)
                     passes._jit_pass_dce(graph)
-            # what is checked was saved and read: the file differs from it by the card alone
+            # the parity check uses a saved and reloaded module; the file differs only by the card
             reloaded = ScriptedModel(torch.jit.load(io.BytesIO(_serialise(scripted))), dtype)
             with optimized_execution(False):
                 parity_entry = {
@@ -204,9 +205,9 @@ class TorchScriptExporter(Exporter):
 
 
 def _serialise(scripted: Any, card: Mapping[str, Any] | None = None) -> bytes:
-    """Return a module as its file holds it.
+    """Return the bytes of the file of a module.
 
-    Through memory, so that a disk that is full is the system's error and not one of PyTorch.
+    They are built in memory, so that a full disk raises an OSError and not an error of PyTorch.
     """
     buffer = io.BytesIO()
     extra_files = {} if card is None else {"card.json": json.dumps(card, indent=1)}
@@ -222,7 +223,7 @@ class AotiModel(LoadedExport):
         self.dtype = dtype
 
     def step(self, *step_arguments: NumberArray) -> tuple[Any, ...]:
-        # the package takes numbers as they lie in memory, whatever a tensor's strides say
+        # the package ignores strides, so that arrays must be contiguous
         tensors = [
             torch.from_numpy(np.ascontiguousarray(array)).to(self.dtype)[None]
             for array in step_arguments
@@ -259,7 +260,7 @@ class AotiExporter(Exporter):
                             program, package_path=str(temporary_path)
                         )
                 except (RuntimeError, OSError) as error:
-                    # what torch raises here has no class of its own
+                    # torch has no exception class for failed compilations
                     error_lines = str(error).strip().splitlines() or [type(error).__name__]
                     raise ExportError(
                         f"{exported.label}: cannot be compiled ahead of time ({error_lines[0]});"

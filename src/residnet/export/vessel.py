@@ -29,14 +29,16 @@ from residnet.export.torchscript import get_size, require_shape, trace_function
 from residnet.heads.base import ResidualHead
 
 PARITY_STEPS = 2000
-"""Steps over which an export must follow the model: long enough for its memory to drift."""
+"""Number of steps of the parity check, in which errors of the memory would accumulate."""
 PAST_STEPS = 50
-"""Steps of measured past that warm the memory up."""
+"""Number of measured steps from which the memory is initialised."""
 _SWEEP_SHARES = (0.8, 0.4, 0.2)
-"""Shares of the training range that inputs sweep together."""
+"""Shares of the training range over which all inputs are swept together, tried in this order."""
 _N_TRACKS = 16
 _STEPS_PER_INPUT = 20
-"""Tracks whose inputs jump, and steps between the jumps: eight may all miss what grows."""
+"""Number of tracks with jumping inputs, and steps between jumps; eight tracks were found too few
+to find growing rounding errors.
+"""
 _FRAME_TEXT = (
     "NED; body axes x forward, y starboard, z down; psi unwrapped, clockwise from north; wind_dir"
     " is where the wind comes from"
@@ -57,13 +59,13 @@ _BAND_TEXT = (
 
 
 class GuardedVesselModule(nn.Module):
-    """What a controller sees; all tensors are float32, SI and radians.
+    """The interface of a controller; all tensors are float32, SI and radians.
 
-    Bad inputs and memories are treated as `residnet.export.base` says: a flag and a finite answer.
-    Tensors of a wrong shape are refused, never broadcast; other precisions are converted.
+    Bad inputs and memories give a flag and a finite result (`residnet.export.guard`). Tensors of a
+    wrong shape are refused, never broadcast; other precisions are converted.
 
-    TorchScript compiles this class. The model's own code is only traced, so that heads and
-    baselines may be written in any Python.
+    TorchScript compiles this class. The code of the model is only traced, so that heads and
+    baselines may use Python that TorchScript does not support.
     """
 
     def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
@@ -73,7 +75,7 @@ class GuardedVesselModule(nn.Module):
         self.n_inputs = len(spec.signals.input_columns)
         self.n_states = len(spec.signals.dof.state_names)
         self.n_state = model.n_state
-        # two rows: a batch of one would hide where the rows of a batch are confused
+        # two rows, since a batch of one would hide mixed-up rows
         sizes = (self.n_states, self.n_inputs, self.n_state)
         examples = tuple(torch.zeros(2, size) for size in sizes)
         what = f"model {spec.name}"
@@ -94,9 +96,9 @@ class GuardedVesselModule(nn.Module):
     def band(self, k: int) -> Tensor:
         """Return the half widths [c] k steps after a measurement.
 
-        They are of u, v, r, heading and position, then of p and phi where the vessel rolls. They
-        are zero at k = 0, grow in proportion to time beyond the calibrated horizon, and are
-        infinite where the model has no band.
+        Channels are u, v, r, heading and position, then p and phi for vessels with roll. The half
+        widths are zero at k = 0, grow in proportion to time beyond the calibrated horizon, and are
+        infinite for a model without band.
         """
         band_steps = self.band_steps.float()
         band_widths = self.band_widths.float()
@@ -147,8 +149,8 @@ class GuardedVesselModule(nn.Module):
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the state [B, 3 + n] and memory after one step under inputs w [B, m], and a flag.
 
-        `outside` [B] is True where a velocity or an input is beyond the training range, an entry or
-        the memory is not finite, or the step was held.
+        `outside` [B] is True for rows with a velocity or input beyond the training range, an entry
+        or memory that is not finite, or a corrected result.
         """
         n_rows = get_size(x, 2, 0)
         require_shape("x", x, [n_rows, self.n_states])
@@ -173,7 +175,7 @@ class GuardedVesselModule(nn.Module):
         x, w, s = x0.float(), w.float(), s.float()
         states = [self.of_state.replace_unaccepted(x)]
         flags = [torch.zeros(n_rows, 0, dtype=torch.bool)]
-        # the first step sees x0 as it was given, for its flag
+        # the first step gets the original x0, so that its flag shows invalid entries
         for k in range(n_steps):
             x, s, outside = self.guarded_step(x, w[:, k], s)
             states.append(x)
@@ -186,7 +188,7 @@ class GuardedVesselModule(nn.Module):
 
 
 class _GuardedVesselStep(nn.Module):
-    """The guarded step, for formats that hold one function."""
+    """The guarded step, for formats with a single function."""
 
     def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
         super().__init__()
@@ -194,15 +196,17 @@ class _GuardedVesselStep(nn.Module):
 
     def forward(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         next_state, memory, outside = self.guarded.flagged_step(x, w, s)
-        # a result that is an argument is no result of its own
+        # without a memory the step returns its argument, which torch.export does not allow
         return next_state, memory.clone(), outside
 
 
 @final
 class ExportedVessel(Exportable):
-    """A vessel model, whose own numbers are left alone.
+    """A vessel model; the given model is not modified.
 
     Args:
+        spec: description of the model.
+        model: the model.
         metrics: rows of metrics.json of this model, for the card.
     """
 
@@ -227,7 +231,7 @@ class ExportedVessel(Exportable):
         self.state_names = spec.signals.dof.state_names
         n_inputs = len(spec.signals.input_columns)
         self.arguments = (("x", len(self.state_names)), ("w", n_inputs), ("s", model.n_state))
-        # what is written and what is read back are compared with one run
+        # the reference run is expensive and the same for all formats
         self._reference_runs: dict[torch.dtype, tuple[Tensor, Tensor, Tensor]] = {}
         self._sweep_share = _SWEEP_SHARES[0]
 
@@ -236,7 +240,7 @@ class ExportedVessel(Exportable):
         return copy.deepcopy(self.model).to(dtype)
 
     def guard_model(self, dtype: torch.dtype) -> GuardedDynamics:
-        """Return the model behind its guard."""
+        """Return the model with its input guard."""
         return GuardedDynamics(self.to_precision(dtype), self.spec).to(dtype).eval()
 
     def build_module(self, dtype: torch.dtype) -> nn.Module:
@@ -246,7 +250,7 @@ class ExportedVessel(Exportable):
         return _GuardedVesselStep(self.to_precision(dtype), self.spec).to(dtype).eval()
 
     def require_finite_numbers(self) -> None:
-        # limits of what has no limits are infinite from the start
+        # infinite limits are allowed if they are infinite in the unfitted model too
         initial_state = self.spec.build().state_dict()
         for name, value in self.model.state_dict().items():
             is_invalid = ~torch.isfinite(value)
@@ -254,9 +258,7 @@ class ExportedVessel(Exportable):
                 is_invalid &= ~(torch.isinf(value) & (initial_state[name].to(value.dtype) == value))
             if bool(is_invalid.any()):
                 raise ExportError(
-                    f"{self.label}: {name} holds {float(value[is_invalid][0])}, so it is no"
-                    f" model; fit it"
-                    " again"
+                    f"{self.label}: {name} holds {float(value[is_invalid][0])}; fit the model again"
                 )
 
     def card_contents(self) -> dict[str, Any]:
@@ -293,7 +295,7 @@ class ExportedVessel(Exportable):
             "dt": spec.dt,
             "integrator": spec.integrator,
             "frame": _FRAME_TEXT,
-            # of a model of all velocities there is nothing to say
+            # only for models that differ from the usual three degrees of freedom
             **(
                 {}
                 if dof.is_planar
@@ -331,7 +333,7 @@ class ExportedVessel(Exportable):
         if tolerance is None:
             tolerance = base.SINGLE_TOLERANCE if is_single else base.DOUBLE_TOLERANCE
         range_shares = self.check_long_run(loaded, subject, dtype, tolerance)
-        # a library that adds up in another order may round otherwise in double precision too
+        # sums in another order may round differently in double precision too
         if loaded.reorders_sums and (is_single or tolerance > base.DOUBLE_TOLERANCE):
             self.check_tracks(loaded, subject, dtype, tolerance)
         self.check_bad_inputs(loaded, subject, dtype)
@@ -403,11 +405,11 @@ class ExportedVessel(Exportable):
     def check_long_run(
         self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float
     ) -> dict[str, float]:
-        """Return the largest difference of each state from the model's, as a share of its range.
+        """Return the largest difference of each state to the model, relative to its range.
 
         Raises:
-            RoundingError: where a share is larger than allowed.
-            ExportError: where the model itself leaves what exports accept.
+            RoundingError: if a difference is larger than allowed.
+            ExportError: if the model itself leaves the accepted range.
         """
         y, w, eager_states = self.run_reference(dtype)
         past_states = y[0].numpy()
@@ -455,14 +457,13 @@ class ExportedVessel(Exportable):
     def check_tracks(
         self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float
     ) -> None:
-        """Refuse a precision whose rounding grows, on tracks whose inputs jump within the range.
+        """Refuse a precision whose rounding errors grow, on tracks with jumping inputs.
 
-        A format adds up in another order than torch. Where a model hardly damps, what that rounds
-        otherwise differs much from track to track, so there are several, each from a state of its
-        own.
+        A format computes sums in another order than torch. With little damping the growth of these
+        rounding errors varies between tracks, so that several are simulated from random states.
 
         Raises:
-            RoundingError: where a state of a track differs by more.
+            RoundingError: if a difference is larger than the tolerance.
         """
         generator = torch.Generator().manual_seed(1)
         guarded = self.guard_model(dtype)
@@ -475,7 +476,7 @@ class ExportedVessel(Exportable):
         )
         n_dof = guarded.dof
         w = track_inputs[:, :, n_dof:].repeat_interleave(_STEPS_PER_INPUT, dim=1)[:, :PARITY_STEPS]
-        # the last column is the guard's flag
+        # the last column of the guarded state is the flag
         x0 = torch.cat(
             (torch.zeros(_N_TRACKS, 3), track_inputs[:, 0, :n_dof], torch.zeros(_N_TRACKS, 1)),
             dim=1,
@@ -501,10 +502,10 @@ class ExportedVessel(Exportable):
             )
 
     def check_bad_inputs(self, loaded: LoadedExport, subject: str, dtype: torch.dtype) -> None:
-        """Refuse what answers bad inputs, states or memories otherwise than the model's guard.
+        """Check that bad inputs, states and memories give the same results as the guarded model.
 
         Raises:
-            ExportError: that names the first entry and its value.
+            ExportError: if a result differs; names the first entry and its value.
         """
         guarded = self.guard_model(dtype)
         past_states, w = self.parity_inputs(dtype)
@@ -513,7 +514,7 @@ class ExportedVessel(Exportable):
         columns = self.spec.signals.input_columns
         names = [*self.state_names, *columns, *(f"memory {i}" for i in range(memory.numel()))]
         n_measured = len(self.state_names) + len(columns)
-        # a long memory is wrong in its first, its middle and its last entry
+        # of a long memory only the first, middle and last entries are tested, to save time
         memory_indices = {n_measured, len(names) // 2, len(names) - 1}
         tested_indices = [i for i in range(len(names)) if i < n_measured or i in memory_indices]
         bad_values = (torch.nan, torch.inf, -torch.inf, 1e30, -1e30)

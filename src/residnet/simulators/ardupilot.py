@@ -26,9 +26,9 @@ from residnet.simulators.vehicle import Vehicle
 
 _PACKET_FORMATS = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
 _GRAVITY = 9.80665
-"""Standard gravity in m/s^2, by which ArduPilot takes its accelerometers."""
+"""Standard gravity in m/s^2, as used by ArduPilot for accelerometers."""
 _PULSE_RANGE = (800, 2200)
-"""Pulse widths in us that a servo output can have; 0 means none yet."""
+"""Valid pulse widths of a servo output in us; 0 means that there is no pulse yet."""
 _FRAME_RATE_RANGE = (10, 4000)
 """Frame rates in Hz that are accepted."""
 
@@ -56,12 +56,11 @@ class Servo:
 def assign_servos(vehicle: Vehicle, servo_texts: Sequence[str] = ()) -> list[Servo]:
     """Return the servo output of each command, from texts such as `cmd_delta=1:-0.6:0.6`.
 
-    Commands that are not given take the outputs 1, 3, 2, 4, 5 ... in their order (ArduPilot's
-    rovers steer by output 1 and drive by output 3, those with two motors likewise), over their
-    whole range.
+    Other commands get the outputs 1, 3, 2, 4, 5 ... in their order and with their full range, since
+    ArduPilot's rovers have steering or left motor on output 1 and throttle or right motor on 3.
 
     Raises:
-        UsageError: where a text cannot be read.
+        UsageError: if a text is invalid.
     """
     names = vehicle.inputs[: vehicle.n_commands]
     order = [1, 3, 2, *range(4, 33)]
@@ -114,8 +113,8 @@ class ArduPilotBackend:
             self.socket.bind((host, port))
         except OSError as error:
             raise UsageError(
-                f"UDP port {port}: cannot listen there ({error.strerror}); stop what uses it or"
-                " name another"
+                f"UDP port {port}: cannot be opened ({error.strerror}); stop the program that uses"
+                " it or choose another port"
             ) from None
         self.port = int(self.socket.getsockname()[1])
         self.n_invalid_packets = 0
@@ -133,7 +132,7 @@ class ArduPilotBackend:
         self.memory = self.vehicle.dynamics.initial_state(1).to(x.dtype)
 
     def serve(self, packets: int | None = None, timeout: float | None = None) -> None:
-        """Answer packets until so many have been answered, or none has come for `timeout` s."""
+        """Answer packets until `packets` have been answered, or none arrives for `timeout` s."""
         self.socket.settimeout(timeout)
         n_answered = 0
         while packets is None or n_answered < packets:
@@ -142,7 +141,7 @@ class ArduPilotBackend:
             except TimeoutError:
                 return
             except ConnectionError:
-                # the other side has gone; another may come
+                # the client has closed its socket; another client may follow
                 continue
             reply = self.reply_to(data)
             if reply is not None:
@@ -150,7 +149,7 @@ class ArduPilotBackend:
                 n_answered += 1
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the socket."""
         self.socket.close()
 
     def reply_to(self, data: bytes) -> bytes | None:
@@ -169,7 +168,7 @@ class ArduPilotBackend:
         if frame == self.last_frame:
             return self.reply
         if frame < self.last_frame:
-            log_message("ArduPilot began anew")
+            log_message("ArduPilot restarted")
             self._reset()
         elif self.last_frame >= 0:
             self.n_lost_frames += frame - self.last_frame - 1
@@ -207,7 +206,7 @@ class ArduPilotBackend:
             "timestamp": self.time,
             "imu": {
                 "gyro": [p, 0.0, r],
-                # what an accelerometer feels: the motion of a turning frame, and not to fall
+                # specific force: acceleration in the rotating body frame minus gravity
                 "accel_body": [
                     acceleration[3] - r * v,
                     acceleration[4] + r * u - _GRAVITY * math.sin(phi),

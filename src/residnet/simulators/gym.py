@@ -27,7 +27,7 @@ from residnet.simulators.vehicle import Vehicle
 
 Task = Literal["heading", "course", "docking"]
 _DIVERGENCE_SPEED = 1e4
-"""Speeds in cruise speeds beyond which a motion has diverged."""
+"""A motion has diverged above this multiple of the cruise speed."""
 
 
 LOOK_AHEAD_TIME = 10.0
@@ -40,8 +40,7 @@ class ReferenceTask(ABC):
     Attributes:
         name: name of the task.
         goal_size: number of entries of a goal.
-        observation_size: number of entries of an observation that the task adds to the motion's
-            five.
+        observation_size: number of entries of an observation in addition to motion and commands.
     """
 
     name: ClassVar[str]
@@ -113,7 +112,7 @@ class CourseTask(ReferenceTask):
         )
 
     def reward(self, x: Tensor, goal: Tensor, cruise: float) -> Tensor:
-        """Return minus the square of the distance, which saturates, less what goes backwards."""
+        """Return minus the saturated squared distance, minus a penalty of the heading error."""
         relative_offset = self._cross_track_error(x, goal) / (cruise * LOOK_AHEAD_TIME)
         return -torch.tanh(relative_offset.square()) + 0.5 * (
             torch.cos(goal[:, 2] - heading(x)) - 1.0
@@ -145,7 +144,7 @@ class DockingTask(ReferenceTask):
         return torch.stack((speed_error, torch.sin(error), torch.cos(error)), dim=-1)
 
     def reward(self, x: Tensor, goal: Tensor, cruise: float) -> Tensor:
-        """Return minus the error of the speed, less sway and the error of the heading."""
+        """Return minus the saturated error of speed and sway, minus a heading penalty."""
         speed_penalty = torch.tanh(((goal[:, 0] - surge(x)).abs() + sway(x).abs()) / cruise)
         return -speed_penalty + 0.5 * (torch.cos(goal[:, 1] - heading(x)) - 1.0)
 
@@ -192,7 +191,7 @@ class EpisodeBatch:
         self.step_count = torch.zeros(n_episodes, dtype=torch.long)
 
     def reset(self, mask: Tensor) -> None:
-        """Begin the episodes `mask` [B] anew: at the start, at a speed drawn up to the cruise."""
+        """Restart the episodes `mask` [B] at the start with a random speed up to cruise."""
         n = int(mask.sum())
         if n == 0:
             return
@@ -209,7 +208,7 @@ class EpisodeBatch:
         """Return the observation [B, size] in float32."""
         cruise = self.vehicle.cruise
         (u, v, r) = dynamic_states(self.x).unbind(-1)
-        # yaw in turns of a look-ahead
+        # dimensionless: yaw rate as the heading change during the look-ahead time
         motion = torch.stack((u / cruise, v / cruise, r * LOOK_AHEAD_TIME), dim=-1)
         observation_parts = (motion, self.task.observe(self.x, self.goal, cruise), self.last_action)
         observation: np.ndarray = torch.cat(observation_parts, dim=-1).float().numpy()
@@ -223,7 +222,7 @@ class EpisodeBatch:
         with torch.no_grad():
             next_state, memory = self.vehicle.dynamics.step(self.x, w, self.s)
         limit = _DIVERGENCE_SPEED * self.vehicle.cruise
-        # one look at the whole batch, which is nearly always sound; what is no number fails it
+        # one cheap test of the whole batch, since divergence is rare; NaN fails the comparisons
         is_finite = (
             float(next_state.abs().sum()) < torch.inf
             and float(next_state[:, 3:5].abs().max()) <= limit
@@ -236,7 +235,7 @@ class EpisodeBatch:
             next_state = torch.where(has_diverged.unsqueeze(-1), self.x, next_state)
             memory = torch.where(has_diverged.unsqueeze(-1), self.s, memory)
         reward = self.task.reward(next_state, self.goal, self.vehicle.cruise)
-        # quick changes of a command wear the actuators
+        # a penalty on fast command changes, which wear actuators
         reward = (
             reward - 0.05 * (action - self.last_action).square().mean(dim=-1) - 10.0 * has_diverged
         )
@@ -263,7 +262,7 @@ class VesselEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One vessel that learns one task.
 
     Args:
-        vehicle: see `residnet.simulators.vehicle.vehicle`.
+        vehicle: vehicle, see `residnet.simulators.vehicle.load_vehicle`.
         task: heading, course or docking.
         seconds: length of an episode.
     """
@@ -286,7 +285,7 @@ class VesselEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.episodes.observe()[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Step once; an episode is terminated where its motion diverges."""
+        """Step once; an episode is terminated if its motion diverges."""
         reward, diverged, finished = self.episodes.step(np.asarray(action)[None])
         return (
             self.episodes.observe()[0],
@@ -301,10 +300,10 @@ class VesselEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 class VesselVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Many vessels that learn one task, stepped as one batch.
 
-    An episode that has ended begins anew with the next step, whose action is left out.
+    An episode that has ended restarts in the next step, whose action is ignored.
 
     Args:
-        vehicle: see `residnet.simulators.vehicle.vehicle`.
+        vehicle: vehicle, see `residnet.simulators.vehicle.load_vehicle`.
         num_envs: number of vessels.
         task: heading, course or docking.
         seconds: length of an episode.

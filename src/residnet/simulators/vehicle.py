@@ -1,4 +1,4 @@
-"""A vessel or a learned model as simulators see it: states, commands and their limits, one step."""
+"""A vessel or a learned model for simulators: states, commands with limits, and a step."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SETTLING_STEPS = 600
 
 @dataclass(frozen=True)
 class Vehicle:
-    """A vessel or learned model with command limits, as the simulators step it.
+    """A vessel or learned model with command limits.
 
     Attributes:
         name: name of the vessel or model.
@@ -52,7 +52,7 @@ class Vehicle:
     cruise: float
 
     def inputs_at(self, commands: Tensor) -> Tensor:
-        """Return the inputs [B, m] of commands [B, c] in calm water, held to their limits."""
+        """Return the inputs [B, m] of commands [B, c] in calm water, clamped to their limits."""
         clamped_commands = torch.minimum(
             torch.maximum(commands, self.lower_commands), self.upper_commands
         )
@@ -78,12 +78,12 @@ def load_vehicle(source: str | Path, *, model: str = "selected", dt: float = 0.1
 
 
 def load_learned_vehicle(run: Path, name: str = "selected") -> Vehicle:
-    """Return a learned model as a vehicle, bad inputs answered as its exports do.
+    """Return a learned model with the input guard of its exports as a vehicle.
 
-    Its commands are its inputs within their training ranges; it feels no wind.
+    Commands are the inputs within their training ranges; there is no wind.
 
     Raises:
-        UsageError: where the run has no such model.
+        UsageError: if the run has no such model.
     """
     spec, model = load_model(run / "models" / resolve_model_name(run, name))
     dof = spec.signals.dof
@@ -133,9 +133,8 @@ def build_plant_vehicle(name: str, plant: Plant, dt: float) -> Vehicle:
     """
     if plant.state_names[: len(STATE_NAMES)] != STATE_NAMES:
         raise UsageError(
-            f"vessel {name}: its states are {', '.join(plant.state_names)}; simulators take"
-            f" vessels with"
-            f" {', '.join(STATE_NAMES)} first"
+            f"vessel {name}: its states are {', '.join(plant.state_names)}; simulators need"
+            f" {', '.join(STATE_NAMES)} as the first states"
         )
     plant = plant.eval().requires_grad_(False)
     demand_corners = torch.tensor([[a, b] for a in (-1.0, 0.0, 1.0) for b in (-1.0, 0.0, 1.0)])
@@ -159,11 +158,12 @@ def build_plant_vehicle(name: str, plant: Plant, dt: float) -> Vehicle:
 
 
 def _with_cruise_speed(base_vehicle: Vehicle) -> Vehicle:
-    """Return a vehicle with the speed that commands half way up lead to as its cruise."""
+    """Return a vehicle with its cruise speed: the steady speed at half drive."""
     partial_drive = base_vehicle.lower_commands + 0.75 * (
         base_vehicle.upper_commands - base_vehicle.lower_commands
     )
-    # what steers to both sides stays amidships, and drives of two sides go together
+    # commands with a symmetric range are rudders, which stay amidships, or reversible propellers,
+    # which drive: both cases are simulated and the faster one is used
     balanced_drive = torch.where(
         (base_vehicle.lower_commands + base_vehicle.upper_commands).abs()
         < 1e-9 * base_vehicle.upper_commands.abs(),
