@@ -127,6 +127,7 @@ def compute_run_weights(log_names: Sequence[str]) -> np.ndarray:
     would dominate short ones, which often hold stronger manoeuvres.
     """
     _, log_indices, runs_per_log = np.unique(log_names, return_inverse=True, return_counts=True)
+    # a compromise: equal runs would favour long logs, equal logs would waste their information
     weights = 1.0 / np.sqrt(runs_per_log[log_indices])
     return np.asarray(weights / weights.sum())
 
@@ -148,6 +149,7 @@ def weighted_quantile(scores: np.ndarray, weights: np.ndarray, level: float) -> 
     )
     cumulative_weights = np.cumsum(sorted_weights, axis=0)
     cumulative_weights /= np.maximum(cumulative_weights[-1:], 1e-300)
+    # the tolerance is for rounding in the cumulative sum
     first_indices = (cumulative_weights >= min(level, 1.0) - 1e-9).argmax(axis=0)
     quantiles = np.take_along_axis(sorted_scores, first_indices[None], axis=0)[0]
     return np.asarray(np.where(is_scored.any(axis=0), quantiles, np.nan))
@@ -269,6 +271,7 @@ class Band:
         interpolated = np.stack(
             [np.interp(steps, self.steps, column) for column in values.T], axis=1
         )
+        # beyond the calibration errors are assumed to grow in proportion to time
         return np.asarray(interpolated * np.maximum(steps / self.steps[-1], 1.0)[:, None])
 
     @property

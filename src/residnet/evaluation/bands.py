@@ -261,6 +261,8 @@ def calibrate_band(
     typical_spread: np.ndarray | None = None
     run_spreads = [run.spread for run in runs if run.spread is not None]
     if len(run_spreads) == len(runs):
+        # only if all runs have a spread: otherwise the typical spread would belong to some runs
+        # only
         spreads = _sample_at_horizons(run_spreads, unexplained_errors.steps)
         typical_spread = _smoothed_rms(spreads, unexplained_errors)
         # the excess disagreement is added to the variance in `Band.half_widths`, so that its share
@@ -379,6 +381,7 @@ def _cross_fitted_scales(runs: _CalibrationRuns) -> np.ndarray:
     A scale estimated from the run itself would understate the errors of new runs.
     """
     _, log_indices = np.unique(runs.names, return_inverse=True)
+    # whole logs are assigned to folds, since runs of one log are correlated
     fold_indices = log_indices % _SCALE_FOLDS
     scales = np.empty_like(runs.errors)
     for k in np.unique(fold_indices):
@@ -485,6 +488,7 @@ def _fit_slopes(
             hessian = (
                 flat_intensities.T @ (weighted_ratio.reshape(-1, 1) * flat_intensities) + ridge
             )
+            # limited steps, since the likelihood is flat far from its maximum
             coefficients = coefficients + np.clip(np.linalg.solve(hessian, gradient), -1.0, 1.0)
         slopes[:, channel] = coefficients
     return slopes

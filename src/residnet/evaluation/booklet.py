@@ -149,6 +149,8 @@ def _page_row(page: BookletPage, length: float, scale: float, level: float) -> d
         "manoeuvre": page.manoeuvre.kind,
         "demand": page.manoeuvre.model_dump(mode="json"),
         "split": page.split,
+        # runs without indices diverged or did not reach their end; they are no part of the
+        # intervals
         "faults": sum(not run_indices for run_indices in page.indices[1:]),
         "indices": indices,
     }

@@ -350,6 +350,7 @@ def _batch_windows(windows: Sequence[Window], numbers_per_step: int) -> Iterator
         windows: windows to run.
         numbers_per_step: number of values stored per row and step.
     """
+    # descending length, so that the first window of a batch determines its length
     indices_by_length = sorted(range(len(windows)), key=lambda row: -_window_length(windows[row]))
     batch: list[int] = []
     for window_index in indices_by_length:
@@ -442,6 +443,7 @@ def _to_prediction(
     velocity_limits = np.where(
         velocity_limits < 0.0, velocity_limits, np.maximum(velocity_limits, measured_limits)
     )
+    # NaN first: comparisons with it would be false
     has_diverged = not np.isfinite(velocities).all() or bool(
         (np.abs(velocities) > velocity_limits).any()
     )

@@ -118,7 +118,9 @@ def find_pairs(
     command_ranges = np.concatenate(recorded_commands).max(0) - np.concatenate(
         recorded_commands
     ).min(0)
+    # constant commands: any difference then counts relative to one unit
     command_ranges[command_ranges == 0] = 1.0
+    # at the stride of the search, since the comparison of all starts is expensive
     coarse_commands = [
         np.nan_to_num(log.rate_inputs[::search_stride, :n_commands]) / command_ranges
         for log in logs
@@ -153,6 +155,7 @@ def find_pairs(
                     & (start_differences < _START_TOLERANCE * state_scales).all(1)
                 )
                 if other_index == log_index:
+                    # a segment of the same log must not overlap the window
                     is_repeat &= starts >= window.stop
                 if is_repeat.any():
                     best_start = int(np.argmin(np.where(is_repeat, command_mismatch, np.inf)))
@@ -301,6 +304,7 @@ def compute_autocovariance(segments: Segments, max_lag: int) -> np.ndarray:
     covariances = np.zeros(max_lag + 1)
     for segment in segments:
         centred = segment - mean
+        # zero padding to twice the length avoids circular correlation
         spectrum = np.abs(np.fft.rfft(centred, 2 * len(centred))) ** 2
         n_lags = min(max_lag + 1, len(centred))
         covariances[:n_lags] += np.fft.irfft(spectrum, 2 * len(centred))[:n_lags]
@@ -527,10 +531,10 @@ def build_goodness_table(
     """Return a row for each model and axis.
 
     Args:
-        models: one-step residuals over the same pieces.
-        targets: measured accelerations, [T, n] of each piece.
-        dt: time between samples, s.
-        axes: number and name of each acceleration that is looked at.
+        models: one-step residuals over the same segments.
+        targets: measured accelerations, [T, n] of each segment.
+        dt: time step, s.
+        axes: index and name of each evaluated acceleration.
     """
     models_by_name = {model.model_name: model for model in models}
     rows = []
@@ -543,6 +547,7 @@ def build_goodness_table(
             model_name: np.concatenate(segments)
             for model_name, segments in residuals_by_model.items()
         }
+        # the model with the smallest estimate serves as the full model of C_p, AIC and BIC
         variance = min(
             estimate_noise_variance(pooled_residuals[model.model_name], model.n_parameters[axis])
             for model in models
@@ -601,13 +606,14 @@ def _residual_statistics(segments: Sequence[np.ndarray], dt: float) -> dict[str,
 def paired_mae_difference(
     residuals: Sequence[np.ndarray], reference_residuals: Sequence[np.ndarray], reference_name: str
 ) -> dict[str, Any]:
-    """Return the difference of two models' mean absolute residuals, with its interval.
+    """Return the paired difference of two models' mean absolute residuals, with its interval.
 
-    Over the same samples, by blocks; negative where the model is better.
+    It is negative if the model is better than the reference.
 
     Args:
-        residuals: residuals of the model, piece by piece.
-        reference_residuals: residuals of the other at the same samples.
+        residuals: residuals of the model by segment.
+        reference_residuals: residuals of the reference at the same samples.
+        reference_name: name of the reference.
     """
     interval = block_bootstrap_interval(
         [

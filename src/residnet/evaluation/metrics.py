@@ -121,6 +121,7 @@ def bootstrap_intervals(
         block_counts
         @ np.bincount(resampling_blocks.block_indices, minlength=resampling_blocks.n_blocks)
     )[:, None]
+    # block sums instead of windows: one matrix product gives all resamples of all columns
     tail_probability = bootstrap_tail_probability(resampling_blocks.n_blocks)
     return [
         [float(lower), float(upper)]
@@ -157,6 +158,7 @@ def prediction_intervals(
     log_sums = np.stack(
         [np.bincount(log_positions, column, n_logs) for column in window_errors.T], axis=1
     )
+    # columns without any error, or with a diverged one, would distort the pooled variance
     log_means = (log_sums / np.bincount(log_positions)[:, None])[
         :, log_sums.any(axis=0) & np.isfinite(log_sums).all(0)
     ]
@@ -166,6 +168,7 @@ def prediction_intervals(
     half_width_factor = scipy.stats.t.ppf(
         0.5 + CONFIDENCE_LEVEL / 2, degrees_of_freedom
     ) * math.sqrt(2 / n_logs)
+    # relative deviations of means are deviations of logarithms in first order
     interval_factor = math.exp(half_width_factor * relative_std)
     return [
         [float(mean / interval_factor), float(mean * interval_factor)]
@@ -188,6 +191,7 @@ def bootstrap_tail_probability(n_blocks: int) -> float:
 def _draw_block_counts(n_blocks: int) -> np.ndarray:
     """Return how often each block is drawn in each resample, [resamples, n_blocks]."""
     return (
+        # a fixed seed: the same results give the same intervals in every report
         np.random.default_rng(0)
         .multinomial(n_blocks, np.full(n_blocks, 1 / n_blocks), size=_N_RESAMPLES)
         .astype(float)
@@ -320,6 +324,7 @@ class ProtocolEvaluation:
         metric_rows = []
         for candidate in self.candidates:
             for group_name, group_kinds in kinds_by_group.items():
+                # groups of the config may name kinds that this split does not have
                 window_mask = np.isin(manoeuvre_kinds, list(group_kinds))
                 if not window_mask.any():
                     continue
@@ -417,6 +422,7 @@ class ProtocolEvaluation:
             max_steps,
         ]:
             reaches_horizon = any_errors.window_lengths > n_steps
+            # the final pose must have been measured, not bridged over a gap
             reaches_horizon[reaches_horizon] = any_errors.is_usable[
                 (any_errors.window_starts + n_steps)[reaches_horizon]
             ]
@@ -509,6 +515,8 @@ class ProtocolEvaluation:
             if not np.isfinite(values).all():
                 continue
             # `searchsorted` keeps windows with equal values in one class
+            # quantiles of the windows instead of equal ranges, so that each class has enough
+            # windows
             class_limits = np.quantile(values, np.arange(1, _N_SPEED_CLASSES) / _N_SPEED_CLASSES)
             class_indices = np.searchsorted(class_limits, values, side="left")
             class_masks = [

@@ -108,6 +108,7 @@ class SelectionBlocks:
         if self.n_blocks < 2:
             return 0.0
         differences = contributions - other_contributions
+        # deviation of each contribution from its share of the difference: delta method for a ratio
         residuals = differences - self.weights * differences.sum()
         return math.sqrt(self.n_blocks / (self.n_blocks - 1) * float(residuals @ residuals))
 
@@ -334,6 +335,7 @@ def block_error_shares(
         errors.is_scored, errors.window_starts, dtype=float
     )
     scaled_columns = [logs[0].dof.dynamic_states.index(name) for name in scales]
+    # a window without error contributes zero; the divisor must not be zero
     weighted_rmse = np.where(weighted_rmse > 0, weighted_rmse, 1.0).take(scaled_columns, axis=1)
     weighted_rmse = weighted_rmse * np.array(list(scales.values()))
     velocity_errors = errors.velocity_errors.take(scaled_columns, axis=1)
@@ -359,6 +361,7 @@ def block_log_errors(
     least_mean_error = min(
         (float(share_of_model.sum()) for share_of_model in error_shares.values()), default=0.0
     )
+    # the smallest positive float only avoids log(0) if all errors are zero
     offset = max(_ERROR_OFFSET_SHARE * least_mean_error, float(np.finfo(float).tiny))
     return {
         name: block_weights * np.log(share_of_model / block_weights + offset)

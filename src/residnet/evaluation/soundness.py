@@ -144,6 +144,7 @@ class TrainingPoints:
                 for log, sample_indices in logs_and_indices
             ]
         )
+        # evenly spaced ranks of the speed cover rare speeds in proportion to their samples
         speed_order = np.argsort(speed, kind="stable")
         evenly_spread = speed_order[
             np.linspace(0, len(speed_order) - 1, min(_N_CHECK_POINTS, len(speed_order)))
@@ -342,7 +343,9 @@ def check_damping(
         ],
         axis=1,
     )
+    # the median, since a few points near zero speed may have any sign
     median_slopes = np.median(damping_slopes, axis=0)
+    # a high quantile: the typical damping at the speeds of the logs
     typical_sizes = np.quantile(np.abs(damping_slopes), 0.9, axis=0)
     wrong_signs = [
         f"d{name}′/d{name} {median_slopes[i]:+.2g} 1/s, positive at"
@@ -518,6 +521,7 @@ def find_contradicting_steady_run(model: HybridDynamics, steady_runs: Sequence[S
     ends at more than three times the observed deviation. The twenty longest runs of this kind are
     checked.
     """
+    # an undisturbed straight run would also be steady for an unstable vessel under control
     informative_runs = [
         run
         for run in steady_runs
@@ -668,6 +672,7 @@ def check_boundedness(
     )
     n_inputs = lower.numel()
     if 2**n_inputs <= _MAX_CORNERS:
+        # binary digits of the corner number select lower or upper limits
         corner_bits = (torch.arange(2**n_inputs)[:, None] >> torch.arange(n_inputs)) & 1
     else:
         generator = torch.Generator().manual_seed(0)

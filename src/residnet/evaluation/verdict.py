@@ -148,6 +148,7 @@ def known_horizons(evidence: VerdictEvidence) -> list[JsonObject]:
     the key `protocol`.
     """
     entry_by_time: dict[float, dict[str, Any]] = {}
+    # the protocol of the rows first, so that others only add horizons or more windows
     for protocol in sorted(evidence.limits_by_protocol, key=lambda name: name != evidence.protocol):
         for horizon_entry in evidence.limits_by_protocol[protocol].get("horizons") or []:
             seconds = horizon_entry["seconds"]
@@ -177,6 +178,7 @@ def longest_good_horizon(evidence: VerdictEvidence) -> float:
     """Return the horizon in s up to which the selected model is good; 0 for none."""
     row = evidence.rows_by_model[evidence.selected]
     longest_horizon = 0.0
+    # one divergence on unseen data excludes the model at any horizon
     if row.get("diverged") and evidence.split in UNSEEN_SPLITS:
         return 0.0
     plant_models = {
@@ -201,7 +203,9 @@ def longest_good_horizon(evidence: VerdictEvidence) -> float:
                 else _MAX_DISTANCE_SHARE * horizon_entry["sailed"]
             )
             rival_errors = [models[name][error_name] for name in rival_models]
+            # errors near the noise floor are not the fault of the model
             twice_noise_floor = 2.0 * max(noise_floor[error_name] for noise_floor in noise_floors)
+            # a model that is far worse than another one of the run should not be called good
             is_near_best = selected_errors[error_name] <= max(
                 twice_noise_floor,
                 _MAX_RATIO_TO_BEST * min(rival_errors, default=selected_errors[error_name]),

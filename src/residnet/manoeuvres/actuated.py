@@ -209,6 +209,7 @@ class ActuatedDynamics(Dynamics):
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         a = columns.actuator_states(x, self.dof)
+        # actuators first, since the mean over the step needs their values at its end
         next_a = self.actuators.step_states(a, w)
         inputs = torch.cat((a, w), dim=-1)[:, self.input_columns]
         if self.has_mean_inputs:

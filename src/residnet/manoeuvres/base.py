@@ -86,6 +86,7 @@ class Helm:
         if isinstance(plant, HullPlant) and isinstance(plant.actuators, ForceCommands):
             side_force = float(plant.actuators.limit[1])
         if plant.input_names[: plant.n_commands] == ForceCommands.command_names:
+            # commands that are forces need no allocation
             forces = torch.Tensor.clone
         elif isinstance(plant, HullPlant) and isinstance(plant.actuators, ForceActuators):
             forces = plant.actuators.allocate
@@ -156,7 +157,7 @@ def require_dive(*, can_dive: bool) -> None:
 
 
 class Manoeuvre(Config, ABC):
-    """One manoeuvre of normalised demands; `manoeuvre_type` names it in logs and metrics.
+    """One manoeuvre of normalised demands; `kind` names it in logs and metrics.
 
     Attributes:
         name: name of the log; None for the kind with a number.
@@ -214,7 +215,7 @@ class Manoeuvre(Config, ABC):
         return x
 
     def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return the manoeuvring indices by name, SI and rad (units in `indices.UNITS`).
+        """Return the manoeuvring indices by name, SI and rad (units in `indices.INDEX_UNITS`).
 
         Indices for which the log is too short are omitted.
 

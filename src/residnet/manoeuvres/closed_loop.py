@@ -199,6 +199,7 @@ def update_steadiness(r: Tensor, parameters: BatchParameters, memory: Tensor) ->
     import torch
 
     mean, max_rate, steady_time = memory.unbind(-1)
+    # exponential running mean; the factor is limited for windows shorter than a step
     mean = mean + (parameters["dt"] / parameters["window"]).clamp(max=1.0) * (r - mean)
     max_rate = torch.maximum(max_rate, r.abs())
     is_near = (r - mean).abs() <= parameters["tolerance"] * max_rate
@@ -209,6 +210,7 @@ def update_steadiness(r: Tensor, parameters: BatchParameters, memory: Tensor) ->
 
 def is_steady(parameters: BatchParameters, memory: Tensor) -> Tensor:
     """Return whether the turn of each row is steady, [B] bool."""
+    # the tolerance allows for rounding in the sum of time steps
     return memory[:, 2] >= parameters["window"] - 1e-9
 
 
@@ -259,6 +261,7 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
         """Return the IMO limits, which apply to 35 deg of rudder or the maximum angle."""
         share = abs(self.steer_share(helm))
         angle = math.degrees(share * (helm.max_rudder or 0.0))
+        # full helm also counts for a vessel that steers without a rudder
         is_full_rudder = share > 0.999 or angle > _FULL_RUDDER_DEG
         return indices.turning_limits(length) if is_full_rudder else {}
 
@@ -367,6 +370,7 @@ class Stopping(ClosedLoopManoeuvre):
         """Command astern drive after the order."""
         import torch
 
+        # a sudden order: the lag of the propulsion is part of the vessel
         drive = torch.where(time >= parameters["start"], parameters["astern"], parameters["drive"])
         return drive, torch.zeros_like(drive), memory
 
@@ -428,6 +432,7 @@ class Spiral(ClosedLoopManoeuvre):
         The height is the largest difference of the yaw rates at the angle nearest to zero. `steers`
         are rudder angles in rad if the manoeuvre has `rudders`, otherwise shares of full steer.
         """
+        # changes of the commands in the log show when each angle was ordered
         commands = [name for name in log.channels if name.startswith("cmd_")]
         has_moved = (np.abs(np.diff(log.stack(commands), axis=0)) > 1e-12).any(axis=1)
         change_samples = np.flatnonzero(has_moved & (log.t[1:] - log.t[0] >= self.start - 1e-9))
@@ -664,8 +669,10 @@ class DepthStep(ClosedLoopManoeuvre):
 
         ordered_change = torch.where(time >= parameters["start"], parameters["depth"], 0.0)
         depth_error = memory[:, 0] + ordered_change - motion["z"]
+        # the depth rate instead of w, which differs from it at a pitch angle
         descent = to_level_axes(*(motion[name] for name in ("u", "v", "w", "phi", "theta")))[2]
         dive = parameters["gain"] * depth_error - parameters["damping"] * descent
+        # q is positive nose up: damping demands more dive while the bow rises
         dive = dive + parameters["pitch_damping"] * motion["q"]
         dive = torch.minimum(torch.maximum(dive, -parameters["dive"]), parameters["dive"])
         return parameters["drive"], torch.zeros_like(dive), dive, memory

@@ -66,6 +66,7 @@ class SmoothTrack:
         x, y, self.heading, self.u, self.v, self.r = motion[is_complete].T
         self.speed = np.hypot(self.u, self.v)
         self._roll = log["phi"][is_complete] if "phi" in log.channels else np.zeros(0)
+        # chords between samples: the error of second order is negligible at the sampling of logs
         cumulative_distance = np.concatenate(([0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))))
         self.psi, self.x, self.y, self.distance_travelled = (
             scipy.interpolate.CubicSpline(self.t, values)
@@ -79,6 +80,7 @@ class SmoothTrack:
 
     def approach_speed(self, start: float) -> float:
         """Return the speed at the last sample up to the order at `start`."""
+        # the last sample before the order, since the speed drops in the turn
         return float(self.speed[max(int(np.searchsorted(self.t, start + 1e-9)) - 1, 0)])
 
     def max_roll_angle(self, start: float) -> dict[str, float]:
@@ -100,6 +102,7 @@ class SmoothTrack:
         self, interval_start: float, interval_end: float, sign: float
     ) -> tuple[float, float]:
         """Return the time and the value of the maximum of sign * heading in an interval."""
+        # the largest sample first, then the root of the derivative on both sides of it
         sample_times = self.t[(self.t > interval_start) & (self.t < interval_end)]
         times = np.concatenate(([interval_start], sample_times, [interval_end]))
         peak_index = int(np.argmax(sign * self.psi(times)))
@@ -144,6 +147,7 @@ def first_crossing(
     if rising_indices.size == 0:
         return None
     i = int(rising_indices[0])
+    # brentq needs values of opposite signs
     if values[i + 1] == 0:
         return float(times[i + 1])
     return float(scipy.optimize.brentq(function, times[i], times[i + 1], xtol=1e-12))
@@ -203,6 +207,7 @@ def turning(
         }
     steady_start, steady_end = (
         track.first_heading_crossing(origin + turn_sign * angle, start, turn_sign)
+        # the last half turn: by then the speed has become steady
         for angle in (until - math.pi, until)
     )
     if until < 2 * math.pi - 1e-9 or steady_start is None:
@@ -213,6 +218,7 @@ def turning(
     if is_steady.any():
         speed = float(track.speed[is_steady].mean())
         rate = float(np.abs(track.r[is_steady].mean()))
+        # v is towards the outside of the turn, so that the sign makes the angle positive
         drift = np.arctan2(-turn_sign * track.v[is_steady], track.u[is_steady])
         indices |= {
             # U = r R in a steady turn
@@ -293,6 +299,7 @@ def zigzag_indices(
         )
         indices["overshoot_width"] = float(lateral_offset.max() - lateral_offset[0])
     if len(reversals) > 2:
+        # every second reversal is to the same side
         indices["period"] = float(np.mean(np.array(reversals[2:]) - np.array(reversals[:-2])))
     return add_values_in_lengths(indices, length)
 

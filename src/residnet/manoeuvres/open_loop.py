@@ -315,6 +315,7 @@ class RandomSteps(Excitation):
         while times[-1] <= duration:
             times.append(times[-1] + 0.5 / generator.uniform(*self.band))
             levels.append(generator.uniform(-1.0, 1.0))
+        # index of the last switching time before each sample; the tolerance is for rounding
         index = torch.searchsorted(torch.tensor(times, dtype=t.dtype), t + 1e-9, right=True) - 1
         return torch.tensor(levels, dtype=t.dtype)[index]
 
@@ -343,6 +344,7 @@ class MultiSine(Excitation):
             wave_index % n_demands :: n_demands
         ]
         generator = np.random.default_rng([self.seed, wave_index])
+        # the sampling resolves the highest frequency with 20 samples per period
         trial_times = np.arange(
             0.0, 10.0 / self.band[0], min(0.05 / self.band[1], 0.005 / self.band[0])
         )
@@ -528,6 +530,7 @@ class Replay(Manoeuvre):
             if values is not None and np.isfinite(values).any():
                 is_known = np.isfinite(values)
                 sample_index = (
+                    # zero-order hold: the last recorded value before each step
                     np.searchsorted(log_time[is_known], t.numpy() + 1e-9, side="right") - 1
                 )
                 input_values[:, i] = values[is_known][sample_index.clip(min=0)]

@@ -157,6 +157,7 @@ class StopRecorder(Source):
 
     def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Return the rows that have stopped now or before."""
+        # only the first stop counts, since the rollout continues for the other rows
         stops_now = self.source.is_finished(x, k, memory) & (self.stop_step < 0)
         self.stop_step = torch.where(stops_now, k, self.stop_step)
         return self.stop_step >= 0

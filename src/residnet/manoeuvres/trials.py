@@ -114,6 +114,7 @@ def make_manoeuvre_source(manoeuvres: Sequence[Manoeuvre], helm: Helm, times: Te
     """
     manoeuvres_by_kind = [
         list(manoeuvres_of_kind)
+        # groupby joins consecutive elements only; the order of the rows is kept
         for _, manoeuvres_of_kind in groupby(manoeuvres, key=lambda manoeuvre: manoeuvre.kind)
     ]
     return StackedSource(
@@ -159,6 +160,7 @@ def simulate_manoeuvres(
         plant_inputs = environment.disturbance.draw_plant_inputs(
             environment.plant, n_trials, n_steps, dt, environment.seed, generator
         )
+        # waves depend on the position, so that they are computed during the simulation
         source = environment.disturbance.add_waves(
             source, environment.plant, n_trials, dt, environment.seed
         )
@@ -180,6 +182,7 @@ def simulate_manoeuvres(
         initial_memory = vessel.dynamics.initial_state(n_trials).to(torch.float64)
         rollout = Rollout(vessel.dynamics, monitored_source)
         states, inputs, _ = rollout(initial_states, torch.from_numpy(plant_inputs), initial_memory)
+    # drawn even without noise, so that random numbers do not depend on the config
     velocity_noise = generator.standard_normal((n_trials, n_steps, 3)) * [
         environment.sensors.u,
         environment.sensors.v,
@@ -203,6 +206,7 @@ def simulate_manoeuvres(
             "seed": environment.seed,
         }
         if not is_finite.all():
+            # the log ends before the first sample that is not finite
             n_valid_steps = int(np.argmin(is_finite))
             log_metadata["diverged"] = True
         elif manoeuvre.end_condition is not None and not has_reached_goal:

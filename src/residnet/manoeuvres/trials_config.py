@@ -342,6 +342,7 @@ class SensorsConfig(Config):
         for name, true_values in true_channels.items():
             sensor = self.sensors.get(name, SensorConfig())
             values = (
+                # a delayed sensor shows an earlier value; before the start it shows the first one
                 np.interp(t - sensor.latency, t, true_values)
                 if sensor.latency
                 else true_values.copy()
@@ -349,12 +350,15 @@ class SensorsConfig(Config):
             if name in VELOCITY_NAMES:
                 values += white_noise[:, VELOCITY_NAMES.index(name)]
             if name in self.sensors:
+                # a separate stream for each channel, so that a further sensor does not change the
+                # others
                 generator = np.random.default_rng((*seed, *name.encode()))
                 values += float(sensor.bias) + float(sensor.noise) * generator.standard_normal(
                     t.size
                 )
             if sensor.interval is not None:
                 samples_per_reading = round(sensor.interval / float(t[1] - t[0]))
+                # a slow sensor has NaN between its readings, as logs from files have
                 values[np.arange(t.size) % samples_per_reading != 0] = np.nan
             measured_channels[name] = values
         return measured_channels
