@@ -647,7 +647,7 @@ def plan_trial(
         with name_damaged_key(folder):
             next_trials = task.plan_trial(run, model, limits)
     print(next_trials.to_text())
-    for file in next_trials.write(output_folder) if output_folder is not None else []:
+    for file in next_trials.write_files(output_folder) if output_folder is not None else []:
         print(f"written: {file}")
 
 

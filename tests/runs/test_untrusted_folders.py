@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import faulthandler
 import hashlib
+import io
 import json
 import os
 import pickle
@@ -10,9 +12,10 @@ import random
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +23,25 @@ import pytest
 from forged_run import forge_sums
 from made_once import made_once
 from tiny import TINY, Command, call, read_json, write_yaml
-from tiny_tasks import flown
+from tiny_tasks import boat, flown, measured
 
 import residnet
+from residnet.cli import main
 from residnet.core.errors import ResidnetError, UsageError
+from residnet.core.files import atomic_write
 from residnet.core.run_loader import accept_run, name_damaged_key
+from residnet.engine.c_code import find_compiler
+from residnet.export import vessel
 from residnet.report import figure_files, page
 from residnet.report.run_reader import RunFiles
+from residnet.runs import folder as run_folder
 from residnet.runs.folder import RunFolder
 from residnet.tasks import registry
 
 SECONDS = 5.0
 """Time after which a folder counts as one that hangs a command."""
+BACKSTOP_SECONDS = 120.0
+"""Time after which the process ends because code outside of Python does not return."""
 SKLEARN = {
     "name": "boosted",
     "heads": {"trees": {"kind": "sklearn", "samples": 100}},
@@ -40,8 +50,13 @@ SKLEARN = {
     "training": {},
     "export": {"models": []},
 }
+REFITTED = {
+    "refit": {"baseline": {"horizon": "5 s", "every": "5 s", "iterations": 1}},
+    "ensembles": {"ensemble": ["ridge", "mlp"]},
+    "export": {"models": []},
+}
 CONFIGS: dict[str, Callable[[Path], dict[str, Any]]] = {
-    "fit": lambda folder: TINY | {"export": {"models": []}},
+    "fit": lambda folder: measured(folder) | REFITTED,
     "simulate": flown,
     "sklearn": lambda folder: TINY | SKLEARN | {"data": TINY["data"] | {"duration": 25}},
 }
@@ -153,26 +168,88 @@ class Hang(BaseException):
     """The alarm of a command that takes too long."""
 
 
-@contextmanager
-def limited(seconds: float) -> Iterator[None]:
-    """End whatever computes for longer within the context, or waits for half a minute more.
+def measure_slowness(seconds: float = 0.02) -> float:
+    """Measure how many seconds pass for each second of the processor, at least 1.
 
-    Time of the processor is counted, since tests run beside others.
+    Other processes of the machine make it larger than 1.
     """
+    wall_start = time.perf_counter()
+    processor_start = time.thread_time()
+    while time.thread_time() - processor_start < seconds:
+        pass
+    return max(1.0, (time.perf_counter() - wall_start) / (time.thread_time() - processor_start))
 
-    def alarm(*_: object) -> None:
-        raise Hang
 
-    kinds = {signal.SIGPROF: signal.ITIMER_PROF, signal.SIGALRM: signal.ITIMER_REAL}
-    before = {number: signal.signal(number, alarm) for number in kinds}
-    signal.setitimer(signal.ITIMER_PROF, seconds)
-    signal.setitimer(signal.ITIMER_REAL, seconds + 30.0)
+@contextmanager
+def limited(seconds: float = SECONDS) -> Iterator[None]:
+    """End a context that takes longer than `seconds` of wall time.
+
+    Waiting counts as much as computing. Only where the processor is shared with other processes
+    is the limit longer, by the factor that is measured at the start and when the time is over.
+    """
+    begin = time.monotonic()
+    slowness = measure_slowness()
+
+    def end_if_too_late(*_: object) -> None:
+        nonlocal slowness
+        slowness = max(slowness, measure_slowness())
+        remaining = seconds * slowness - (time.monotonic() - begin)
+        if remaining <= 0.0:
+            raise Hang(f"longer than {seconds:g} s, at {slowness:.1f} s for each of the processor")
+        signal.setitimer(signal.ITIMER_REAL, remaining)
+
+    previous_handler = signal.signal(signal.SIGALRM, end_if_too_late)
+    # an alarm is handled between two instructions of Python; a thread ends everything else
+    faulthandler.dump_traceback_later(BACKSTOP_SECONDS, exit=True, file=sys.__stderr__)
+    signal.setitimer(signal.ITIMER_REAL, seconds * slowness)
     try:
         yield
     finally:
-        for number, timer in kinds.items():
-            signal.setitimer(timer, 0)
-            signal.signal(number, before[number])
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, previous_handler)
+        faulthandler.cancel_dump_traceback_later()
+
+
+@pytest.mark.parametrize("compute", [True, False])
+def test_a_hang_is_ended_whether_it_computes_or_waits(compute: bool, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    begin = time.monotonic()
+
+    def hang() -> None:
+        while compute:
+            pass
+        (tmp_path / "fifo").read_bytes()
+
+    with pytest.raises(Hang, match=r"longer than 0\.2 s"), limited(0.2):
+        hang()
+    assert 0.2 <= time.monotonic() - begin < 30.0
+    with limited(0.2):
+        pass
+
+
+def _run_command(*words: object) -> None:
+    """Carry out a command line; a refusal has to be one line.
+
+    Raises:
+        AssertionError: if it ends in several lines, a traceback or a defect.
+    """
+    output = io.StringIO()
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        redirect_stdout(io.StringIO()),
+        redirect_stderr(output),
+    ):
+        patch.setattr("sys.argv", ["residnet", *map(str, words)])
+        code: object = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+    said = output.getvalue()
+    assert code in (0, 1, 2), said
+    assert said.count("\n") <= 1, said
+    assert "defect of residnet" not in said, said
+    assert "Traceback" not in said, said
 
 
 def _load_models(run: Path) -> None:
@@ -199,30 +276,82 @@ def _read_task(run: Path) -> None:
         RunFiles(run).read_json("metrics.json")
 
 
-ENTRANCES = [_load_models, _read_report, _list_runs, _read_task]
+def _export(run: Path) -> None:
+    # a random name or format would depend on the mutation: each model has its format
+    names = sorted(path.name for path in (run / "models").glob("*"))[:4] or ["selected"]
+    for name, file_format in zip(names, ("torchscript", "parameters", "casadi", "c"), strict=False):
+        out = run.parent.parent / "written" / f"{name}.out"
+        words = ("--model", name, "--format", file_format, "--anyway", "--quiet")
+        _run_command("export", run, *words, "--out", out)
+
+
+def _evaluate(run: Path) -> None:
+    out = run.parent.parent / "written" / "evaluation"
+    _run_command("evaluate", run, run.parent.parent / "new.csv", "--out", out, "--quiet")
+
+
+def _monitor(run: Path) -> None:
+    out = run.parent.parent / "written" / "page"
+    words = ("--window", "5 s", "--out", out, "--quiet")
+    _run_command("monitor", run, run.parent.parent / "new.csv", *words)
+
+
+def _compare(run: Path) -> None:
+    out = run.parent.parent / "written" / "comparison"
+    undamaged = run.parent.parent / "undamaged"
+    _run_command("compare", undamaged, run, "--out", out, "--quiet")
+
+
+def _plan_trial(run: Path) -> None:
+    out = run.parent.parent / "written" / "plan"
+    _run_command("plan-trial", run, "--time", "10 s", "--count", 1, "--out", out, "--quiet")
+
+
+ENTRANCES = [
+    _load_models, _read_report, _list_runs, _read_task,
+    _export, _evaluate, _monitor, _compare, _plan_trial,
+]  # fmt: skip
 
 
 @pytest.fixture
 def no_execution(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make every start of a program and every pickle an error; pictures are not drawn."""
+    """Make every start of a program and every pickle an error; pictures are not drawn.
+
+    Only the compiler may start, with the sources that residnet writes for compiled rollouts.
+    """
 
     def forbidden(*args: object, **_: object) -> None:
         raise AssertionError(f"something was executed: {args}")
 
+    class CompilerOnly(subprocess.Popen):  # type: ignore[type-arg]
+        def __init__(self, args: Any, *others: Any, **settings: Any) -> None:
+            if settings.get("shell") or args[0] != find_compiler():
+                forbidden(args, settings)
+            super().__init__(args, *others, **settings)
+
     for owner, name in (
-        (os, "system"), (os, "popen"), (os, "execv"), (os, "posix_spawn"), (subprocess, "Popen"),
+        (os, "system"), (os, "popen"), (os, "execv"),
         (pickle, "load"), (pickle, "loads"), (pickle, "Unpickler"),
     ):  # fmt: skip
         monkeypatch.setattr(owner, name, forbidden)
+    monkeypatch.setattr(subprocess, "Popen", CompilerOnly)
+    # the revision of residnet's source is asked of git, whatever the run folder holds
+    monkeypatch.setattr(run_folder, "read_git_revision", lambda: None)
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 20)
     monkeypatch.setattr(page, "render_figures", lambda sections: {})
     monkeypatch.setattr(figure_files, "render_matplotlib", lambda figure, case: None)
-    monkeypatch.setattr(figure_files, "save_png", lambda still, path, *_: path.write_bytes(PIXEL))
+    monkeypatch.setattr(figure_files, "save_png", _save_pixel)
 
 
 PIXEL = bytes.fromhex(
     "89504e470d0a1a0a0000000d4948445200000001000000010804000000b51c0c02"
     "0000000b4944415478da6364f80f00010501012718e3660000000049454e44ae426082"
 )
+
+
+def _save_pixel(_: object, path: Path, *__: object) -> None:
+    with atomic_write(path) as file:
+        file.write_bytes(PIXEL)
 
 
 def _hashes(folder: Path) -> dict[str, str]:
@@ -233,27 +362,24 @@ def _hashes(folder: Path) -> dict[str, str]:
     }
 
 
-def fuzz(finished: Path, folder: Path, seeds: range) -> None:
-    """Mutate a run once for each seed, and read it by every entrance.
+def fuzz(finished: Path, folder: Path, seeds: range) -> list[str]:
+    """Mutate a run once for each seed, and read it by two of the entrances in turn.
 
-    Raises:
-        AssertionError: with all seeds that were not refused in one line.
+    Returns:
+        One line for each seed and entrance that was not refused in one line, took too long or
+        touched a file outside of the run.
     """
     outside = folder / "outside"
     outside.mkdir()
     victim = outside / "victim.txt"
     victim.write_text("the user's thesis")
-    before = _hashes(outside)
+    boat(9).to_csv(folder / "new.csv", index=False)
+    shutil.copytree(finished, folder / "undamaged")
+    before = _hashes(outside) | _hashes(folder / "undamaged")
     faults = []
-    # what a report costs by itself is no hang
-    shutil.copytree(finished, folder / "runs" / "stranger")
-    begin = time.process_time()
-    _read_report(folder / "runs" / "stranger")
-    usual = time.process_time() - begin
-    shutil.rmtree(folder / "runs" / "stranger")
+    run = folder / "runs" / "stranger"
     for seed in seeds:
         rng = random.Random(seed)
-        run = folder / "runs" / "stranger"
         shutil.copytree(finished, run)
         done = mutate(run, victim, rng)
         if rng.random() < 0.7:
@@ -263,29 +389,50 @@ def fuzz(finished: Path, folder: Path, seeds: range) -> None:
             except OSError:
                 # a device or a link has no sum
                 pass
-        for read in rng.sample(ENTRANCES, 2):
+        turn = seed % len(ENTRANCES)
+        for read in (ENTRANCES[turn], ENTRANCES[turn - rng.randrange(1, len(ENTRANCES))]):
+            problem = ""
             try:
-                with limited(usual + SECONDS):
+                with limited():
                     read(run)
             except ResidnetError as error:
-                if "\n" in str(error):
-                    faults.append((seed, done, read.__name__, "several lines"))
+                problem = "several lines" if "\n" in str(error) else ""
             except (Hang, Exception) as error:
-                faults.append((seed, done, read.__name__, f"{type(error).__name__}: {error}"[:200]))
-        assert _hashes(outside) == before, (seed, done)
+                problem = f"{type(error).__name__}: {str(error).splitlines()[:1]}"[:300]
+            if problem:
+                faults.append(f"{seed} {done}, {read.__name__}: {problem}")
+        if _hashes(outside) | _hashes(folder / "undamaged") != before:
+            faults.append(f"{seed} {done}: touched a file outside of the run")
         shutil.rmtree(run)
-    assert not faults, "\n".join(map(str, faults))
+        shutil.rmtree(folder / "written", ignore_errors=True)
+    return faults
+
+
+@pytest.mark.usefixtures("no_execution")
+@pytest.mark.parametrize("read", ENTRANCES)
+def test_an_undamaged_folder_is_read_in_time(
+    read: Callable[[Path], None], finished: Path, tmp_path: Path
+) -> None:
+    boat(9).to_csv(tmp_path / "new.csv", index=False)
+    for copy in (tmp_path / "undamaged", run := tmp_path / "runs" / "stranger"):
+        shutil.copytree(finished, copy)
+    begin = time.monotonic()
+    with limited():
+        read(run)
+    assert time.monotonic() > begin
 
 
 @pytest.mark.usefixtures("no_execution")
 def test_mutated_folders_end_in_one_line(finished: Path, tmp_path: Path) -> None:
-    fuzz(finished, tmp_path, range(12))
+    faults = fuzz(finished, tmp_path, range(18))
+    assert not faults, "\n".join(faults)
 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("no_execution")
 def test_a_thousand_mutated_folders_end_in_one_line(finished: Path, tmp_path: Path) -> None:
-    fuzz(finished, tmp_path, range(1_000, 1_334))
+    faults = fuzz(finished, tmp_path, range(1_000, 1_334))
+    assert not faults, "\n".join(faults)
 
 
 # ------------------------------------------------------------------------- single attacks

@@ -264,9 +264,16 @@ def test_evaluate_has_the_options_that_it_recommends(
     said = command("evaluate", run, other, "--out", out, "--resume", "--quiet")
     assert said.code == 2
     assert "has changed since" in said.err
-    said = command("evaluate", run, other, "--out", run, "--overwrite", "--quiet")
-    assert said.code == 2
-    assert "resolved.yaml: lies in" in said.err
+    for option in ([], ["--resume"], ["--overwrite"]):
+        for place in (run, run.parent):
+            said = command("evaluate", run, other, "--out", place, *option, "--quiet")
+            assert (said.code, said.err.count("\n")) == (2, 1)
+            assert (
+                f"{place}: contains the run {run} that is evaluated; choose another --out"
+                in said.err
+            )
+            # an option that was not given is no way out
+            assert "--overwrite" not in said.err
     RunFolder.open(run)
 
 

@@ -133,7 +133,11 @@ def evaluate_on_logs(
     folder_path = output_folder or run.path / time.strftime("external-%Y%m%dT%H%M%S")
     resolved = dump_config(config)
     # refuse an unusable folder before the logs are read, which may take long
-    require_apart(folder_path, [run.resolved_config])
+    if run.resolved_config.resolve().is_relative_to(folder_path.resolve()):
+        raise UsageError(
+            f"{folder_path}: contains the run {run.path} that is evaluated; choose another --out,"
+            " or none for a new folder in the run"
+        )
     RunFolder(folder_path).require_usable(resolved, resume=resume, overwrite=overwrite)
     input_paths, raw_logs, prepared = read_external_logs(config, logs)
     for log in prepared:
