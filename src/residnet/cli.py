@@ -406,6 +406,22 @@ def new(
     defaults: Annotated[
         bool, typer.Option("--defaults", help="Ask nothing: use defaults and mark them as guesses.")
     ] = False,
+    names: Annotated[
+        str | None,
+        typer.Option(
+            "--names",
+            metavar="T,X,Y,...",
+            help="Names of all columns in order, for tables without a line of names.",
+        ),
+    ] = None,
+    step: Annotated[
+        str | None,
+        typer.Option(
+            "--step",
+            metavar="TIME",
+            help="Time between two rows, such as '0.1 s', for tables without a column of time.",
+        ),
+    ] = None,
     quiet: QuietOption = False,
 ) -> None:
     """Draft a complete config for `residnet run` from logs.
@@ -413,13 +429,18 @@ def new(
     Channels, units, frames, inputs, splits, protocols and models are proposed. Questions that the
     logs do not answer are asked on a terminal; otherwise the default is marked as a guess.
     """
-    from residnet.tasks.drafting import write_new_config
+    from residnet.io.drafting.channels import READER_KEY
+    from residnet.tasks.drafting import STOP, write_new_config
 
+    options = {(*READER_KEY, "names"): names, (*READER_KEY, "time", "step"): step}
+    answers = {key: answer for key, answer in options.items() if answer is not None}
     with show_progress(quiet=quiet):
         prompt = None if defaults else interactive_prompt()
         config_file = output_file or Path("my_boat.yaml")
-        lines = write_new_config(logs, config_file, prompt, overwrite=overwrite)
+        lines = write_new_config(logs, config_file, prompt, overwrite=overwrite, answers=answers)
     print("\n".join(lines))
+    if lines[-1].startswith(STOP):
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -3,9 +3,10 @@
 A case is a folder with two trips of the truth in some layout and a `case.yaml`: `channels` with the
 largest error (SI) of nine samples in ten, null where the truth lacks it; `told`, patterns that
 `inspect` must say, `never`, which nobody may; `misled`, whether it warns, null where either will
-do; `drafted`, patterns that `new` must say, or `refused`, how it ends; `truth`, log -> trip and its
-first second. Where only the channels stand, only they are looked at. `make.py` makes the truth, and
-what the sensors of a new case say.
+do; `drafted`, patterns that `new` must say, or `refused`, how it ends; `answers`, what the user
+says to `new`, key of the reader -> answer, after which it does not refuse; `truth`, log -> trip and
+its first second. Where only the channels stand, only they are looked at. `make.py` makes the truth,
+and what the sensors of a new case say.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ import yaml
 import residnet
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
+from residnet.io.drafting.channels import READER_KEY
+from residnet.io.drafting.questions import Key
 from residnet.tasks.drafting import write_new_config
 from residnet.tasks.inspection import inspect_logs
 from residnet.tasks.registry import load_task, open_finished_task
@@ -58,10 +61,16 @@ def drafted(case: dict[str, Any], folder: Path, config: Path) -> str:
         with pytest.raises(ResidnetError, match=case["refused"]) as refused:
             write_new_config([folder], config, None, overwrite=False)
         assert "\n" not in str(refused.value)
-        return ""
-    told = write_new_config([folder], config, None, overwrite=False)
+        if "answers" not in case:
+            return ""
+    told = write_new_config([folder], config, None, overwrite=False, answers=answers_of(case))
     load_task(config, []).check()
     return "\n".join([*told, config.read_text()])
+
+
+def answers_of(case: dict[str, Any]) -> dict[Key, str]:
+    """Return the answers of a user, by keys of the config."""
+    return {(*READER_KEY, *key.split(".")): text for key, text in case.get("answers", {}).items()}
 
 
 @pytest.mark.parametrize("name", FOLDERS)
@@ -84,7 +93,11 @@ def test_a_layout_is_read_and_told_for_what_it_is(name: str, tmp_path: Path) -> 
     assert [
         word for word in case.get("never", ()) if re.search(word, " ".join(text.values()))
     ] == []
-    logs = residnet.read_logs(folder)
+    if "answers" in case:
+        reader: Any = load_task(tmp_path / "boat.yaml", [])
+        logs = [reader.data.reader.build().read(path) for path in sorted(folder.iterdir())]
+    else:
+        logs = residnet.read_logs(folder)
     assert logs
     for log in logs:
         assert set(log.channels) == set(case["channels"])
@@ -97,11 +110,12 @@ def test_a_layout_is_read_and_told_for_what_it_is(name: str, tmp_path: Path) -> 
 @pytest.mark.parametrize("name", FOLDERS)
 def test_a_layout_is_fitted_and_judged(name: str, tmp_path: Path) -> None:
     case, folder = case_in(name, tmp_path)
-    if "refused" in case:
+    if "refused" in case and "answers" not in case:
         pytest.skip("cannot be fitted, as the test of its doors says")
-    write_new_config([folder], tmp_path / "boat.yaml", None, overwrite=False)
+    config = tmp_path / "boat.yaml"
+    write_new_config([folder], config, None, overwrite=False, answers=answers_of(case))
     run = tmp_path / "run"
-    load_task(tmp_path / "boat.yaml", ["effort=0.02"]).run(output_folder=run)
+    load_task(config, ["effort=0.02"]).run(output_folder=run)
     ended, task = open_finished_task(run, "evaluate")
     task.evaluate_on_logs(ended, [folder], tmp_path / "other")
     for place in (run, tmp_path / "other"):

@@ -224,7 +224,7 @@ def test_times_that_are_days_whole_seconds_or_beside_a_counter(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"1,2,3\n4,5,6\n7,8,9\n", "no line with column names"),
+        (b"1,2,3\n4,5,6\n7,8,9\n", "3 columns of numbers without names"),
         (b"\xff\xfea\x00\x00\xd8;\x00b\x00\n\x001\x00", "not UTF-16 text"),
         (b"name,vessel\na,b\nc,d\n", "column names|contain numbers"),
         ("\n".join(GERMAN).encode().replace(b"0,4", b"\x00\x00\x00"), r"zero byte|no text"),

@@ -43,6 +43,8 @@ MONTH_NUMBERS: dict[str, int] = {
 """First three letters of a month -> its number, from 1."""
 DATE_PART_NAMES = tuple(_VOCABULARY["date_parts"].split())
 """Normalized names of columns with one part of a date or of a time of day."""
+VESSEL_COLUMN_NAMES = tuple(_VOCABULARY["vessel_columns"].split("|"))
+"""Normalized names of columns that identify the vessel of each row, in order of precedence."""
 TIME_VECTOR_NAMES = tuple(_VOCABULARY["time_vectors"].split())
 """Names of time vectors in MATLAB and HDF5 files, in order of precedence."""
 ARRIVAL_COLUMN_NAMES = tuple(_VOCABULARY["arrival_columns"].split())
@@ -51,6 +53,11 @@ SPLIT_NAMES: dict[str, str] = _VOCABULARY["split_names"]
 """Name of a folder or file -> split."""
 GERMANIC_PATTERN = re.compile("|".join(_VOCABULARY["germanic_words"].split()))
 """German and Dutch words, in which the letter O means east."""
+MANOEUVRE_PATTERNS: dict[str, re.Pattern[str]] = {
+    kind: re.compile(re.sub(r"\|\s+", "|", text.strip()))
+    for kind, text in _VOCABULARY["manoeuvre_names"].items()
+}
+"""Kind of manoeuvre -> pattern of the normalized names of its files."""
 REVOLUTION_PATTERN = re.compile("|".join(_VOCABULARY["revolution_patterns"].split()), re.IGNORECASE)
 """Words for revolutions."""
 
@@ -432,10 +439,18 @@ _STATE_RULES = (
     _ChannelRule("v", "sway", _EARTH_AXIS_CONCEPTS),
     _ChannelRule("u", "surge|longitude", _EARTH_AXIS_CONCEPTS),
     _ChannelRule("v", "speed port|starboard", _EARTH_AXIS_CONCEPTS),
+    # the sibling of a velocity along x and y is no speed
+    _ChannelRule(None, "", "", _TWIST_PATTERN.format("z")),
     _ChannelRule("speed", "speed", _EARTH_AXIS_CONCEPTS),
 )
 """Rules for channels of motion in order of precedence."""
+_VERTICAL_TWIST_PATTERN = _TWIST_PATTERN.format("z")
 _DEPTH_RULES = (
+    # the siblings of position_x, linear_x and angular_z
+    _ChannelRule("z", "position", "x y speed", r"\bz(?: m)?$"),
+    _ChannelRule("w", "", "angular", _VERTICAL_TWIST_PATTERN),
+    _ChannelRule("q", "angular", "", r" y(?: (?:dps|degps|radps|rps|deg s|rad s))?$"),
+    _ChannelRule("p", "angular", "", r" x(?: (?:dps|degps|radps|rps|deg s|rad s))?$"),
     _ChannelRule("q", "pitch rate|speed|angular", "propeller heave"),
     _ChannelRule("theta", "pitch", "propeller heave"),
     _ChannelRule("w", "heave|depth rate|speed|angular"),

@@ -596,3 +596,26 @@ def mask_held_values(log: Log) -> Log:
             is_fresh = np.append(True, (np.diff(values, axis=0) != 0.0).any(axis=1))
             fresh_values |= {name: np.where(is_fresh, log[name], np.nan) for name in names}
     return log.replace(channels={**log.channels, **fresh_values}) if fresh_values else log
+
+
+_AIS_SENTINELS = {
+    ("psi", "deg"): 511.0,
+    ("latitude", "deg"): 91.0,
+    ("longitude", "deg"): 181.0,
+    ("u", "kn"): 102.3,
+}
+"""Channel and unit -> value that means "not available" (ITU-R M.1371, message 1)."""
+
+
+def is_ais_sentinel(channel: str, unit: str, values: np.ndarray) -> np.ndarray:
+    """Return which values [T] are the code of AIS for a missing value, bool [T].
+
+    Args:
+        channel: name of the channel.
+        unit: unit of the values.
+        values: values in this unit.
+    """
+    sentinel = _AIS_SENTINELS.get((channel, unit))
+    if sentinel is None:
+        return np.zeros(values.shape, dtype=bool)
+    return np.asarray(np.abs(values - sentinel) < 1e-6)

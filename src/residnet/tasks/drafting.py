@@ -31,12 +31,14 @@ from residnet.core.names import (
 from residnet.core.ownership import require_replaceable
 from residnet.core.progress import log_message
 from residnet.io.drafting.channels import CHANNELS_KEY
+from residnet.io.drafting.problems import group_problems
 from residnet.io.drafting.questions import (
     TEXT_COLUMNS,
     UNMAPPED_COLUMNS,
     UNMAPPED_FIELDS,
     AnswerCallback,
     DraftNotes,
+    Key,
     dump_commented_yaml,
 )
 from residnet.io.drafting.reading import INPUTS_KEY, find_log_files, read_drafted
@@ -57,6 +59,10 @@ from residnet.io.split import (
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.quality import inspect_log
 
+STOP = "stop: "
+"""Start of the last line of a draft that has to be completed before a run."""
+_MIN_TURN = np.radians(20.0)
+"""Range of the heading in rad from which a vessel counts as turning."""
 _UNMATCHED_COLUMN_NOTES = (UNMAPPED_COLUMNS, TEXT_COLUMNS, UNMAPPED_FIELDS)
 _MAX_INSPECTED_LOGS = 12
 """Maximum number of logs that are inspected."""
@@ -73,12 +79,14 @@ class ConfigDraft:
         guesses: pairs of a key and the reason of its guess.
         text: the YAML text with comments.
         warnings: unused channels and logs, and errors of the data that would mislead a fit.
+        missing: what the config needs before a run; empty if it is complete.
     """
 
     config: dict[str, Any]
     guesses: tuple[tuple[str, str], ...]
     text: str
     warnings: tuple[str, ...] = ()
+    missing: str = ""
 
     def save(self, file: Path | str) -> Path:
         """Write the config as YAML with its comments; returns the path of the file.
@@ -98,14 +106,18 @@ def write_new_config(
     answer_question: AnswerCallback | None,
     *,
     overwrite: bool,
+    answers: Mapping[Key, str] | None = None,
 ) -> list[str]:
     """Draft a config for logs and write it; returns the lines for the terminal.
+
+    The last line says what to do next. It begins with `STOP` if the config is incomplete.
 
     Args:
         logs: files, folders and bags.
         output_file: file of the config.
         answer_question: asks the user; None for the default answers.
         overwrite: replace an earlier config.
+        answers: answers given in advance, by key of the config.
 
     Raises:
         UsageError: if the file exists already, or a path does not.
@@ -120,7 +132,7 @@ def write_new_config(
     require_replaceable(output_file)
     ascii_name = unicodedata.normalize("NFKD", output_file.stem).encode("ascii", "ignore").decode()
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", ascii_name).strip("_.-") or "my_boat"
-    draft = draft_fit_config(logs, output_file.parent, name, answer_question)
+    draft = draft_fit_config(logs, output_file.parent, name, answer_question, answers)
     file = draft.save(output_file)
     n_guesses = len(draft.guesses)
     messages = [f"{key}: {reason}" for key, reason in draft.guesses[:_MAX_SHOWN_GUESSES]]
@@ -134,7 +146,9 @@ def write_new_config(
         *messages,
         *draft.warnings,
         f"config: {file}",
-        f"next: residnet run {shlex.quote(str(file))}",
+        f"{STOP}{draft.missing}; then residnet run {shlex.quote(str(file))}"
+        if draft.missing
+        else f"next: residnet run {shlex.quote(str(file))}",
     ]
 
 
@@ -182,7 +196,11 @@ def _note_unused_channels(
 
 
 def draft_fit_config(
-    paths: Sequence[Path], folder: Path, name: str, answer_question: AnswerCallback | None = None
+    paths: Sequence[Path],
+    folder: Path,
+    name: str,
+    answer_question: AnswerCallback | None = None,
+    answers: Mapping[Key, str] | None = None,
 ) -> ConfigDraft:
     """Draft a config of the task `fit` for logs.
 
@@ -191,15 +209,24 @@ def draft_fit_config(
         folder: folder of the config; its paths are relative to this folder.
         name: name of the run.
         answer_question: answers questions; None for the default answers, marked as guesses.
+        answers: answers given in advance, by key of the config.
 
     Raises:
         UsageError: if a path does not exist.
         DataError: if no log can be used.
     """
-    draft_notes = DraftNotes(answer_question)
+    draft_notes = DraftNotes(answer_question, answers)
     draft_logs = _DraftLogs(find_log_files(paths), draft_notes)
+    for key in draft_notes.unused_answers():
+        raise UsageError(
+            f"{paths[0]}: --{key[-1]} ({'.'.join(key)}) applies to tables of text that are one log"
+            " each; these logs do not use it, leave it out"
+        )
     inputs = choose_inputs(list(draft_logs.complete_logs.values()), draft_notes)
     _note_missing_inputs(inputs, draft_logs, draft_notes)
+    missing_text = _explain_missing_steering(
+        inputs, draft_logs.dof, list(draft_logs.complete_logs.values()), draft_notes
+    )
     inputs = draft_logs.keep_inputs(inputs, draft_notes)
     dof = draft_logs.dof
     finding_codes, quality_warnings = _data_quality_warnings(list(draft_logs.logs.values()), inputs)
@@ -276,11 +303,42 @@ def draft_fit_config(
     validate_config(config, FitConfig, "draft", folder)
     guesses = tuple((".".join(key), text) for key, text in draft_notes.guessed_values)
     unused = [text for key, text in draft_notes.notes if key[-1] == "channels" or key == ("data",)]
-    exclusion_lines = [
-        f"left out: {path.name}: {reason}" for path, reason in draft_logs.exclusion_reasons.items()
-    ]
+    exclusions = group_problems(draft_logs.exclusion_reasons, has_full_paths=False)
+    exclusion_lines = [f"left out: {line}" for line in exclusions]
     text = dump_commented_yaml(config, draft_notes.comments_at, draft_logs.header_lines())
-    return ConfigDraft(config, guesses, text, (*exclusion_lines, *unused))
+    return ConfigDraft(config, guesses, text, (*exclusion_lines, *unused), missing_text)
+
+
+def _explain_missing_steering(
+    inputs: Sequence[str], dof: DegreesOfFreedom, logs: Sequence[Log], draft_notes: DraftNotes
+) -> str:
+    """Return why a draft without steering cannot be run.
+
+    Args:
+        inputs: inputs of the model.
+        dof: degrees of freedom of the model.
+        logs: logs with complete motion.
+        draft_notes: notes on the columns without a channel.
+
+    Returns:
+        The reason and what to do; empty if an input steers or the vessel goes straight.
+    """
+    if inputs and missing_control(inputs, dof) != "steers":
+        return ""
+    turns = [
+        float(np.ptp(log["psi"][np.isfinite(log["psi"])])) for log in logs if "psi" in log.channels
+    ]
+    if max(turns, default=0.0) < _MIN_TURN:
+        return ""
+    unmatched = "; ".join(
+        text for _, text in draft_notes.notes if text.startswith(_UNMATCHED_COLUMN_NOTES)
+    )
+    columns_text = f" ({unmatched})" if unmatched else ""
+    return (
+        f"the vessel turns by up to {np.degrees(max(turns)):.0f} deg, and no input steers it; name"
+        f" the column that does under data.reader.channels and signals.inputs{columns_text}, or"
+        " give logs with it"
+    )
 
 
 def _data_quality_warnings(
@@ -355,7 +413,7 @@ class _DraftLogs:
             unmatched_notes = "; ".join(
                 text for _, text in draft_notes.notes if text.startswith(_UNMATCHED_COLUMN_NOTES)
             )
-            reason = next(iter(self.exclusion_reasons.values()))
+            reason = group_problems(self.exclusion_reasons)[0]
             raise DataError(f"{reason} ({unmatched_notes})" if unmatched_notes else reason)
 
     def keep_inputs(self, inputs: Sequence[str], draft_notes: DraftNotes) -> tuple[str, ...]:
@@ -419,7 +477,7 @@ class _DraftLogs:
             except ResidnetError as error:
                 self.exclusion_reasons[path] = str(error)
         if not usable_logs:
-            raise DataError(next(iter(self.exclusion_reasons.values())))
+            raise DataError(group_problems(self.exclusion_reasons)[0])
         unique_names = {log.name for log in remove_copies(list(usable_logs.values()))}
         copies = [path for path, log in usable_logs.items() if log.name not in unique_names]
         self.exclusion_reasons |= dict.fromkeys(

@@ -14,6 +14,7 @@ from residnet.core.errors import ConfigError, DataError, ResidnetError, UsageErr
 from residnet.core.files import write_owned
 from residnet.core.log import Log
 from residnet.core.progress import report_progress
+from residnet.io.drafting.problems import group_problems, strip_file_name
 from residnet.io.drafting.questions import dump_commented_yaml
 from residnet.io.drafting.reading import find_log_files, read_mixed_formats
 from residnet.io.split import assign_log_names
@@ -98,6 +99,7 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
     names = assign_log_names(files)
     logs: list[Log] = []
     reports: list[InspectionReport] = []
+    unreadable_files: dict[Path, str] = {}
     for number, path in enumerate(files):
         report_progress("inspecting logs", number, len(files))
         log = results[path]
@@ -112,7 +114,9 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
         except DataError as error:
             if len(files) == 1:
                 raise
-            unreadable = Finding("fatal", "unreadable", str(error))
+            message = strip_file_name(files, str(error))
+            unreadable_files[path] = message
+            unreadable = Finding("fatal", "unreadable", f"{path}: {message}")
             quality_report = InspectionReport(names[path], (unreadable,), str(path))
         reports.append(quality_report)
     splits = {} if fit_config is None else _split_of_logs(fit_config, names)
@@ -124,9 +128,12 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
             "together", (*joint_report.findings, *_check_regressor_conditioning(logs, fit_config))
         )
     report_progress("inspecting logs", len(files), len(files))
-    lines = [
+    # one line for each reason why files cannot be read
+    lines = [f"fatal: {line}" for line in group_problems(unreadable_files)]
+    lines += [
         line
         for quality_report_of_log in (*reports, joint_report)
+        if not quality_report_of_log.find_by_code("unreadable")
         for line in quality_report_of_log.to_lines()
     ]
     content = build_inspection(reports, joint_report)

@@ -403,10 +403,13 @@ def find_depth_channels(columns: Sequence[str], known_channels: Collection[str])
     """
     depth_channels = {column: match_depth_channel(parse_name(column)) for column in columns}
     column_by_channel = {name: column for column, name in reversed(depth_channels.items()) if name}
+    roll_rate = {"p": column_by_channel["p"]} if "p" in column_by_channel else {}
     column_by_channel = {
         name: column_by_channel[name] for name in _DEPTH_CHANNELS if name in column_by_channel
     }
     has_full_attitude = "phi" in known_channels and {"z", "theta"} <= column_by_channel.keys()
+    if has_full_attitude and "p" not in known_channels:
+        column_by_channel |= roll_rate
     return (
         column_by_channel
         if has_full_attitude

@@ -9,6 +9,8 @@ from typing import Any, final
 
 import yaml
 
+from residnet.core.errors import DataError
+
 Key = tuple[str, ...]
 """Path of a key in the drafted config, for example `("data", "reader", "channels", "r")`."""
 
@@ -49,14 +51,19 @@ class DraftNotes:
 
     Args:
         answer: function that asks the user; None takes every default.
+        answers: answers that the user has given in advance, by key.
 
     Attributes:
         guessed_values: key and reason of each value that may be wrong.
         notes: key and text of each fact from the files.
     """
 
-    def __init__(self, answer: AnswerCallback | None = None) -> None:
+    def __init__(
+        self, answer: AnswerCallback | None = None, answers: Mapping[Key, str] | None = None
+    ) -> None:
         self._answer_question = answer
+        self._answers = dict(answers or {})
+        self._used_answers = set[Key]()
         self.guessed_values: list[tuple[Key, str]] = []
         self.notes: list[tuple[Key, str]] = []
 
@@ -81,6 +88,34 @@ class DraftNotes:
         else:
             self.add_note(key, f"answered '{user_answer}' instead of '{default}'")
         return user_answer
+
+    def has_answer(self, key: Key) -> bool:
+        """Return whether the user has given the answer in advance."""
+        return key in self._answers
+
+    def unused_answers(self) -> list[Key]:
+        """Return the keys of answers that were given in advance and that no question asked for."""
+        return [key for key in self._answers if key not in self._used_answers]
+
+    def require_answer(self, key: Key, text: str, refusal: DataError) -> str:
+        """Return the user's answer to a question without a default.
+
+        Args:
+            key: key of the config.
+            text: the question.
+            refusal: error if nobody answers.
+
+        Raises:
+            DataError: if nobody answers.
+        """
+        self._used_answers.add(key)
+        answer = self._answers.get(key, "")
+        if not answer and self._answer_question is not None:
+            answer = self._answer_question(Question(key, text, "", "", ()))
+        if not answer.strip():
+            raise refusal
+        self.add_note(key, f"answered '{answer}'")
+        return answer
 
     def add_guess(self, key: Key, reason: str) -> None:
         """Record that a value may be wrong, with the reason for it."""

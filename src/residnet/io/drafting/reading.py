@@ -11,7 +11,7 @@ import dataclasses
 import itertools
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -35,8 +35,14 @@ from residnet.io.drafting.channels import (
     draft_channel_map,
     estimate_motion,
     estimate_rudder_gain,
+    find_depth_channels,
     fit_to_motion,
     forward_alignment,
+)
+from residnet.io.drafting.problems import (
+    UnreadableLogsError,
+    raise_unreadable,
+    without_channel_map,
 )
 from residnet.io.drafting.questions import UNMAPPED_FIELDS, DraftNotes, Key
 from residnet.io.drafting.tables import (
@@ -58,6 +64,7 @@ from residnet.io.readers import ReaderConfig
 from residnet.io.readers.compose import extract_heading, extract_position
 from residnet.io.readers.detect import AutoConfig, detect_log_kind, suggest_conversion
 from residnet.io.readers.joined_files import group_trip_files
+from residnet.io.readers.manoeuvre_kinds import UNKNOWN, resolve_manoeuvre
 from residnet.io.readers.messages import extend_with_standard_messages, is_ned_format
 from residnet.io.readers.quantities import (
     QUATERNION,
@@ -71,7 +78,7 @@ from residnet.io.readers.quantities import (
     QuaternionHeading,
 )
 from residnet.io.readers.recording import ALL_FIELDS, Recording, Series
-from residnet.io.readers.tables import read_column_names
+from residnet.io.readers.tables import TABLE_KINDS, read_column_names
 from residnet.io.readers.topics import align_clocks
 from residnet.io.split import assign_log_names, find_logs
 from residnet.preprocessing.motion import MotionConfig, complete_motion
@@ -163,7 +170,7 @@ def draft_recordings(
     renamed_fields = _name_bare_numbers(aligned[0], plan.channels) if uses_standard_messages else ()
     for name, (topic, field) in (
         *renamed_fields,
-        *_find_actuator_fields(aligned, sources.used_fields),
+        *_find_actuator_fields(aligned, sources.used_fields, plan, draft_notes),
     ):
         if name in known_channels or name in channels:
             continue
@@ -193,7 +200,7 @@ def _choose_motion_sources(
         is_frame_fixed: whether the format defines the frame of its poses.
     """
     has_pose = log is not None and {"x", "y", "psi"} <= set(log.channels)
-    if named_sources := _find_named_table(recordings, draft_notes):
+    if named_sources := _find_named_table(recordings, draft_notes, needs_pose=not has_pose):
         return named_sources
     if log is None or not has_pose or not _is_consistent(log, draft_notes):
         other_sources = None
@@ -246,22 +253,76 @@ def _is_consistent(log: Log, draft_notes: DraftNotes) -> bool:
 
 
 def _find_named_table(
-    recordings: Sequence[Recording], draft_notes: DraftNotes
+    recordings: Sequence[Recording], draft_notes: DraftNotes, *, needs_pose: bool
 ) -> _MotionSources | None:
-    """Return the motion and inputs of a series without message type, or None.
+    """Return the motion and inputs of series without message type, or None.
 
-    Such series are MATLAB structs and HDF5 groups. Their fields have names like columns of a table,
-    and units, signs and frames are determined in the same way.
+    Such series are MATLAB structs, HDF5 groups and csv files of topics. Their fields have names
+    like columns of a table, and units, signs and frames are determined in the same way. Position,
+    heading and velocities may be in one series or in several.
 
     Args:
         recordings: recordings with aligned clocks.
         draft_notes: receives guesses and notes.
+        needs_pose: whether standard messages give no pose; only then are several series combined.
+
+    Raises:
+        DataError: if several series have the same columns.
+    """
+    sources, base_topic = _choose_named_fields(recordings[0], needs_pose=needs_pose)
+    if not sources:
+        return None
+    tables = [
+        _tabulate_fields(recording, sources, base_topic)
+        for recording in recordings
+        if base_topic in recording.series
+    ]
+    # fields with values in all recordings, without clocks
+    fields = [
+        name
+        for name in sources
+        if all(name in table.columns and np.isfinite(table.columns[name]).any() for table in tables)
+        and not (
+            parse_name(name).has_all("time")
+            and bool((np.diff(tables[0].columns[name]) > 0.0).all())
+        )
+    ]
+    names = match_channels(fields, draft_notes)
+    names |= find_depth_channels(fields, names)
+    if "psi" not in names or not ({"x", "y"} <= {*names} or {"latitude", "longitude"} <= {*names}):
+        return None
+    logs = [
+        RawTable(table.t, {name: table.columns[field] for name, field in names.items()})
+        for table in tables
+    ]
+    entries = draft_channel_map(names, logs, draft_notes)
+    unused_fields = [name for name in fields if name not in names.values()]
+    if unused_fields:
+        draft_notes.add_note(CHANNELS_KEY, f"{UNMAPPED_FIELDS}: {', '.join(unused_fields[:20])}")
+    settings = _convert_entries(entries, sources, base_topic)
+    for name, setting_name in (("x", "position"), ("y", "position"), ("psi", "heading")):
+        draft_notes.move_key((*CHANNELS_KEY, name), (*READER_KEY, setting_name))
+    base_series = recordings[0].series[base_topic]
+    return _MotionSources(settings, {*sources.values()}, _median_series_step(base_series))
+
+
+def _choose_named_fields(
+    recording: Recording, *, needs_pose: bool
+) -> tuple[dict[str, tuple[str, str]], str]:
+    """Choose the series without message type that have position and heading.
+
+    Args:
+        recording: recording with aligned clocks.
+        needs_pose: whether several series may be combined.
+
+    Returns:
+        Name -> topic and field, and the topic whose clock is used; empty if there are none.
 
     Raises:
         DataError: if several series have the same columns.
     """
     candidates = []
-    for series in recordings[0].series.values():
+    for series in recording.series.values():
         channels = {match_state_channel(parse_name(name)) for name in series.fields}
         has_position = {"x", "y"} <= channels or {"latitude", "longitude"} <= channels
         if (
@@ -274,34 +335,29 @@ def _find_named_table(
     if len({frozenset(series.fields) for series in candidates}) < len(candidates):
         table_names = ", ".join(series.name for series in candidates)
         raise DataError(
-            f"{recordings[0].path}: contains {len(candidates)} tables of the same columns"
+            f"{recording.path}: contains {len(candidates)} tables of the same columns"
             f" ({table_names[:120]}), each a separate log; write each to a file, in Python"
             " pandas.DataFrame({name: column for name, column in table.items()}).to_csv(...)"
         )
-    if len(candidates) != 1:
-        return None
-    series = candidates[0]
-    topic = series.name
-    same_series = [r.series[topic] for r in recordings if topic in r.series]
-    # fields with values in all recordings, without clocks
-    fields = [
-        name
-        for name in series.fields
-        if all(
-            series_part.has_field(name) and np.isfinite(series_part[name]).any()
-            for series_part in same_series
-        )
-        and not (parse_name(name).has_all("time") and bool((np.diff(series[name]) > 0.0).all()))
-    ]
-    names = match_channels(fields, draft_notes)
-    logs = [
-        RawTable(series_part.clock, {name: series_part[field] for name, field in names.items()})
-        for series_part in same_series
-    ]
-    entries = draft_channel_map(names, logs, draft_notes)
-    unused_fields = [name for name in fields if name not in names.values()]
-    if unused_fields:
-        draft_notes.add_note(CHANNELS_KEY, f"{UNMAPPED_FIELDS}: {', '.join(unused_fields[:20])}")
+    if len(candidates) > 1:
+        return {}, ""
+    if candidates:
+        topic = candidates[0].name
+        return {field: (topic, field) for field in candidates[0].fields}, topic
+    sources = _find_named_topics(recording) if needs_pose else {}
+    return sources, _find_base_topic(recording, sources) if sources else ""
+
+
+def _convert_entries(
+    entries: dict[str, dict[str, Any]], sources: Mapping[str, tuple[str, str]], base_topic: str
+) -> dict[str, Any]:
+    """Convert the channel map of a table to the settings of a reader of recordings.
+
+    Args:
+        entries: channel -> entry; those of the pose are removed.
+        sources: column -> topic and field.
+        base_topic: topic whose clock is used.
+    """
     settings: dict[str, Any] = {"standard_messages": False}
     for position_kind, channel_pair, keys in (
         ("local", ("x", "y"), ("north", "east")),
@@ -309,27 +365,84 @@ def _find_named_table(
     ):
         if set(channel_pair) <= set(entries):
             first_entry, second_entry = (entries.pop(name) for name in channel_pair)
-            position_settings = {
-                "kind": position_kind,
-                "topic": topic,
-                keys[0]: first_entry["column"],
-            }
+            topic, first_field = sources[first_entry["column"]]
+            position_settings = {"kind": position_kind, "topic": topic, keys[0]: first_field}
             settings["position"] = position_settings | {
-                keys[1]: second_entry["column"],
+                keys[1]: sources[second_entry["column"]][1],
                 "unit": first_entry["unit"],
             }
     heading = entries.pop("psi")
-    settings["heading"] = {"kind": "angle", "topic": topic, "field": heading["column"]}
+    topic, heading_field = sources[heading["column"]]
+    settings["heading"] = {"kind": "angle", "topic": topic, "field": heading_field}
     settings["heading"] |= {"unit": heading["unit"], "frame": heading.get("frame", "ned")}
-    for name, setting_name in (("x", "position"), ("y", "position"), ("psi", "heading")):
-        draft_notes.move_key((*CHANNELS_KEY, name), (*READER_KEY, setting_name))
-    settings["channels"] = {
-        name: {"topic": topic, "field": entry.pop("column"), **entry}
-        for name, entry in entries.items()
+    settings["channels"] = {}
+    for name, entry in entries.items():
+        topic, field = sources[entry.pop("column")]
+        # a command of another topic applies until the next one
+        hold = {} if topic == base_topic or name in MOTION_CHANNELS else {"hold": True}
+        settings["channels"][name] = {"topic": topic, "field": field, **entry, **hold}
+    return settings
+
+
+def _find_named_topics(recording: Recording) -> dict[str, tuple[str, str]]:
+    """Return the fields of the series without message type: name -> topic and field.
+
+    A field that several series have, such as `data`, is named with its topic. Empty if position
+    and heading are not among the names, or if the position is in several series.
+    """
+    series_by_topic = {
+        topic: series
+        for topic, series in recording.series.items()
+        if not series.message_type and len(series) > 1
     }
-    return _MotionSources(
-        settings, {(topic, name) for name in series.fields}, _median_series_step(series)
+    counts = Counter(field for series in series_by_topic.values() for field in series.fields)
+    sources = {
+        field if counts[field] == 1 and field != "data" else f"{topic} {field}": (topic, field)
+        for topic, series in series_by_topic.items()
+        for field in series.fields
+    }
+    channels = match_channels([*sources], DraftNotes())
+    position = next(
+        (pair for pair in (("x", "y"), ("latitude", "longitude")) if {*pair} <= channels.keys()),
+        None,
     )
+    if position is None or "psi" not in channels:
+        return {}
+    first_topic, second_topic = (sources[channels[name]][0] for name in position)
+    has_rows = all(
+        len(series_by_topic[sources[channels[name]][0]]) >= _MIN_MOTION_ROWS
+        for name in (*position, "psi")
+    )
+    return sources if first_topic == second_topic and has_rows else {}
+
+
+def _find_base_topic(recording: Recording, sources: Mapping[str, tuple[str, str]]) -> str:
+    """Return the topic of position or heading with more rows."""
+    channels = match_channels([*sources], DraftNotes())
+    position = "x" if "x" in channels else "latitude"
+    topics = [sources[channels[name]][0] for name in (position, "psi")]
+    return max(topics, key=lambda topic: len(recording.series[topic]))
+
+
+def _tabulate_fields(
+    recording: Recording, sources: Mapping[str, tuple[str, str]], base_topic: str
+) -> RawTable:
+    """Return fields of several topics on the clock of one of them, by the nearest sample.
+
+    Angles cannot be interpolated before their unit is known.
+    """
+    clock = recording.series[base_topic].clock
+    columns = {}
+    for name, (topic, field) in sources.items():
+        series = recording.series.get(topic)
+        if series is None or not series.has_field(field) or not len(series):
+            continue
+        values = series[field]
+        if topic != base_topic:
+            midpoints = 0.5 * (series.clock[1:] + series.clock[:-1])
+            values = values[np.searchsorted(midpoints, clock)]
+        columns[name] = values
+    return RawTable(clock, columns)
 
 
 def _find_best_pose(
@@ -587,16 +700,22 @@ def _concatenate_field(recordings: Sequence[Recording], topic: str, field: str) 
 
 
 def _find_actuator_fields(
-    recordings: Sequence[Recording], used_fields: set[tuple[str, str]]
+    recordings: Sequence[Recording],
+    used_fields: set[tuple[str, str]],
+    plan: ChannelPlan,
+    draft_notes: DraftNotes,
 ) -> Iterator[tuple[str, tuple[str, str]]]:
     """Yield channel, topic and field of fields with names of actuators.
 
-    Fields that differ in a number only (`control[0]`, `control[1]`) become several channels.
-    Otherwise the first field of a channel is used.
+    Fields that differ in a number only (`control[0]`, `control[1]`) become several channels. Of a
+    rudder that several topics command, the one that the vessel follows is used. Otherwise the first
+    field of a channel is used.
 
     Args:
         recordings: recordings with aligned clocks.
         used_fields: topics and fields that are mapped already.
+        plan: sources of position and heading by standard messages.
+        draft_notes: receives guesses and notes.
     """
     fields_by_channel: dict[str, list[tuple[str, str]]] = {}
     for topic, series in recordings[0].series.items():
@@ -609,6 +728,10 @@ def _find_actuator_fields(
             if finite_values.size >= _MIN_INPUT_ROWS and float(np.ptp(finite_values)) > 0.0:
                 fields_by_channel.setdefault(channel, []).append((topic, field))
     for channel, candidate_fields in fields_by_channel.items():
+        if channel in ("delta", "cmd_delta") and len({f for _, f in candidate_fields}) == 1:
+            candidate_fields.sort(
+                key=_rank_publishers(channel, recordings[0], candidate_fields, plan, draft_notes)
+            )
         field_patterns = [(topic, re.sub(r"\d+", "#", field)) for topic, field in candidate_fields]
         numbered_fields = [
             topic_field
@@ -617,6 +740,57 @@ def _find_actuator_fields(
         ]
         for number, topic_field in enumerate(numbered_fields, 1):
             yield f"{channel}_{number}" if len(numbered_fields) > 1 else channel, topic_field
+
+
+def _rank_publishers(
+    channel: str,
+    recording: Recording,
+    fields: Sequence[tuple[str, str]],
+    plan: ChannelPlan,
+    draft_notes: DraftNotes,
+) -> Callable[[tuple[str, str]], float]:
+    """Return the sort key of commands of one rudder by several topics: the followed one first.
+
+    The vessel follows the command that explains most of the changes of its yaw rate over a second,
+    beyond what the yaw rate itself explains.
+
+    Args:
+        channel: channel of the rudder.
+        recording: recording with aligned clocks.
+        fields: topic and field of each command.
+        plan: sources of position and heading by standard messages.
+        draft_notes: receives the guess.
+    """
+    pose = None
+    if len(fields) > 1 and plan.position is not None and plan.heading is not None:
+        pose = _extract_pose(recording, plan.position, plan.heading)
+    if pose is None:
+        return lambda _: 0.0
+    is_known = np.isfinite(pose.columns["psi"])
+    t = pose.t[is_known]
+    yaw_rate = np.gradient(np.unwrap(pose.columns["psi"][is_known]), t)
+    horizon = max(1, round(1.0 / float(np.median(np.diff(t)))))
+    change = yaw_rate[horizon:] - yaw_rate[:-horizon]
+    explained: dict[tuple[str, str], float] = {}
+    for topic, field in fields:
+        series = recording.series[topic]
+        rows = np.maximum(np.searchsorted(series.clock, t, side="right") - 1, 0)
+        command = series[field][rows][:-horizon]
+        regressors = np.stack((np.ones(command.size), yaw_rate[:-horizon], command), axis=1)
+        usable = np.isfinite(regressors).all(axis=1) & np.isfinite(change)
+        solution = np.linalg.lstsq(regressors[usable], change[usable], rcond=None)[0]
+        residual = change[usable] - regressors[usable] @ solution
+        explained[topic, field] = 1.0 - float(
+            np.var(residual) / max(np.var(change[usable]), 1e-300)
+        )
+    followed = max(fields, key=lambda source: explained[source])
+    shares = ", ".join(f"{topic} {explained[topic, field]:.2f}" for topic, field in fields)
+    draft_notes.add_guess(
+        (*CHANNELS_KEY, channel),
+        f"{fields[0][1]} is written by {' and '.join(topic for topic, _ in fields)}; {followed[0]}"
+        f" is taken, which the yaw rate follows (share of its changes that is explained: {shares})",
+    )
+    return lambda source: -explained[source]
 
 
 INPUTS_KEY = ("signals", "inputs")
@@ -724,11 +898,12 @@ def read_drafted(
                 log = reader.read(path) if recording is None else reader.to_log(recording)
                 result.logs[path] = log.replace(name=names[path])
         except ResidnetError as error:
-            result.errors[path] = error
+            result.errors[path] = without_channel_map(error)
     report_progress("reading logs", len(paths), len(paths))
     if not result.logs:
-        raise next(iter(result.errors.values()))
+        raise_unreadable(result.errors)
     _correct_rudder_signs(result)
+    _name_manoeuvres(result)
     return result
 
 
@@ -785,6 +960,27 @@ def _draft_trip_parts(
     draft_notes.add_guess((*READER_KEY, "parts"), text)
     parts = {part_name: part_settings[part_name] for part_name in part_order}
     return {"kind": "joined", "parts": parts}, errors
+
+
+def _name_manoeuvres(result: DraftResult) -> None:
+    """Infer the kinds of manoeuvres of tables, unless folders name them.
+
+    Args:
+        result: drafted reader and its logs, which receive the kinds.
+    """
+    if "manoeuvre" in result.reader or result.reader["kind"] not in TABLE_KINDS.values():
+        return
+    kinds = {path: resolve_manoeuvre("auto", path, log) for path, log in result.logs.items()}
+    counts = Counter(kind for kind in kinds.values() if kind != UNKNOWN)
+    if not counts:
+        return
+    result.reader["manoeuvre"] = "auto"
+    text = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    result.draft_notes.add_guess(
+        (*READER_KEY, "manoeuvre"),
+        f"{text} of {len(kinds)} logs, by the names of the files or by rudder angle and heading",
+    )
+    result.logs = {path: log.replace(manoeuvre=kinds[path]) for path, log in result.logs.items()}
 
 
 def group_by_trip(paths: Sequence[Path]) -> dict[str, list[Path]]:
@@ -852,6 +1048,8 @@ def read_mixed_formats(paths: Sequence[Path]) -> list[DraftResult]:
         draft_notes = DraftNotes()
         try:
             results.append(read_drafted(group, draft_notes, is_gridded=False))
+        except UnreadableLogsError as error:
+            results.append(DraftResult({}, draft_notes, errors=error.errors))
         except ResidnetError as error:
             results.append(DraftResult({}, draft_notes, errors=dict.fromkeys(group, error)))
     return results

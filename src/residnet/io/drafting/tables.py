@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from residnet.core.errors import DataError, ResidnetError, UsageError
+from residnet.core.layout import DegreesOfFreedom
 from residnet.core.names import CHANNEL_UNITS, get_si_unit, truncate
-from residnet.core.units import is_unit, to_si
+from residnet.core.units import is_unit, si_unit, to_si
 from residnet.io.drafting.channels import (
     CHANNELS_KEY,
     MAGNETIC_PATTERN,
@@ -26,14 +27,22 @@ from residnet.io.drafting.channels import (
     find_quaternions,
     find_sin_cos_pairs,
 )
+from residnet.io.drafting.problems import (
+    UnreadableLogsError,
+    raise_unreadable,
+    strip_file_name,
+)
 from residnet.io.drafting.questions import TEXT_COLUMNS, UNMAPPED_COLUMNS, DraftNotes
 from residnet.io.header_vocabulary import (
     DATE_PART_NAMES,
     GERMANIC_PATTERN,
     MOTION_CHANNELS,
     REVOLUTION_PATTERN,
+    VESSEL_COLUMN_NAMES,
     ParsedName,
     find_mismatched_unit,
+    infer_unit,
+    match_depth_channel,
     match_input_channel,
     match_state_channel,
     normalize_name,
@@ -43,7 +52,14 @@ from residnet.io.header_vocabulary import (
 from residnet.io.readers.angles import AngleForm, LetterO, hemisphere_signs, parse_degrees
 from residnet.io.readers.base import require_file
 from residnet.io.readers.clock_repair import find_unique_rows, repair_clock
-from residnet.io.readers.quantities import COSINE_SUFFIX, QUATERNION, SINE_SUFFIX
+from residnet.io.readers.quantities import (
+    COSINE_SUFFIX,
+    QUATERNION,
+    SINE_SUFFIX,
+    normalize_quaternion,
+    quaternion_tilt,
+    quaternion_yaw,
+)
 from residnet.io.readers.tables import (
     TABLE_KINDS,
     list_sheet_names,
@@ -51,7 +67,7 @@ from residnet.io.readers.tables import (
     read_json_head,
     read_parquet_head,
 )
-from residnet.io.readers.text_tables import read_table_head
+from residnet.io.readers.text_tables import HeaderlessTableError, read_table_head
 from residnet.io.readers.timestamps import (
     detect_date_order,
     detect_unix_unit,
@@ -62,6 +78,7 @@ from residnet.io.readers.timestamps import (
 from residnet.preprocessing.channel_values import (
     INTERVAL_TOLERANCE,
     MIN_REGULAR_SHARE,
+    is_ais_sentinel,
     mask_fill_values,
 )
 
@@ -103,13 +120,14 @@ def draft_tables(
         UsageError: if the tables have no common column of time.
         DataError: if no table can be read, or none has a time.
     """
-    previews, errors = _preview_tables(files)
+    previews, errors, names = _preview_named_tables(files, draft_notes)
+    previews, select = _select_vessel_rows(previews, draft_notes)
     main_preview, column_settings = convert_positions_to_degrees(previews[0], draft_notes)
     previews = [
         main_preview,
         *(convert_positions_to_degrees(sheet, DraftNotes())[0] for sheet in previews[1:]),
     ]
-    clock = detect_clock(main_preview)
+    clock, step = _detect_or_ask_clock(previews, draft_notes)
     common_columns = _find_common_columns(previews, clock, draft_notes)
     if clock.guess:
         draft_notes.add_guess((*READER_KEY, "time"), clock.guess)
@@ -134,10 +152,12 @@ def draft_tables(
         draft_notes,
         has_heading=has_heading or has_sin_cos_heading or bool(attitudes),
     )
+    if select:
+        _drop_ais_turn_rate(column_by_channel, main_preview, draft_notes)
     column_by_channel = _rename_pulsed_drives(column_by_channel, previews)
     column_by_channel = _add_sin_cos_channels(column_by_channel, sin_cos_pairs)
     _drop_incomplete_roll(column_by_channel, previews, draft_notes)
-    column_by_channel |= find_depth_channels(common_numeric, column_by_channel)
+    column_by_channel |= find_depth_channels(simple_columns, column_by_channel)
     _refuse_unparsed_positions(main_preview, column_by_channel)
     if "psi" not in column_by_channel:
         column_by_channel |= choose_quaternion_order(
@@ -149,13 +169,17 @@ def draft_tables(
             f" ({', '.join(common_numeric[:12])});"
             f" {_suggest_table_fix(main_preview, clock, common_numeric)}"
         )
-    logs = _build_raw_tables(previews, column_by_channel, errors)
+    logs = _build_raw_tables(previews, column_by_channel, errors, step)
     cells = [
         str(text) for texts in main_preview.text_columns.values() for text in texts.unique()[:20]
     ]
     channels = draft_channel_map(
         column_by_channel, logs, draft_notes, [*main_preview.column_names, *cells]
     )
+    channels |= _draft_vertical_motion(simple_columns, previews, logs, channels, draft_notes)
+    column_by_channel |= {
+        name: entry["column"] for name, entry in channels.items() if name in _VERTICAL_CHANNELS
+    }
     for channel, entry in channels.items():
         if _is_recorded_on_change(channel, logs):
             entry["hold"] = True
@@ -166,11 +190,41 @@ def draft_tables(
     reader_settings = {
         key: value for key, value in main_preview.reader_settings.items() if key != "kind"
     }
-    time = {**clock.settings, "column": main_preview.original_name(clock.settings["column"])}
-    reader_config = {"kind": main_preview.reader_settings["kind"], **reader_settings, "time": time}
+    time = dict(clock.settings)
+    if "column" in time:
+        time["column"] = main_preview.original_name(time["column"])
+    reader_config = {"kind": main_preview.reader_settings["kind"], **reader_settings}
+    reader_config |= {"names": list(names)} if names else {}
+    reader_config |= {"time": time, **({"select": select} if select else {})}
     reader_config |= draft_manoeuvre_setting(files, draft_notes)
-    _note_unused_columns(main_preview, column_by_channel, clock, draft_notes)
+    _note_unused_columns(main_preview, column_by_channel, clock, draft_notes, {*select})
     return {**reader_config, "channels": channels}, errors
+
+
+def _detect_or_ask_clock(
+    previews: Sequence[TablePreview], draft_notes: DraftNotes
+) -> tuple[TableClock, str | None]:
+    """Return the clock of tables, and the time between rows that the user gives for others.
+
+    Raises:
+        DataError: if the tables have no clock, and nobody gives the time between rows.
+    """
+    main_preview = previews[0]
+    key = (*READER_KEY, "time", "step")
+    error = DataError("the time between two rows is empty")
+    if not draft_notes.has_answer(key):
+        try:
+            return detect_clock(main_preview), None
+        except MissingClockError as missing_clock:
+            message = strip_file_name([main_preview.path], str(missing_clock))
+        error = UnreadableLogsError({sheet.path: DataError(message) for sheet in previews})
+    step = draft_notes.require_answer(
+        key,
+        f"{main_preview.path.name} and the other tables have no column of time; time between two"
+        " rows, for example 0.1 s",
+        error,
+    )
+    return make_step_clock(main_preview, step), step
 
 
 def _find_common_columns(
@@ -262,6 +316,100 @@ def _refuse_unparsed_positions(preview: TablePreview, column_by_channel: Mapping
         )
 
 
+_VERTICAL_CHANNELS = ("z", "w", "q", "p")
+"""Channels whose columns complete those of a planar motion to six degrees of freedom."""
+
+
+def _draft_vertical_motion(
+    columns: Sequence[str],
+    previews: Sequence[TablePreview],
+    logs: Sequence[RawTable],
+    channels: Mapping[str, Mapping[str, Any]],
+    draft_notes: DraftNotes,
+) -> dict[str, dict[str, Any]]:
+    """Draft the vertical motion of an underwater vessel whose attitude is a quaternion.
+
+    The columns are the siblings of those of the planar motion, such as `position_z` of
+    `position_x`. They are used if the depth follows from velocities and attitude.
+
+    Args:
+        columns: names of the columns of numbers.
+        previews: first rows of the tables.
+        logs: tables with the mapped columns, in the order of the previews.
+        channels: channel -> entry of the planar motion.
+        draft_notes: receives guesses and notes.
+
+    Returns:
+        Channel -> entry of depth, heave velocity, pitch rate and roll rate; empty for a surface
+        vessel.
+    """
+    matches = {match_depth_channel(parse_name(column)): column for column in reversed(columns)}
+    candidates = {
+        name: matches[name]
+        for name in _VERTICAL_CHANNELS
+        if name in matches and name not in channels
+    }
+    if (
+        "z" not in candidates
+        or not {*QUATERNION} <= channels.keys()
+        or len(previews) != len(logs)
+        or any(set(candidates.values()) - preview.numeric_columns.keys() for preview in previews)
+    ):
+        return {}
+    is_east_north_up = channels["qw"].get("frame") == "enu"
+    vertical_sign = -1 if is_east_north_up else 1
+    rates: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in ("w", "q", "p")}
+    is_submerged = False
+    for preview, log in zip(previews, logs, strict=True):
+        if not {*QUATERNION, "u", "v"} <= log.columns.keys():
+            return {}
+        parts = normalize_quaternion(*(log.columns[name] for name in QUATERNION))
+        roll, pitch = quaternion_tilt(*parts)
+        pitch = vertical_sign * pitch
+        values = {name: preview.numeric_columns[column] for name, column in candidates.items()}
+        if any(column.size != log.t.size for column in values.values()) or log.t.size < 10:
+            continue
+        u = log.columns["u"]
+        v = vertical_sign * log.columns["v"]
+        depth = vertical_sign * values["z"]
+        depth_rate = np.gradient(depth, log.t)
+        heave = depth_rate + u * np.sin(pitch) - v * np.cos(pitch) * np.sin(roll)
+        rates["w"].append((values.get("w", heave), heave / (np.cos(pitch) * np.cos(roll))))
+        rates["q"].append((values.get("q", heave), np.gradient(pitch, log.t)))
+        rates["p"].append((values.get("p", heave), np.gradient(np.unwrap(roll), log.t)))
+        yaw = np.unwrap(quaternion_yaw(*parts))
+        motion = {"x": log.columns.get("x", u), "y": log.columns.get("y", v), "psi": yaw}
+        motion |= {"u": u, "v": v, "z": depth, "phi": roll, "theta": pitch}
+        if "w" in values:
+            motion["w"] = values["w"] * np.sign(np.nansum(values["w"] * heave))
+        is_submerged |= DegreesOfFreedom.from_channels(motion).is_six_dof
+    if not is_submerged:
+        draft_notes.add_note(
+            CHANNELS_KEY,
+            f"{', '.join(candidates.values())}: known and not used, a surface vessel is assumed"
+            " because the depth does not follow from the motion",
+        )
+        return {}
+    entries: dict[str, dict[str, Any]] = {}
+    for name, column in candidates.items():
+        values_of_logs = np.concatenate([preview.numeric_columns[column] for preview in previews])
+        scaling = infer_unit(name, column, values_of_logs)
+        sign = vertical_sign
+        if name != "z":
+            measured = np.concatenate([pair[0] for pair in rates[name]])
+            expected = np.concatenate([pair[1] for pair in rates[name]])
+            is_finite = np.isfinite(measured) & np.isfinite(expected)
+            sign = 1 if float(measured[is_finite] @ expected[is_finite]) >= 0.0 else -1
+        entries[name] = {"column": column, **scaling.settings, **({"sign": -1} if sign < 0 else {})}
+        draft_notes.add_guess(
+            (*CHANNELS_KEY, name),
+            f"'{column}' completes the six degrees of freedom"
+            + ("; positive up in the file" if name == "z" and sign < 0 else "")
+            + (f"; {scaling.reason}" if scaling.reason else ""),
+        )
+    return entries
+
+
 def _suggest_table_fix(
     preview: TablePreview, clock: TableClock, numeric_columns: Sequence[str]
 ) -> str:
@@ -301,7 +449,59 @@ def draft_manoeuvre_setting(files: Sequence[Path], draft_notes: DraftNotes) -> d
     return {"manoeuvre": "folder"}
 
 
-def _preview_tables(files: Sequence[Path]) -> tuple[list[TablePreview], dict[Path, ResidnetError]]:
+class HeaderlessTablesError(UnreadableLogsError):
+    """Tables of the same number of columns, all without column names.
+
+    Attributes:
+        first_error: error of the first table.
+    """
+
+    def __init__(
+        self, first_error: HeaderlessTableError, errors: Mapping[Path, ResidnetError]
+    ) -> None:
+        self.first_error = first_error
+        super().__init__(errors)
+
+
+def _preview_named_tables(
+    files: Sequence[Path], draft_notes: DraftNotes
+) -> tuple[list[TablePreview], dict[Path, ResidnetError], Sequence[str]]:
+    """Load the first rows of tables, whose names are asked for if the files have none.
+
+    Returns:
+        The previews, the error of each table that cannot be read, and the names of all columns;
+        empty if the tables have lines of names.
+
+    Raises:
+        UsageError: if the tables have several formats.
+        DataError: if no table can be read, or its columns have no names.
+    """
+    key = (*READER_KEY, "names")
+    if not draft_notes.has_answer(key):
+        try:
+            return *_preview_tables(files), ()
+        except HeaderlessTablesError as error:
+            refusal = error
+        headerless = refusal.first_error
+        text = f"{files[0].name} has {headerless.n_columns} columns without names; names, in order"
+        if headerless.proposed_names:
+            answer = draft_notes.ask_question(
+                key,
+                text,
+                ", ".join(headerless.proposed_names),
+                "the files have no line of names; these words stand above the numbers",
+            )
+        else:
+            answer = draft_notes.require_answer(key, text, refusal)
+    else:
+        answer = draft_notes.require_answer(key, "", DataError("the names are empty"))
+    names = [name for name in re.split(r"[\s,;]+", answer) if name]
+    return *_preview_tables(files, names), names
+
+
+def _preview_tables(
+    files: Sequence[Path], names: Sequence[str] | None = None
+) -> tuple[list[TablePreview], dict[Path, ResidnetError]]:
     """Load the first rows of tables, 20,000 rows of up to 48 tables and 50 of the others.
 
     Returns:
@@ -317,13 +517,15 @@ def _preview_tables(files: Sequence[Path]) -> tuple[list[TablePreview], dict[Pat
     errors: dict[Path, ResidnetError] = {}
     for number, path in enumerate(files):
         try:
-            previews.append(
-                preview_table(path) if number % stride == 0 else preview_table(path, 50)
-            )
+            previews.append(preview_table(path, 20_000 if number % stride == 0 else 50, names))
         except DataError as error:
             errors[path] = error
     if not previews:
-        raise next(iter(errors.values()))
+        first_error = next(iter(errors.values()))
+        n_columns = {getattr(error, "n_columns", 0) for error in errors.values()}
+        if isinstance(first_error, HeaderlessTableError) and len(n_columns) == 1:
+            raise HeaderlessTablesError(first_error, errors)
+        raise_unreadable(errors)
     reader_settings = {
         tuple(sorted(sheet.reader_settings.items()))
         for sheet in previews
@@ -349,6 +551,83 @@ def _preview_tables(files: Sequence[Path]) -> tuple[list[TablePreview], dict[Pat
         if tuple(sorted(s.reader_settings.items())) == common_settings
     )
     return [previews[best_index], *previews[:best_index], *previews[best_index + 1 :]], errors
+
+
+def _select_vessel_rows(
+    previews: list[TablePreview], draft_notes: DraftNotes
+) -> tuple[list[TablePreview], dict[str, Any]]:
+    """Select the rows of one vessel of tables with a column that identifies vessels, as in AIS.
+
+    Args:
+        previews: first rows of the tables.
+        draft_notes: receives the question for the vessel and notes.
+
+    Returns:
+        The previews with the rows of the vessel, without codes of missing values, and the key
+        `select` of the reader; empty if no column identifies vessels.
+    """
+    import pandas as pd
+
+    columns = {normalize_name(name): name for name in previews[0].column_names}
+    column = next((columns[name] for name in VESSEL_COLUMN_NAMES if name in columns), None)
+    if column is None or column in previews[0].empty_columns:
+        return previews, {}
+
+    def identities(preview: TablePreview) -> pd.Series:
+        numbers = preview.numeric_columns.get(column)
+        cells = preview.text_columns.get(column) if numbers is None else pd.Series(numbers)
+        if cells is None:
+            return pd.Series(dtype="string")
+        return cells.astype("string").str.strip().str.removesuffix(".0")
+
+    cells_of_tables = [identities(preview) for preview in previews]
+    counts = pd.concat(cells_of_tables).value_counts()
+    vessels = [str(vessel) for vessel in counts.index]
+    if not vessels:
+        return previews, {}
+    key = (*READER_KEY, "select")
+    vessel = vessels[0]
+    if len(vessels) > 1:
+        names = truncate(", ".join(vessels), 80)
+        reason = (
+            f"'{column}' has {len(vessels)} vessels ({names}), and one config reads one of them:"
+            f" {vessel}"
+        )
+        text = f"vessel of column '{column}' to read"
+        vessel = draft_notes.ask_question(key, text, vessel, reason, tuple(vessels[:20]))
+    selected = []
+    for preview, cells in zip(previews, cells_of_tables, strict=True):
+        rows = np.flatnonzero((cells == vessel).to_numpy(dtype=bool, na_value=False))
+        numeric = {name: values[rows] for name, values in preview.numeric_columns.items()}
+        texts = {name: cell.iloc[rows] for name, cell in preview.text_columns.items()}
+        for name, values in numeric.items():
+            channel = match_state_channel(parse_name(name)) or ""
+            numeric[name] = np.where(is_ais_sentinel(channel, "deg", values), np.nan, values)
+        if rows.size:
+            selected.append(
+                dataclasses.replace(preview, numeric_columns=numeric, text_columns=texts)
+            )
+    value: Any = int(vessel) if re.fullmatch(r"\d{1,15}", vessel) else vessel
+    return selected, {previews[0].original_name(column): value}
+
+
+def _drop_ais_turn_rate(
+    column_by_channel: dict[str, str], preview: TablePreview, draft_notes: DraftNotes
+) -> None:
+    """Remove the yaw rate if its values are coded as in AIS: integers from -128 to 127."""
+    column = column_by_channel.get("r", "")
+    if normalize_name(column) not in ("rot", "rate of turn", "rateofturn"):
+        return
+    values = preview.numeric_columns[column]
+    values = values[np.isfinite(values)]
+    is_coded = (values == np.round(values)) & (values >= -128.0) & (values <= 127.0)
+    if is_coded.all():
+        del column_by_channel["r"]
+        draft_notes.add_note(
+            CHANNELS_KEY,
+            f"'{column}' is coded as in AIS, 4.733 sqrt(deg/min) and -128 for unknown; it is left"
+            " out, r follows from the heading",
+        )
 
 
 def _select_one_vessel(
@@ -494,13 +773,21 @@ def _assign_columns(
             len(parsed_names[column].concepts),
         )
 
+    has_surge = any(match_state_channel(parsed) == "u" for parsed in parsed_names.values())
     # precedence: true before magnetic headings, then canonical names (`u` before `vx`), then names
     # with fewer concepts (`heading` before `heading of the second compass`)
     for column in sorted(columns, key=sort_key):
-        channel = side_velocities.get(column) or _match_name(column, parsed_names[column])
+        channel = (
+            side_velocities.get(column)
+            or _match_name(column, parsed_names[column])
+            or _match_force_column(column)
+        )
         if channel is None:
             continue
-        channel = _correct_by_unit(column, channel)
+        channel = _match_force_column(column) or _correct_by_unit(column, channel)
+        if channel == "v" and not has_surge and _TOTAL_SPEED_PATTERN.match(column):
+            # the capital V is the speed, next to which a sway velocity would have a surge velocity
+            channel = "speed"
         unit = _find_other_unit(column, channel)
         if channel in STATE_NAMES and unit is not None:
             draft_notes.add_note(
@@ -618,6 +905,37 @@ def _rename_single_rudder(names: dict[str, str], draft_notes: DraftNotes) -> Non
             )
 
 
+_TOTAL_SPEED_PATTERN = re.compile(r"V\s*(?:[\[(/].*)?$")
+"""Name of a column with the symbol V alone, with or without a unit."""
+_FORCE_AXES = {
+    "N": {
+        **dict.fromkeys(("u", "x", "surge"), "tau_x"),
+        **dict.fromkeys(("v", "y", "sway"), "tau_y"),
+    },
+    "N m": dict.fromkeys(("r", "n", "z", "yaw", "psi"), "tau_n"),
+}
+"""SI unit of a force or moment -> last word of a name -> channel."""
+
+
+def _match_force_column(column: str) -> str | None:
+    """Return the channel of a force or moment whose unit is in its header, such as `T_u [N]`."""
+    unit = parse_header_unit(column, None)
+    parsed_name = parse_name(column)
+    is_part = not parsed_name.has_none(
+        "wind", "thrust", "propeller", "rudder", "planes", "engine", "azimuth", "command"
+    )
+    if unit is None or is_part:
+        return None
+    words = parsed_name.text.split()
+    if not words:
+        return None
+    axis = re.sub(r"^[fmt](?=[xyzuvrn]$)", "", words[-1])
+    if words == [axis]:
+        # a letter alone may be a load that was measured
+        return None
+    return _FORCE_AXES.get(si_unit(unit), {}).get(axis)
+
+
 def _add_sin_cos_channels(
     names: dict[str, str], sin_cos_pairs: Mapping[str, tuple[str, str]]
 ) -> dict[str, str]:
@@ -674,13 +992,16 @@ def _rename_pulsed_drives(
 
 
 def _build_raw_tables(
-    sheets: Sequence[TablePreview], names: Mapping[str, str], errors: dict[Path, ResidnetError]
+    sheets: Sequence[TablePreview],
+    names: Mapping[str, str],
+    errors: dict[Path, ResidnetError],
+    step: str | None,
 ) -> list[RawTable]:
     """Return the mapped columns of each table on its clock, sorted by time and without copies."""
     logs = []
     for preview in sheets:
         try:
-            clock = detect_clock(preview)
+            clock = detect_clock(preview) if step is None else make_step_clock(preview, step)
         except DataError as error:
             errors[preview.path] = error
             continue
@@ -725,9 +1046,13 @@ def _is_recorded_on_change(channel: str, logs: Sequence[RawTable]) -> bool:
 
 
 def _note_unused_columns(
-    preview: TablePreview, names: Mapping[str, str], clock: TableClock, draft_notes: DraftNotes
+    preview: TablePreview,
+    names: Mapping[str, str],
+    clock: TableClock,
+    draft_notes: DraftNotes,
+    selected_columns: set[str],
 ) -> None:
-    used_columns = {*names.values(), *clock.columns}
+    used_columns = {*names.values(), *clock.columns, *selected_columns}
     unused_columns = [name for name in preview.numeric_columns if name not in used_columns]
     if unused_columns:
         draft_notes.add_note(CHANNELS_KEY, f"{UNMAPPED_COLUMNS}: {', '.join(unused_columns[:20])}")
@@ -779,8 +1104,15 @@ class TablePreview:
         return self.original_names.get(name, name)
 
 
-def preview_table(path: Path, rows: int = 20_000) -> TablePreview:
+def preview_table(
+    path: Path, rows: int = 20_000, names: Sequence[str] | None = None
+) -> TablePreview:
     """Load the first rows of a table.
+
+    Args:
+        path: file of the table.
+        rows: largest number of rows to load.
+        names: names of all columns of a text table without a line of names.
 
     Raises:
         DataError: if the table has no rows or cannot be read.
@@ -794,7 +1126,9 @@ def preview_table(path: Path, rows: int = 20_000) -> TablePreview:
         reader_settings = {"kind": table_kind}
     else:
         table, reader_settings = (
-            _preview_excel(path, rows) if table_kind == "excel" else read_table_head(path, rows)
+            _preview_excel(path, rows)
+            if table_kind == "excel"
+            else read_table_head(path, rows, names)
         )
     columns = _append_units(table)
     other_sheets = table.attrs.get("other_sheets", ())
@@ -890,13 +1224,42 @@ class TableClock:
     columns: tuple[str, ...]
 
 
+class MissingClockError(DataError):
+    """A table without a column of time."""
+
+
+def make_step_clock(preview: TablePreview, step: str) -> TableClock:
+    """Return the clock of a table whose rows are a constant time apart.
+
+    Args:
+        preview: first rows of the table.
+        step: time between two rows with its unit, for example `0.1 s`.
+
+    Raises:
+        UsageError: if the step is no positive time.
+    """
+    match = re.fullmatch(r"\s*([\d.eE+-]+)\s*([a-zµ]*)\s*", step)
+    try:
+        seconds = float(match[1]) * to_si(match[2] or "s") if match else 0.0
+    except (ValueError, ResidnetError):
+        seconds = 0.0
+    if not 0.0 < seconds < np.inf:
+        raise UsageError(
+            f"the time between two rows '{truncate(step, 40)}' is no time; write it as '0.1 s'"
+        )
+    columns = [*preview.numeric_columns.values(), *preview.text_columns.values()]
+    settings = {"step": f"{seconds:.12g} s"}
+    return TableClock(settings, seconds * np.arange(len(columns[0])), "", ())
+
+
 def detect_clock(preview: TablePreview) -> TableClock:
     """Detect the column of time and its unit.
 
     It is a column of dates, else a column with a word for time, else one that increases regularly.
 
     Raises:
-        DataError: if the table has no clock, or its parts are in several columns.
+        MissingClockError: if no column is a clock.
+        DataError: if the clock is not readable, or its parts are in several columns.
     """
     time_columns = [name for name in preview.column_names if parse_name(name).has_all("time")]
     part_columns = [
@@ -928,6 +1291,8 @@ def detect_clock(preview: TablePreview) -> TableClock:
         )
 
     numeric_time_columns = [name for name in time_columns if name in preview.numeric_columns]
+    # the time of the measurement precedes that of its arrival
+    numeric_time_columns.sort(key=lambda name: not normalize_name(name).endswith("header stamp"))
     # only without a column called time, others are searched; counters are excluded
     increasing_columns = [
         name
@@ -943,9 +1308,10 @@ def detect_clock(preview: TablePreview) -> TableClock:
     )
     if clock_column is None:
         if not time_columns:
-            raise DataError(
-                f"{preview.path}: no column has a name of time or increases like a clock; set it in"
-                " a channel map (--config)"
+            raise MissingClockError(
+                f"{preview.path}: no column has a name of time or increases like a clock; if the"
+                " rows are evenly spaced, give the time between them: residnet new --step '0.1 s',"
+                " or time: {step: 0.1 s} of the reader in a config"
             )
         cells = [
             str(cell) for cell in preview.text_columns.get(time_columns[0], ()) if cell == cell

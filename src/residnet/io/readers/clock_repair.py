@@ -13,6 +13,13 @@ _COUNTER_BITS = (16, 24, 32, 48)
 _DAY_IN_SECONDS = 86_400.0
 _N_SAMPLED_STAMPS = 1000
 """Evenly spaced stamps that are tested first; most other clocks fail on one of them."""
+_SIGNIFICANT_DIGITS = (2, 3, 4, 5, 6, 7)
+"""Numbers of significant digits with which a clock may be printed."""
+_MIN_PRINTED_ROWS = 50
+"""Fewest rows from which the interval between rows is estimated."""
+_MAX_PRINTED_SPREAD = 1.1
+"""Largest spread of the differences from evenly spaced rows, in units of the last digit; rounding
+and truncation both give 1."""
 _MAX_WRAP_STEPS = 3.0
 """Longest step across a counter overflow, in median steps."""
 
@@ -74,6 +81,43 @@ def _unpack_clock_numbers(t: np.ndarray) -> np.ndarray | None:
     return seconds_of_day if is_jump.any() and jumps_are_regular else None
 
 
+def _restore_printed_clock(t: np.ndarray) -> tuple[np.ndarray, int, float] | None:
+    """Restore the clock of evenly spaced rows that was printed with few significant digits.
+
+    A time of 123.7 s that is printed with three digits reads 124. The last digit is therefore worth
+    more at later times. Rows are evenly spaced if all times differ from a straight line over the
+    row number by less than their last digit.
+
+    Args:
+        t: printed times [T] in s, not decreasing.
+
+    Returns:
+        The restored times [T] in s, the number of digits and the interval between rows in s; None
+        for other clocks.
+    """
+    if t.size < _MIN_PRINTED_ROWS or t[0] < 0.0:
+        return None
+    exponents = np.floor(np.log10(np.maximum(t, 1e-300)))
+    for digits in _SIGNIFICANT_DIGITS:
+        # worth of the last digit of each time
+        last_digit = 10.0 ** (exponents - digits + 1)
+        if not (np.abs(t / last_digit - np.round(t / last_digit)) < 1e-6).all():
+            continue
+        is_positive = t > 0.0
+        rows = np.arange(t.size, dtype=np.float64)
+        weights = 1.0 / last_digit[is_positive]
+        regressors = np.stack((np.ones(weights.size), rows[is_positive]), axis=1)
+        intercept, interval = np.linalg.lstsq(
+            weights[:, None] * regressors, weights * t[is_positive], rcond=None
+        )[0]
+        restored = intercept + interval * rows
+        difference = ((t - restored)[is_positive]) * weights
+        if interval > 0.0 and float(np.ptp(difference)) <= _MAX_PRINTED_SPREAD:
+            return restored, digits, float(interval)
+        return None
+    return None
+
+
 def repair_clock(
     t: np.ndarray, columns: Iterable[np.ndarray], clock_resolution: float | None = None
 ) -> tuple[np.ndarray, list[Remark]]:
@@ -83,6 +127,8 @@ def repair_clock(
     - A counter that overflows restarts at zero; its range is added from there on.
     - The hour by which a clock of dates is set back in autumn is added, the hour in spring is
       subtracted.
+    - Times of evenly spaced rows that were printed with few significant digits follow from the row
+      number.
     - Rows with one stamp are spread over the time to the next stamp if the clock is coarser than
       the rows; copies of rows are not spread.
 
@@ -169,9 +215,22 @@ def _spread_shared_stamps(
         return t
     stamps, first_rows, counts = np.unique(t, return_index=True, return_counts=True)
     rows_per_stamp = int(np.median(counts))
-    if stamps.size < 3 or rows_per_stamp < 2 or (np.diff(t) < 0.0).any():
+    if stamps.size < 3 or (np.diff(t) < 0.0).any():
         return t
     if repeats_previous_row(columns, repeated_rows).mean() > 0.5:
+        return t
+    if (printed_clock := _restore_printed_clock(t)) is not None:
+        restored, digits, interval = printed_clock
+        text = (
+            f"the times are printed with {digits} digits, so that up to {int(counts.max())} rows"
+            f" share one; the rows are {interval:.4g} s apart, and their times follow from the row"
+            " number"
+        )
+        remarks.append(
+            make_remark("note", "printed_clock", text, digits=float(digits), step=interval)
+        )
+        return restored
+    if rows_per_stamp < 2:
         return t
     stamp_step = float(np.median(np.diff(stamps)))
     # the last stamp has no successor; the first one may be incomplete, its rows are its last ones

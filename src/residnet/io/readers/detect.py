@@ -19,7 +19,7 @@ from residnet.io.readers.formats.topic_folder import TopicFolderConfig
 from residnet.io.readers.formats.ulog import UlogConfig
 from residnet.io.readers.recording import FieldFilter, Recording
 from residnet.io.readers.tables import TABLE_KINDS
-from residnet.io.readers.text_tables import read_table_head
+from residnet.io.readers.text_tables import HeaderlessTableError, read_table_head
 
 # formats with unambiguous content are tested first, formats known by their extension last
 _RECORDING_CONFIGS: tuple[type[RecordingConfig], ...] = (
@@ -84,6 +84,8 @@ def is_text_table(path: Path) -> bool:
         return True
     try:
         table, _ = read_table_head(path, 20)
+    except HeaderlessTableError:
+        return True
     except DataError:
         return False
     return len(table.select_dtypes("number").columns) > 1

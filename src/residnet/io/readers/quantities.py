@@ -595,6 +595,18 @@ def normalize_quaternion(
     return tuple(np.where(is_valid, component / safe_norm, np.nan) for component in (x, y, z, w))
 
 
+def quaternion_tilt(
+    x: np.ndarray, y: np.ndarray, z: np.ndarray, w: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the roll and pitch angles [T] of unit quaternions in rad.
+
+    They belong to the order yaw, pitch, roll (Fossen 2021, section 2.2).
+    """
+    roll: np.ndarray = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch: np.ndarray = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    return roll, pitch
+
+
 def quaternion_yaw(x: np.ndarray, y: np.ndarray, z: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Return the yaw angle [T] of unit quaternions in rad (Fossen 2021, section 2.2)."""
     yaw: np.ndarray = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

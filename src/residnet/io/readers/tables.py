@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from residnet.core.config import Config
+from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError, UsageError
 from residnet.core.frames import unwrap_angle
 from residnet.core.log import Log, Remark, make_remark
@@ -38,6 +38,7 @@ from residnet.io.readers.base import (
     wrap_read_errors,
 )
 from residnet.io.readers.clock_repair import find_unique_rows, repair_clock
+from residnet.io.readers.manoeuvre_kinds import resolve_manoeuvre
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
     QUATERNION,
@@ -46,10 +47,12 @@ from residnet.io.readers.quantities import (
     conversion_factor,
     normalize_quaternion,
     project_fixes,
+    quaternion_tilt,
     quaternion_yaw,
 )
 from residnet.io.readers.text_tables import (
     coerce_numeric,
+    count_numbers,
     find_column_positions,
     find_header,
     make_names_unique,
@@ -57,7 +60,12 @@ from residnet.io.readers.text_tables import (
     read_csv,
 )
 from residnet.io.readers.timestamps import DateOrder, parse_texts, parse_zone
-from residnet.preprocessing.channel_values import is_fill_value, is_implausible, max_magnitude
+from residnet.preprocessing.channel_values import (
+    is_ais_sentinel,
+    is_fill_value,
+    is_implausible,
+    max_magnitude,
+)
 from residnet.preprocessing.motion import add_true_wind
 
 if TYPE_CHECKING:
@@ -82,10 +90,11 @@ _MIN_TABLE_ROWS = 20
 
 
 class TimeColumn(Config):
-    """Column of time and its unit.
+    """Column of time and its unit, or the constant time between rows.
 
     Attributes:
-        column: name of the column.
+        column: name of the column; null for a table without one.
+        step: time between two rows of a table without a column of time, for example `0.1 s`.
         unit: unit of the numbers, for example `ms`; `date` for dates and times of day, for example
             `2024-05-03T12:00:00.5+02:00`, `03.05.2024 12:00:00,5` or `12:00:00.5`.
         date: column of dates if `column` has times of day; null if there is none.
@@ -93,7 +102,8 @@ class TimeColumn(Config):
         order: order of day, month and year in dates: `dmy`, `mdy` or `ymd`; null detects it.
     """
 
-    column: str
+    column: str | None = None
+    step: Seconds | None = Field(default=None, gt=0)
     unit: str = "s"
     date: str | None = None
     zone: str | None = None
@@ -114,6 +124,10 @@ class TimeColumn(Config):
 
     @model_validator(mode="after")
     def _validate_date_settings(self) -> TimeColumn:
+        if (self.column is None) == (self.step is None):
+            raise ValueError(
+                "give `column`, the name of the column of time, or `step`, the time between rows"
+            )
         date_settings = [
             name for name in ("date", "zone", "order") if getattr(self, name) is not None
         ]
@@ -123,8 +137,8 @@ class TimeColumn(Config):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns of time and date."""
-        return (self.column,) if self.date is None else (self.column, self.date)
+        """Names of the columns of time and date; empty with a constant step."""
+        return tuple(name for name in (self.column, self.date) if name is not None)
 
 
 @dataclass
@@ -162,12 +176,16 @@ class TableConfig(ConfiguredReader, ABC):
             the heading psi unless it is mapped; the cosine and sine of an angle (`psi_cos` and
             `psi_sin`) become the angle.
         manoeuvre: type of manoeuvre of every file; `folder` takes the name of each file's folder;
-            null means unknown.
+            `auto` infers it from the name of the file, else from rudder angle and heading; null
+            means unknown.
+        select: column -> value of the rows that are read, for tables of several vessels, such as
+            {MMSI: 211000000}.
     """
 
     time: TimeColumn
     channels: dict[str, ChannelMap] = Field(min_length=1)
     manoeuvre: str | None = None
+    select: dict[str, str | int | float] = Field(default_factory=dict)
     row_format: ClassVar[str] = "row {0}"
     """Format of a row number in messages: {0} counts rows from 1, {1} also counts one header."""
 
@@ -244,10 +262,8 @@ class TableConfig(ConfiguredReader, ABC):
         if table.start_ns is not None:
             first_epoch_ns = table.start_ns + int(np.rint(clock[0] * 1e9))
             meta |= {"epoch": first_epoch_ns * 1e-9, "epoch_ns": first_epoch_ns}
-        manoeuvre = self.manoeuvre
-        manoeuvre = path.resolve().parent.name if manoeuvre == "folder" else manoeuvre
-        log = Log(path.stem, clock, channels, units, manoeuvre or "unknown", meta=meta)
-        return add_true_wind(log)
+        log = Log(path.stem, clock, channels, units, meta=meta)
+        return add_true_wind(log.replace(manoeuvre=resolve_manoeuvre(self.manoeuvre, path, log)))
 
     def _parse_table(self, path: Path) -> _ParsedTable:
         """Load the configured columns and convert their cells to numbers.
@@ -262,7 +278,7 @@ class TableConfig(ConfiguredReader, ABC):
             entry.hemisphere for entry in channel_maps.values() if entry.hemisphere
         ]
         with reading_progress(path.name, path.stat().st_size, 1.0) as advance:
-            table = self.load(path, [*columns, *hemisphere_columns], advance)
+            table = self.load(path, [*columns, *hemisphere_columns, *self.select], advance)
         # pandas would copy the attrs of a table to each of its columns
         attributes = table.attrs
         table.attrs = {}
@@ -270,11 +286,20 @@ class TableConfig(ConfiguredReader, ABC):
         is_truncated = bool(attributes.get("is_truncated"))
         n_rows = len(table) + is_truncated
         cells = dict(
-            zip([*columns, *hemisphere_columns], (cells for _, cells in table.items()), strict=True)
+            zip(
+                [*columns, *hemisphere_columns, *self.select],
+                (cells for _, cells in table.items()),
+                strict=True,
+            )
         )
         self._require_matching_units(path, attributes.get("units", ()))
-        t, start_ns, findings = self._parse_times(path, cells, n_lines_above)
+        t, start_ns, findings = self._parse_times(path, cells, len(table), n_lines_above)
         raw = {name: self._parse_channel(path, name, cells, n_lines_above) for name in channel_maps}
+        is_selected, new_findings = self._select_rows(path, cells, len(table))
+        findings += new_findings
+        if not is_selected.all():
+            t = np.where(is_selected, t, np.nan)
+            raw = {name: np.where(is_selected, values, np.nan) for name, values in raw.items()}
         # free the table before the channels are copied
         del table, cells
         is_measured = np.zeros(t.size, dtype=bool)
@@ -290,6 +315,11 @@ class TableConfig(ConfiguredReader, ABC):
         for name, values in raw.items():
             raw[name], new_findings = self._mask_implausible(path, name, values, n_lines_above)
             findings += new_findings
+        n_blank_rows = attributes.get("n_blank_lines", 0)
+        n_blank_rows += int((is_selected & ~is_measured & ~np.isfinite(t)).sum())
+        if n_blank_rows:
+            text = f"{n_blank_rows} rows are blank and are left out"
+            findings.append(make_remark("note", "blank_rows", text, rows=float(n_blank_rows)))
         return _ParsedTable(
             t, start_ns, raw, is_measured, findings, n_lines_above, n_rows, is_truncated
         )
@@ -379,18 +409,53 @@ class TableConfig(ConfiguredReader, ABC):
                     f" unit: {cell_unit}"
                 )
 
+    def _select_rows(
+        self, path: Path, cells: Mapping[str, pd.Series], rows: int
+    ) -> tuple[np.ndarray, list[Remark]]:
+        """Return which of the `rows` rows are read, bool [T], and a remark on the others.
+
+        Raises:
+            DataError: if no row has the selected value.
+        """
+        is_selected = np.ones(rows, dtype=bool)
+        remarks = []
+        for column, value in self.select.items():
+            # a number may be stored as 211000000 or 211000000.0
+            texts = cells[column].astype("string").str.strip().str.removesuffix(".0")
+            text = str(value).removesuffix(".0")
+            is_selected &= (texts == text).to_numpy(dtype=bool, na_value=False)
+            others = [str(name) for name in texts[~is_selected].dropna().unique()]
+            if not is_selected.any():
+                names = truncate(", ".join(others), 80)
+                raise DataError(
+                    f"{path}: no row has {text} in column '{column}' (it has {names}); correct"
+                    " `select`"
+                )
+            if others:
+                count = int((~is_selected).sum())
+                names = truncate(", ".join(others), 80)
+                text = (
+                    f"{count} rows with another '{column}' than {text} are left out ({names}): one"
+                    " config reads one vessel (key `select`)"
+                )
+                remarks.append(make_remark("note", "other_vessels", text, rows=float(count)))
+        return is_selected, remarks
+
     def _format_row(self, i: int) -> str:
         return self.row_format.format(i + 1, i + 2)
 
     def _parse_times(
-        self, path: Path, cells: Mapping[str, pd.Series], n_lines_above: int
+        self, path: Path, cells: Mapping[str, pd.Series], rows: int, n_lines_above: int
     ) -> tuple[np.ndarray, int | None, list[Remark]]:
-        """Convert the column of time.
+        """Convert the column of time, or count `rows` in constant steps.
 
         Returns:
             Times [T] in s; the Unix time in ns that they count from (None without dates); remarks.
         """
         time = self.time
+        if time.step is not None:
+            return time.step * np.arange(rows), None, []
+        assert time.column is not None
         texts = cells[time.column]
         if time.unit != DATE_UNIT:
             return (
@@ -469,7 +534,7 @@ class TableConfig(ConfiguredReader, ABC):
         """
         entry = self.channels[name]
         findings = []
-        is_fill = is_fill_value(values)
+        is_fill = is_fill_value(values) | is_ais_sentinel(name, entry.unit, values)
         if is_fill.any():
             count = int(is_fill.sum())
             text = f"{count} cells of {name} hold a fill value and count as missing"
@@ -490,12 +555,14 @@ class TableConfig(ConfiguredReader, ABC):
 
 @final
 class CsvConfig(TableConfig):
-    """Reader of text tables with a line of column names.
+    """Reader of text tables.
 
     The header is the first line that contains the names of all required columns. Lines above it,
-    and units below it, are skipped.
+    and units below it, are skipped. Without such a line `names` names the columns; the values begin
+    at the first line with as many numbers.
 
     Attributes:
+        names: names of all columns in order, for files without a line of names.
         delimiter: separator of cells; a blank means any number of blanks and tabs.
         decimal: decimal sign, `.` or `,`.
         encoding: encoding of the text, for example `cp1252` for files of older Windows programs;
@@ -503,6 +570,7 @@ class CsvConfig(TableConfig):
     """
 
     kind: Literal["csv"] = "csv"
+    names: tuple[str, ...] | None = Field(default=None, min_length=1)
     delimiter: str = Field(default=",", min_length=1, max_length=1)
     decimal: Literal[".", ","] = "."
     encoding: str | None = None
@@ -522,7 +590,9 @@ class CsvConfig(TableConfig):
             ) from error
 
     def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
-        return read_csv(path, columns, self.delimiter, self.decimal, self.encoding, advance)
+        return read_csv(
+            path, columns, self.delimiter, self.decimal, self.encoding, advance, self.names
+        )
 
 
 @final
@@ -604,12 +674,15 @@ def _add_yaw_of_quaternion(
 ) -> None:
     """Replace the four channels of a quaternion by the heading psi, unless psi is mapped.
 
+    With a depth z the roll and pitch angles phi and theta are added.
+
     Raises:
         DataError: if no row has a quaternion.
     """
     if not channels.keys() >= {*QUATERNION} or "psi" in channels:
         return
-    yaw = quaternion_yaw(*normalize_quaternion(*(channels.pop(name) for name in QUATERNION)))
+    quaternion = normalize_quaternion(*(channels.pop(name) for name in QUATERNION))
+    yaw = quaternion_yaw(*quaternion)
     if not np.isfinite(yaw).any():
         columns = [channel_maps[name].column for name in QUATERNION]
         raise DataError(
@@ -617,7 +690,13 @@ def _add_yaw_of_quaternion(
             " remove them from the channel map"
         )
     # the frame of a quaternion is set at qw: in `enu` yaw is counter-clockwise from east
-    channels["psi"] = unwrap_angle(np.pi / 2.0 - yaw if channel_maps["qw"].frame == "enu" else yaw)
+    is_enu = channel_maps["qw"].frame == "enu"
+    channels["psi"] = unwrap_angle(np.pi / 2.0 - yaw if is_enu else yaw)
+    if "z" in channels:
+        # about the axis to port of a body in `enu`, a positive pitch lowers the bow
+        roll, pitch = quaternion_tilt(*quaternion)
+        channels.setdefault("phi", roll)
+        channels.setdefault("theta", -pitch if is_enu else pitch)
 
 
 def _add_angles_of_components(channels: dict[str, np.ndarray]) -> None:
@@ -784,7 +863,10 @@ def read_column_names(path: Path) -> tuple[str, ...]:
     if table_kind != "csv":
         return ()
     with path.open("rb") as stream:
-        return (stream.readline(1 << 16).decode(errors="replace").strip(),)
+        line = stream.readline(1 << 16).decode(errors="replace").strip()
+    # the numbers of tables without a line of names differ from file to file
+    n_numbers = count_numbers(line)
+    return (f"{n_numbers} columns of numbers" if n_numbers > 1 else line,)
 
 
 @final

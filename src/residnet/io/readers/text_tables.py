@@ -18,7 +18,11 @@ import numpy as np
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import suggest_name, truncate
 from residnet.core.units import canonical_unit, is_unit
-from residnet.io.header_vocabulary import parse_name
+from residnet.io.header_vocabulary import (
+    match_input_channel,
+    match_state_channel,
+    parse_name,
+)
 from residnet.io.readers.base import ProgressCallback
 
 if TYPE_CHECKING:
@@ -76,6 +80,25 @@ class Header(NamedTuple):
     n_lines_above: int
 
 
+class HeaderlessTableError(DataError):
+    """A table without column names.
+
+    Attributes:
+        n_columns: number of columns.
+        proposed_names: words of a line above the numbers that are as many as the columns and mostly
+            names of channels; empty if there is no such line.
+    """
+
+    def __init__(self, path: Path, first_row: Sequence[str], proposed_names: Sequence[str]) -> None:
+        self.n_columns = len(first_row)
+        self.proposed_names = tuple(proposed_names)
+        super().__init__(
+            f"{path}: has {len(first_row)} columns of numbers without names (first row:"
+            f" {truncate(' '.join(first_row), 80)}); name them once for all files, in order:"
+            " residnet new --names t,x,y,..., or the key `names` of the reader in a config"
+        )
+
+
 def make_names_unique(names: Sequence[str]) -> list[str]:
     """Return unique column names: repeated names and empty names receive a number."""
     unique_names: list[str] = []
@@ -122,6 +145,7 @@ def read_csv(
     decimal: str,
     encoding: str | None,
     advance: ProgressCallback,
+    names: Sequence[str] | None = None,
 ) -> pd.DataFrame:
     """Read columns of a text table.
 
@@ -132,11 +156,13 @@ def read_csv(
         decimal: decimal sign.
         encoding: encoding of the text; None detects it.
         advance: callback that receives the fraction of the file that has been read.
+        names: names of all columns of a table without a line of names; None searches that line.
 
     Returns:
         The columns in the requested order. `attrs` has `n_lines_above` (lines above the values
-        minus one), `is_truncated` (whether an incomplete last line was dropped) and `units` (the
-        unit in the cells of each column, or an empty string).
+        minus one), `is_truncated` (whether an incomplete last line was dropped), `n_blank_lines`
+        (skipped lines with separators only) and `units` (the unit in the cells of each column, or
+        an empty string).
 
     Raises:
         UsageError: if a column is missing.
@@ -146,7 +172,11 @@ def read_csv(
 
     with open_as_utf8(path, encoding) as file:
         try:
-            header = _find_header_with_columns(path, delimiter, file, columns)
+            header = (
+                _find_header_with_columns(path, delimiter, file, columns)
+                if names is None
+                else _locate_values(path, delimiter, file, names)
+            )
             n_columns = len(header.names)
             size = max(1, file.stat().st_size)
             try:
@@ -154,7 +184,7 @@ def read_csv(
             except UsageError as error:
                 hint = f" (only one column found; is the delimiter really '{delimiter}'?)"
                 raise UsageError(f"{error}{hint if n_columns == 1 else ''}") from None
-            is_truncated, comments = _check_lines(path, delimiter, header, file)
+            is_truncated, comments, n_blank_lines = _check_lines(path, delimiter, header, file)
             chunks: dict[int, list[pd.Series]] = {position: [] for position in column_positions}
             with file.open("rb") as stream:
                 pandas_options = _pandas_options(
@@ -196,6 +226,7 @@ def read_csv(
     table.attrs |= {
         "n_lines_above": header.n_lines_above - 1,
         "is_truncated": is_truncated,
+        "n_blank_lines": n_blank_lines,
         "units": units,
     }
     return table
@@ -321,18 +352,22 @@ def _parse_trailing_unit(cell: str) -> str:
     return match["unit"]
 
 
-def read_table_head(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
+def read_table_head(
+    path: Path, rows: int, column_names: Sequence[str] | None = None
+) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Read the first rows of a text table and detect its format.
 
     Args:
         path: file of the table.
         rows: largest number of rows to read.
+        column_names: names of all columns of a table without a line of names.
 
     Returns:
         The rows, with the cells of the lines between names and values in `attrs["unit_rows"]`, and
         the settings `kind`, `delimiter` and `decimal` of a reader.
 
     Raises:
+        HeaderlessTableError: if the table has no line of names, and none are given.
         DataError: if the file is empty or no table.
     """
     import pandas as pd
@@ -352,7 +387,13 @@ def read_table_head(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]
                 " (`ros2 bag record`), or convert it to csv, in Python pandas.json_normalize("
                 "list(yaml.safe_load_all(open(file)))).to_csv('log.csv', index=False)"
             )
-        delimiter, cells, (header_row, n_lines_above) = _detect_delimiter(path, lines)
+        if column_names is None:
+            delimiter, cells, (header_row, n_lines_above) = _detect_delimiter(path, lines)
+        else:
+            delimiter, cells, n_lines_above = _detect_values(path, lines, len(column_names))
+            # the names take the place of the line above the values
+            header_row = n_lines_above
+            cells = [*cells[:n_lines_above], [*column_names], *cells[n_lines_above:]]
         # a comma that separates cells is no decimal sign
         sampled_cells = [cell for row in cells[1:50] for cell in row] if delimiter != "," else []
         n_decimal_commas, n_decimal_points = (
@@ -366,6 +407,9 @@ def read_table_head(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]
         for line, block, _ in _iter_line_blocks(file):
             skipped_lines = _find_comment_lines(
                 block, delimiter, cells[header_row], n_lines_above - line
+            )
+            skipped_lines = sorted(
+                {*skipped_lines, *_find_separator_lines(block, delimiter, len(names))}
             )
             comments += [line + i for i in skipped_lines]
             n_rows_seen += sum(bool(text.strip()) for text in _split_lines(block)) - len(
@@ -432,12 +476,112 @@ def _detect_delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]
             f"{path}: contains one line ('{truncate(lines[0], 60)}') and no row of numbers below"
             " it; leave the file out"
         )
+    if not candidates and (values := _find_values(lines)) is not None:
+        _, rows, first_row = values
+        proposed_names = _propose_names(lines[:first_row], len(rows[first_row]))
+        raise HeaderlessTableError(path, rows[first_row], proposed_names)
     if not candidates:
         raise DataError(
             f"{path}: no line with column names above the numbers; add one with the delimiter of"
             f" the numbers (first line: '{truncate(lines[0], 60)}')"
         )
     return max(candidates, key=lambda entry: entry[:2])[2]
+
+
+def _find_values(lines: Sequence[str]) -> tuple[str, list[list[str]], int] | None:
+    """Find the rows of numbers in a table without column names.
+
+    Args:
+        lines: first lines of the file.
+
+    Returns:
+        The delimiter, the cells of the first lines, and the index of the first row of numbers; None
+        if most of the lines are no rows of numbers with the same number of cells.
+    """
+    for delimiter in (";", "\t", "|", ",", WHITESPACE_DELIMITER):
+        rows = [_split_line(line, delimiter) for line in lines[:_SNIFFED_LINES]]
+        later_rows = [row for row in rows[len(rows) // 2 :] if any(row)]
+        # the last delimiter may end the line
+        later_rows = [row[:-1] if row and not row[-1] else row for row in later_rows]
+        n_columns = len(later_rows[0]) if later_rows else 0
+        is_regular = [len(row) == n_columns and all(map(_is_value, row)) for row in later_rows]
+        if n_columns < 2 or 2 * sum(is_regular) <= len(is_regular):
+            continue
+        rows = [row[:-1] if len(row) == n_columns + 1 and not row[-1] else row for row in rows]
+        for i, row in enumerate(rows):
+            if len(row) == n_columns and all(map(_is_value, row)):
+                return delimiter, rows, i
+    return None
+
+
+def _detect_values(
+    path: Path, lines: Sequence[str], n_names: int
+) -> tuple[str, list[list[str]], int]:
+    """Return delimiter, cells and index of the first row of a table whose names are given.
+
+    Raises:
+        DataError: if the table has no rows of numbers, or another number of columns than names.
+    """
+    values = _find_values(lines)
+    if values is None:
+        raise DataError(
+            f"{path}: has no rows of numbers that `names` could name (first line:"
+            f" '{truncate(lines[0], 60)}'); leave `names` out if the file has a line of names"
+        )
+    delimiter, rows, first_row = values
+    if len(rows[first_row]) != n_names:
+        raise DataError(
+            f"{path}: has {len(rows[first_row])} columns, and {n_names} names are given; give one"
+            " name for each column (key `names`, or residnet new --names)"
+        )
+    return delimiter, rows, first_row
+
+
+def _propose_names(lines: Sequence[str], n_columns: int) -> list[str]:
+    """Return the last words of a line of prose above the numbers that look like column names.
+
+    They are as many as the columns, all different, and at least half of them name the time or a
+    channel. Empty if no line has such words.
+    """
+    for line in reversed(lines):
+        words = [word for word in re.split(r"[\s,;|]+", line) if re.search(r"\w", word)]
+        names = words[-n_columns:]
+        if len(names) < n_columns or len({*names}) < n_columns or any(map(_is_value, names)):
+            continue
+        parsed_names = [parse_name(name) for name in names]
+        n_known = sum(
+            parsed_name.has_all("time")
+            or match_state_channel(parsed_name) is not None
+            or match_input_channel(parsed_name) is not None
+            for parsed_name in parsed_names
+        )
+        if 2 * n_known >= n_columns:
+            return names
+    return []
+
+
+def _locate_values(path: Path, delimiter: str, file: Path, names: Sequence[str]) -> Header:
+    """Return the header of a table without a line of names.
+
+    Args:
+        path: file of the table, for messages.
+        delimiter: separator of cells.
+        file: the same text in UTF-8.
+        names: names of all columns.
+
+    Raises:
+        DataError: if no line has as many numbers as there are names.
+    """
+    with file.open(encoding="utf-8-sig", errors="replace") as stream:
+        for i, line in enumerate(islice(stream, _HEADER_SEARCH_LINES)):
+            row = _split_line(line.rstrip("\r\n"), delimiter)
+            row = row[:-1] if len(row) == len(names) + 1 and not row[-1] else row
+            if len(row) == len(names) and 2 * sum(map(_is_value, row)) > len(row):
+                return Header(tuple(names), i)
+    raise DataError(
+        f"{path}: no line has {len(names)} numbers, one for each of the `names`; check `names` and"
+        " `delimiter`"
+    )
 
 
 def _split_line(line: str, delimiter: str) -> list[str]:
@@ -464,6 +608,12 @@ def _iter_numbered_rows(stream: TextIO, delimiter: str) -> Iterator[tuple[int, l
     reader = csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
     for row in reader:
         yield reader.line_num, [cell.strip() for cell in row]
+
+
+def count_numbers(line: str) -> int:
+    """Return the number of cells of a line of numbers; 0 if a cell is no number."""
+    cells = [cell for cell in re.split(r"[\s,;|]+", line) if cell]
+    return len(cells) if all(map(_is_value, cells)) else 0
 
 
 def _find_header_with_columns(
@@ -586,7 +736,9 @@ def _has_repeated_cells(row: Sequence[str]) -> bool:
     return len(set(filled_cells)) < len(filled_cells)
 
 
-def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tuple[bool, list[int]]:
+def _check_lines(
+    path: Path, delimiter: str, header: Header, file: Path
+) -> tuple[bool, list[int], int]:
     """Check that every line has the same number of cells as the header.
 
     pandas fills short lines with NaN and shifts cells silently. Blank lines are accepted, and so is
@@ -600,7 +752,8 @@ def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tupl
 
     Returns:
         Whether the file ends within its last line, and the indices of lines without values, which
-        begin with `#`, `%` or `//`, or repeat the column names.
+        begin with `#`, `%` or `//`, repeat the column names, or hold separators only; and the
+        number of the latter.
 
     Raises:
         DataError: if a line has another number of cells, or a zero byte.
@@ -613,6 +766,7 @@ def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tupl
     )
     is_truncated = _is_truncated(file, delimiter, n_named_columns)
     n_lines = 0
+    n_blank_lines = 0
     comments: list[int] = []
     for first_line, block, is_last_block in _iter_line_blocks(file):
         if b"\x00" in block:
@@ -627,7 +781,12 @@ def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tupl
         skipped_lines = _find_comment_lines(
             block, delimiter, header.names, n_lines_above - first_line
         )
-        comments += [first_line + i for i in skipped_lines]
+        if is_irregular.any():
+            # a spreadsheet writes blank rows as separators, often fewer than the header has
+            separator_lines = _find_separator_lines(block, delimiter, n_columns)
+            n_blank_lines += len(separator_lines)
+            skipped_lines += separator_lines
+        comments += [first_line + i for i in sorted({*skipped_lines})]
         is_irregular[[i for i in skipped_lines if i < is_irregular.size]] = False
         if is_irregular.any():
             # rare, therefore tested only now: an empty cell or a column without a name at the end
@@ -650,7 +809,7 @@ def _check_lines(path: Path, delimiter: str, header: Header, file: Path) -> tupl
                 " `delimiter` and `decimal`, or delete the damaged lines"
             )
         n_lines = first_line + cells.size
-    return is_truncated and n_lines - 1 not in comments[-1:], comments
+    return is_truncated and n_lines - 1 not in comments[-1:], comments, n_blank_lines
 
 
 def _iter_line_blocks(path: Path) -> Iterator[tuple[int, bytes, bool]]:
@@ -718,6 +877,26 @@ def _find_comment_lines(
             longest_name in line
             and _split_line(line.decode("utf-8", "replace"), delimiter) == header_cells
         )
+    ]
+
+
+def _find_separator_lines(block: bytes, delimiter: str, n_columns: int) -> list[int]:
+    """Return the indices of blank lines in a block whose number of separators is irregular.
+
+    Args:
+        block: complete lines.
+        delimiter: separator of cells.
+        n_columns: number of cells of a regular line.
+    """
+    sign = delimiter.encode()
+    if delimiter == WHITESPACE_DELIMITER or not re.search(rb"(?m)^[" + sign + rb" ]+$", block):
+        return []
+    return [
+        i
+        for i, line in enumerate(_split_lines(block))
+        if sign in line
+        and not line.replace(sign, b"").strip()
+        and line.count(sign) + 1 != n_columns
     ]
 
 

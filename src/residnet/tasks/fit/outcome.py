@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from residnet.core.log import Log
+from residnet.core.files import read_json
+from residnet.core.log import Log, make_remark
 from residnet.core.names import CHANNEL_UNITS, POSE_ERROR_UNITS, si_unit
 from residnet.core.progress import begin_stage, log_message
 from residnet.dynamics.store import ModelSpec
@@ -212,6 +213,28 @@ def read_external_logs(
         raw_logs,
         logs,
     )
+
+
+def mark_logs_of_fit(logs: Sequence[Log], run: RunFolder) -> list[Log]:
+    """Add a finding to the logs that are among the data of a fit, by their SHA-256.
+
+    Args:
+        logs: logs that the models of the fit are evaluated on.
+        run: folder of the fit.
+    """
+    inputs = read_json(run.provenance).get("inputs") if run.provenance.is_file() else None
+    checksums = {*inputs.values()} if isinstance(inputs, dict) else set()
+    text = (
+        "this log, or a part of it, is among the data of the fit (same SHA-256): its errors do not"
+        " show how well the model predicts new data; evaluate on other logs"
+    )
+    remark = make_remark("will mislead", "log_of_fit", text)
+    return [
+        log.replace(meta={**log.meta, "findings": [*log.meta.get("findings", ()), remark]})
+        if log.meta.get("sha256") in checksums
+        else log
+        for log in logs
+    ]
 
 
 def divergence_limit(spec: ModelSpec, config: FitConfig) -> np.ndarray:

@@ -15,6 +15,7 @@ from pydantic import Field
 from residnet.core.errors import DataError
 from residnet.core.log import Remark, make_remark
 from residnet.core.names import truncate
+from residnet.core.units import to_si
 from residnet.io.header_vocabulary import ARRIVAL_COLUMN_NAMES, match_state_channel, parse_name
 from residnet.io.readers.base import (
     LARGE_FOLDER_BYTES,
@@ -197,7 +198,7 @@ class TopicFolderConfig(RecordingConfig):
                     cell.strip() for cell in next(csv.reader(stream, delimiter=delimiter), [])
                 ]
             clock_column = _find_clock_column(header, self.time)
-            stamp_columns = _find_stamp_columns(header)
+            stamp_columns = _find_stamp_columns(header) or _find_stamp_column(header)
             if clock_column is None and stamp_columns is None:
                 text = (
                     f"topic {name}: no column of time (expected one of {', '.join(self.time)}, or a"
@@ -299,12 +300,39 @@ def _find_stamp_columns(header: list[str]) -> tuple[str, str] | None:
     return None
 
 
+def _find_stamp_column(header: list[str]) -> tuple[str] | None:
+    """Return the column of a header stamp in one number, as `rostopic echo -p` writes it."""
+    return next(
+        ((column,) for column in header if normalize_field_path(column) == "header_stamp"), None
+    )
+
+
+def _parse_header_stamps(columns: Sequence[np.ndarray]) -> TimeStamps | None:
+    """Return header stamps from one column, or from columns of seconds and nanoseconds.
+
+    None if the stamps are not set or no Unix time.
+    """
+    if not all(np.isfinite(values).all() for values in columns) or not columns[0].any():
+        return None
+    if len(columns) == 2:
+        seconds, nanoseconds = columns
+        ns = seconds.astype(np.int64) * 10**9 + nanoseconds.astype(np.int64)
+        return TimeStamps(ns, parse_numbers(seconds.astype(np.float64)).is_absolute)
+    unit = detect_unix_unit(columns[0].astype(np.float64))
+    if unit is None:
+        return None
+    ns_per_count = round(1e9 * to_si(unit))
+    if columns[0].dtype.kind in "iu":
+        return TimeStamps(columns[0].astype(np.int64) * ns_per_count, True)
+    return TimeStamps(np.rint(columns[0] * ns_per_count).astype(np.int64), True)
+
+
 def _parse_topic(
     name: str,
     columns: dict[str, pd.Series],
     clock_column: str | None,
     unit: str,
-    stamp_columns: tuple[str, str] | None,
+    stamp_columns: tuple[str, ...] | None,
 ) -> RawSeries:
     """Convert the columns of a topic to a series; columns of text other than senders are ignored.
 
@@ -313,7 +341,7 @@ def _parse_topic(
         columns: column -> cells.
         clock_column: column of arrival times.
         unit: unit of times that are no Unix times.
-        stamp_columns: columns with seconds and nanoseconds of the header stamp.
+        stamp_columns: column of the header stamp, or columns with its seconds and nanoseconds.
 
     Raises:
         DataError: if the column of arrival times has other cells.
@@ -339,10 +367,7 @@ def _parse_topic(
         if numeric_values is not None:
             numeric_columns[column] = numeric_values
     if stamp_columns is not None and {*stamp_columns} <= numeric_columns.keys():
-        seconds, nanoseconds = (numeric_columns[column] for column in stamp_columns)
-        if np.isfinite(seconds).all() and np.isfinite(nanoseconds).all() and seconds.any():
-            ns = seconds.astype(np.int64) * 10**9 + nanoseconds.astype(np.int64)
-            header_stamps = TimeStamps(ns, parse_numbers(seconds.astype(np.float64)).is_absolute)
+        header_stamps = _parse_header_stamps([numeric_columns[column] for column in stamp_columns])
     fields = {
         n: v.astype(np.float64, copy=False)
         for n, v in numeric_columns.items()

@@ -1,0 +1,89 @@
+"""Problems of many files in as few lines as possible."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from residnet.core.errors import DataError, ResidnetError
+from residnet.core.names import truncate
+
+_MAX_FILE_NAMES = 100
+"""Largest number of characters of the names of files with the same problem."""
+
+
+class UnreadableLogsError(DataError):
+    """No file of a group of logs can be read.
+
+    Attributes:
+        errors: error of each file.
+    """
+
+    def __init__(self, errors: Mapping[Path, ResidnetError]) -> None:
+        self.errors = dict(errors)
+        super().__init__(group_problems({path: str(error) for path, error in errors.items()})[0])
+
+
+def raise_unreadable(errors: Mapping[Path, ResidnetError]) -> NoReturn:
+    """Raise the error of a single file, or one error for several files.
+
+    Raises:
+        ResidnetError: always.
+    """
+    raise next(iter(errors.values())) if len(errors) == 1 else UnreadableLogsError(errors)
+
+
+def without_channel_map(error: ResidnetError) -> ResidnetError:
+    """Return an error of a drafted reader with advice that needs no channel map.
+
+    A user who gives only files has no channel map to correct.
+    """
+    message = re.sub(
+        r"remove (it|them) from the channel map(, or leave the file out)?",
+        r"fill \1 with values, or leave the file out",
+        str(error),
+    )
+    return error if message == str(error) else DataError(message)
+
+
+def strip_file_name(paths: Iterable[Path], message: str) -> str:
+    """Return a message without the path of one of its files at the start."""
+    for path in paths:
+        if message.startswith(f"{path}: "):
+            return message.removeprefix(f"{path}: ")
+    return message
+
+
+def group_problems(messages: Mapping[Path, str], *, has_full_paths: bool = True) -> list[str]:
+    """Return one line for each problem, with the number of files that have it.
+
+    Messages that differ in numbers only are one problem; the line has the numbers of the first
+    file.
+
+    Args:
+        messages: message by path, which may begin with the path.
+        has_full_paths: whether a line begins with the path of its first file, not with its name.
+    """
+    paths_by_problem: dict[str, list[Path]] = {}
+    for path, message in messages.items():
+        pattern = re.sub(
+            r"[-+]?\d+(?:\.\d+)?(?:e[+-]?\d+)?", "#", strip_file_name(messages, message)
+        )
+        paths_by_problem.setdefault(pattern, []).append(path)
+    lines = []
+    for paths in paths_by_problem.values():
+        first_message = strip_file_name(messages, messages[paths[0]])
+        others = describe_other_files_with_problem(paths[1:])
+        file = paths[0] if has_full_paths else paths[0].name
+        lines.append(f"{file}: {first_message}{others}")
+    return lines
+
+
+def describe_other_files_with_problem(paths: Sequence[Path]) -> str:
+    """Return a remark on further files with the same problem; empty if there are none."""
+    if not paths:
+        return ""
+    names = truncate(", ".join(path.name for path in paths), _MAX_FILE_NAMES)
+    return f" (and {len(paths)} other file{'s' * (len(paths) > 1)}: {names})"

@@ -1,0 +1,31 @@
+"""Logs that a fit has used are named when its models are evaluated on them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from residnet.core.log import Log
+from residnet.runs.folder import RunFolder
+from residnet.tasks.fit.outcome import mark_logs_of_fit
+
+
+def log(name: str, sha256: str) -> Log:
+    t = np.arange(3.0)
+    return Log(name, t, {"u": t}, {"u": "m/s"}, meta={"sha256": sha256, "findings": []})
+
+
+def test_a_log_of_the_fit_is_named_by_its_checksum(tmp_path: Path) -> None:
+    (tmp_path / "provenance.json").write_text(json.dumps({"inputs": {"logs/a.csv": "f00d"}}))
+    known, new = mark_logs_of_fit([log("copy_of_a", "f00d"), log("b", "beef")], RunFolder(tmp_path))
+    (finding,) = known.meta["findings"]
+    assert (finding["level"], finding["code"]) == ("will mislead", "log_of_fit")
+    assert "same SHA-256" in finding["text"]
+    assert new.meta["findings"] == []
+
+
+def test_a_run_without_provenance_names_no_log(tmp_path: Path) -> None:
+    (marked,) = mark_logs_of_fit([log("a", "f00d")], RunFolder(tmp_path))
+    assert marked.meta["findings"] == []
