@@ -152,7 +152,7 @@ def test_a_log_without_samples_is_named() -> None:
     logs, _ = sailed()
     signals = SIGNALS.build()
     empty = dataclasses.replace(logs[0], trainable=np.zeros(len(logs[0]), dtype=bool))
-    told = "log constant_01: has no sample to estimate its current from"
+    told = "log constant_01: no trainable sample to estimate its current from"
     with pytest.raises(FitError, match=told):
         estimate_currents(LINEAR.build(signals.names), signals, [empty, logs[1]], CurrentConfig())
 

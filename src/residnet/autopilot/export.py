@@ -125,6 +125,7 @@ class _GuardedController(nn.Module):
         command = last_command + (wanted_command - last_command).clamp(
             -self.max_step, self.max_step
         )
+        # a memory is updated with valid measurements only, so that a fault leaves no trace in it
         kept_memory = torch.where(is_valid, next_memory, s[:, :-1])
         return command, torch.cat((kept_memory, command), dim=-1), ~is_valid[:, 0]
 
@@ -278,7 +279,7 @@ class _TracedController(nn.Module):
         self.memory = inner.memory_low.numel()
         # its dtype defines the precision of the module
         self.low = nn.Buffer(inner.low)
-        # two rows: a batch of one would hide where the rows of a batch are confused
+        # two rows, since a batch of one would hide mixed-up rows
         examples = tuple(torch.zeros(2, size, dtype=inner.low.dtype) for size in sizes)
         self.first_memory = trace_function(inner.initial_state, examples[:1], "policy")
         self.answer = trace_function(inner.step_unchecked, examples, "policy")

@@ -181,8 +181,8 @@ def _parse_document(text: str, source: str, show_location: bool) -> tuple[Any, N
 
         if count_values(node) > _MAX_VALUES:
             raise ConfigError(
-                f"{source}: stands for more than {_MAX_VALUES} values, or refers to itself; write"
-                " its aliases out",
+                f"{source}: has more than {_MAX_VALUES} values, or refers to itself; replace its"
+                " aliases by values",
                 "config.too_large",
             )
         return loader.construct_document(node), node

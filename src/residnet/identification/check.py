@@ -1,4 +1,4 @@
-"""Check that prepared logs hold what a fit needs, without fitting and without PyTorch."""
+"""Check that prepared logs suffice for a fit, without fitting and without PyTorch."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from residnet.training.config import TrainingConfig
 
 
 def check_fit(logs: PreparedSplits, settings: FitSettings) -> FitSettings:
-    """Check that prepared logs hold the manoeuvres, folds and windows that a fit asks for.
+    """Check that prepared logs hold the manoeuvres, folds and windows that a fit requires.
 
     The fit calls the same functions and therefore refuses with the same messages.
 

@@ -1,9 +1,9 @@
 """Estimate the ambient current of each log together with a baseline.
 
-A log measures velocities over ground, a hull is moved by those through the water: nu_r = nu -
-R(psi)' [c_north, c_east, 0]. Without the current, least squares attributes its effect to the hull.
-Each log has a constant current here, which rotates in body axes with the heading; Gauss-Newton
-estimates all currents, with the coefficients eliminated (variable projection).
+Logs contain velocities over ground, but hydrodynamic forces depend on velocities through the water:
+nu_r = nu - R(psi)' [c_north, c_east, 0]. Without the current, least squares attributes its effect
+to the hull. Each log has a constant current here, which rotates in body axes with the heading;
+Gauss-Newton estimates all currents, with the coefficients eliminated (variable projection).
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from residnet.training.current_config import CurrentConfig
 
 _MAX_ROUNDS = 4
-"""Most rounds of grid search and Gauss-Newton; the first without a gain is the last."""
+"""Largest number of rounds of grid search and Gauss-Newton; it ends earlier without a gain."""
 _SEARCH_STRIDE = 10
-"""Every how many samples the grid search uses."""
+"""Stride of the samples in the grid search."""
 
 
 def estimate_currents(
@@ -41,27 +41,26 @@ def estimate_currents(
 ) -> tuple[np.ndarray, list[dict[str, Any]]]:
     """Return currents to north and east [L + K, 2] in m/s of logs over ground, and their table.
 
-    The baseline gives the regressors and keeps its own coefficients. Standard errors from least
-    squares hold where the regressors are the true ones and the errors of neighbouring samples
-    independent, which they never are. So the two halves of each log are estimated separately, and
-    the errors of all are widened by as much as the halves differ more than they say (Birge 1932,
-    Phys. Rev. 40, 207-227).
+    The baseline provides the regressors; its own coefficients are not changed. Standard errors of
+    least squares assume true regressors and independent errors of neighbouring samples, which is
+    never the case. Therefore the two halves of each log are also estimated separately, and all
+    standard errors are multiplied by the ratio of the observed to the expected difference of the
+    halves (Birge 1932, Phys. Rev. 40, 207-227).
 
     Args:
-        baseline: whose regressors explain the accelerations.
-        signals: of the logs.
+        baseline: baseline whose regressors explain the accelerations.
+        signals: signals of the logs.
         logs: L logs that are fitted.
         config: settings of the prior of currents.
         others: K logs that the coefficients are not fitted on.
 
     Raises:
-        FitError: where a log has no sample to learn from, or the logs do not determine their
-            currents.
+        FitError: if a log has no trainable sample, or the logs do not determine their currents.
     """
     for log in (*logs, *others):
         if not log.trainable.any():
             raise FitError(
-                f"log {log.log.name}: has no sample to estimate its current from; leave it out"
+                f"log {log.log.name}: no trainable sample to estimate its current from; remove it"
             )
     precision = config.spread**-2
     # all samples give the currents
@@ -208,7 +207,7 @@ class _CurrentProblem:
         signals: signals of the logs.
         logs: L logs over ground.
         precision: prior precision of each component of a current.
-        theta: known coefficients [3, J]; None where they are eliminated.
+        theta: known coefficients [3, J]; None if they are eliminated.
     """
 
     baseline: RegressorBaseline
@@ -313,7 +312,7 @@ class _CurrentProblem:
         """Return currents [L, 2] of lowest cost at fixed coefficients on a grid, log by log.
 
         Args:
-            current: currents [L, 2], which are returned where the grid has no better ones.
+            current: currents [L, 2], which are returned for logs without a better grid point.
             fit: fit at these currents.
             spread: prior standard deviation of a component of a current, m/s.
         """

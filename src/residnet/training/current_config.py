@@ -8,18 +8,17 @@ from residnet.core.config import Config, MetresPerSecond
 
 
 class CurrentConfig(Config):
-    """Settings for logs that each ran in a constant current which nobody measured.
+    """Estimation of a constant, unmeasured current for each log.
 
-    The currents are estimated first; what follows fits and chooses models on these logs as motion
-    through the water, without current. Logs that are kept for tests are moved too: each by the
-    current that the coefficients of the fitted logs see in it, so that nothing of them is fitted.
+    The currents are estimated first. All later steps use the logs as motion through the water,
+    without current. Test logs are converted too, with the currents that the coefficients of the
+    fitted logs imply, so that test logs do not influence the fit.
 
     Attributes:
-        baseline: name of the baseline whose regressors explain the accelerations while the currents
-            are estimated.
-        spread: standard deviation that each component of a current is expected to have; keeps logs
-            that say little near zero.
-        iterations: at most.
+        baseline: name of the baseline whose regressors explain the accelerations in the estimation.
+        spread: prior standard deviation of each component of a current; logs with little
+            information get currents near zero.
+        iterations: maximum number of iterations.
     """
 
     baseline: str = "baseline"

@@ -85,6 +85,7 @@ def find_passages(track: Array, buoys: Sequence[BuoyConfig]) -> list[Passage]:
     for distances, buoy in zip(distance, buoys, strict=True):
         first_sample = first_counted_sample(distances, buoy.radius)
         distances[: first_sample if first_sample < len(distances) else 0] = np.inf
+    # dynamic programming over buoys: the best passing sample so far, for each last sample
     cumulative_distance = distance[0]
     predecessor_tables = []
     sample_index = np.arange(len(track))
@@ -117,6 +118,7 @@ def _side_of_buoy(track: Array, sample: int, buoy: BuoyConfig) -> str:
     step = track[min(sample + 1, len(track) - 1)] - track[max(sample - 1, 0)]
     north = buoy.north - track[sample, 0]
     east = buoy.east - track[sample, 1]
+    # sign of the cross product of track direction and bearing
     return "starboard" if step[0] * east - step[1] * north > 0 else "port"
 
 
@@ -129,7 +131,7 @@ def find_first_violation(
 ) -> tuple[int, str] | None:
     """Find the first buoy at which a track violates the protocol.
 
-    The distance between samples may be smaller than at them, see `_sampling_error`.
+    Between samples the distance may be smaller than at the samples, see `_sampling_error`.
 
     Args:
         track: north and east [N, 2] in m.
@@ -151,7 +153,7 @@ def find_first_violation(
             ):
                 return number - 1, (
                     f"buoy {number}: passed at {passage.distance:.4g} m, its circle of"
-                    f" {buoy.radius:.4g} m is not entered in its turn"
+                    f" {buoy.radius:.4g} m is not entered"
                 )
         elif passage.min_distance < buoy.radius - tolerance:
             return number - 1, (

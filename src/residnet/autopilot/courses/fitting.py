@@ -37,7 +37,7 @@ _HARD_PENALTY = 40.0
 radii.
 """
 _SOFT_PENALTY = 4.0
-"""The same for the constraint that other parts of the course pass a buoy at a larger distance."""
+"""Penalty of the constraint that other parts of the course keep a larger distance from a buoy."""
 _PASSING_MARGIN = 0.03
 """Difference in turning radii between the distance of a buoy from other parts of the course and
 its distance from its own turn.
@@ -82,13 +82,13 @@ class LinearizedProblem(NamedTuple):
 
     def solve_linear_program(self, lower: Array, upper: Array) -> tuple[Array, float]:
         """Solve the linear program within bounds; returns the step and the predicted decrease."""
-        # what cannot become negative within the bounds is left out
+        # constraints that remain positive for any step within the bounds are omitted
         is_active = self.constraints < np.abs(self.constraint_jacobian) @ np.maximum(-lower, upper)
         jacobian_rows = self.constraint_jacobian[is_active]
         constraint_values = self.constraints[is_active]
         n_variables = len(lower)
         count = len(constraint_values)
-        # its types know no sparse arrays
+        # Any, since the type stubs of linprog do not include sparse arrays
         solve_program: Any = linprog
         solution = solve_program(
             np.concatenate((self.cost_gradient, self.penalties[is_active])),
@@ -176,6 +176,7 @@ class RouteProblem:
         self.buoy_positions = np.array([circle.centre for circle in circles])
         self.passing_sides = np.array([circle.turn_sign for circle in circles])
         self.length_unit = route.turns.min_radius
+        # each buoy is assigned the points up to the middle between its passing and the next one
         window_boundaries = (passing_indices[1:] + passing_indices[:-1] + 1) // 2
         self.window_edges = np.concatenate(([0], window_boundaries, [-1]))
         self.other_parts: list[tuple[int, int, slice]] = []
@@ -212,7 +213,8 @@ class RouteProblem:
         geometry = self.route(z)
         points = geometry.points
         self.other_parts = []
-        # of a whole turn about a buoy, the nearest point jumps from its beginning to its end
+        # turns are divided into pieces: the nearest point of a whole turn would jump between its
+        # beginning and its end, and the constraint would not be differentiable
         count = len(points)
         part_boundaries = {0, count - 1, *range(LEG, count, LEG + POINTS)}
         for k in range(_PARTS_PER_TURN):
@@ -241,7 +243,7 @@ class RouteProblem:
             self.other_parts += [
                 (j, i, turn_part)
                 for i, turn_part in turn_parts
-                # from the wrong side the way to the right one leads through the circle
+                # a route on the wrong side of its buoy must be free to cross the circle
                 if (i != j or is_on_passing_side[j])
                 and turn_part.stop - max(turn_part.start, first_counted) > 1
                 and distance[max(turn_part.start, first_counted) : turn_part.stop].min()
@@ -314,6 +316,7 @@ class RouteProblem:
             )
             / _ABEAM_SINE
         )
+        # near the ends of a part the sign changes smoothly with the bearing instead of jumping
         is_ahead_or_astern = np.abs(abeam_offset) < distance
         sign = np.where(abeam_offset >= 0, 1.0, -1.0)
         return _NearestPoints(

@@ -393,10 +393,11 @@ class NoisyDelayedLoop(Source):
         m = self.n_inputs
         push, reference, delay = w[:, m : m + 3].split(1, dim=1)
         measurement_noise = torch.zeros_like(x)
-        for k, column in enumerate(self.measured_columns):
-            measurement_noise[:, column : column + 1] = w[:, m + 3 + k : m + 4 + k]
+        for i, column in enumerate(self.measured_columns):
+            measurement_noise[:, column : column + 1] = w[:, m + 3 + i : m + 4 + i]
         command, s = self.policy(x + measurement_noise, reference, memory[:, self.max_delay :])
         pending_commands = torch.cat((command, memory[:, : self.max_delay]), dim=1)
+        # the newest command is at index 0, so that the delay in steps is the index
         delayed_command = pending_commands.gather(1, delay.to(torch.int64))
         applied_inputs = torch.cat((delayed_command, w[:, 1:m], push, command), dim=1)
         return applied_inputs, torch.cat((pending_commands[:, : self.max_delay], s), dim=1)
@@ -455,6 +456,7 @@ class ClosedLoopTrajectories:
             band: tolerance in rad, or in m of depth.
         """
         absolute_error = self.error.abs()
+        # negated, so that NaN counts as outside
         is_outside = ~(absolute_error <= band)
         steps_inside = is_outside.flip(1).to(torch.int64).argmax(1)
         last_outside = (absolute_error.shape[1] - 1 - steps_inside).unsqueeze(1)
@@ -472,7 +474,7 @@ class ClosedLoopTrajectories:
     def overshoot(self) -> Tensor:
         """Return the overshoot beyond the reference [B] in rad or m; zero without overshoot."""
         signed_overshoot = -self.error * self.target.sign()[:, None]
-        # plus zero: no negative zero is shown
+        # adding zero turns -0.0 into 0.0 in reports
         return (signed_overshoot * self.counted_mask).amax(1).clamp(min=0.0) + 0.0
 
     def integrated_absolute_error(self) -> Tensor:
@@ -562,7 +564,7 @@ def simulate_heading_steps(
         target: new headings [B] in rad.
         variation: variations of the vessel [B, 3].
         dt: time step in s.
-        duration: in s.
+        duration: duration in s.
         weather: environmental inputs by name, SI, for all rows or [B].
         wrap_source: wraps the closed loop to add to its inputs, for example waves.
     """

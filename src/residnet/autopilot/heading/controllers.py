@@ -48,7 +48,7 @@ class SearchRange(NamedTuple):
     """Logarithmic search range of a tuned parameter.
 
     Attributes:
-        low, high: limits of the range, non-dimensional.
+        lower, upper: limits of the range, non-dimensional.
         disabled_value: value that switches the parameter's term off; None if it cannot be switched
             off. Tuning also tries this value, so that the result is never worse than the simpler
             law.
@@ -169,7 +169,7 @@ class TunableConfig(ControllerConfig, ABC):
         return {name: value for name, value in parameters.items() if value is not None}
 
 
-# from nearly none to where it slows the loop
+# from nearly no filter to a time constant that slows down the closed loop
 _FILTER_RANGES = {"filter_time": SearchRange(0.002, 0.3, time_power=1)}
 
 
@@ -253,7 +253,7 @@ class PidConfig(PdConfig):
     ranges: ClassVar[Mapping[str, SearchRange]] = {
         "kp": SearchRange(0.3, 60.0),
         "damping_time": SearchRange(0.05, 2.0, time_power=1),
-        # a million T is no integral in single precision
+        # with 1e6 T the integral term vanishes in single precision
         "integral_time": SearchRange(1.0, 50.0, disabled_value=1e6, time_power=1),
         **_FILTER_RANGES,
     }
@@ -448,7 +448,7 @@ class DepthConfig(TunableConfig):
         drift_rate: observer gain of the vertical drift in 1/s.
     """
 
-    # a vessel goes speed times T while its dive angle changes
+    # distances scale with speed times T, the distance covered while the dive angle changes
     ranges: ClassVar[Mapping[str, SearchRange]] = {
         "lookahead": SearchRange(0.3, 20.0, time_power=1, is_distance=True),
         "depth_rate": SearchRange(0.05, 20.0, time_power=-1),

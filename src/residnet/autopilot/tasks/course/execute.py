@@ -1,4 +1,4 @@
-"""Carrying out a course run, into a run folder."""
+"""Execution of a course run in a run folder."""
 
 from __future__ import annotations
 
@@ -180,14 +180,14 @@ def _summarize_policy(
 
 
 class AutopilotRun(NamedTuple):
-    """The finished autopilot run that courses are planned and flown with.
+    """The finished autopilot run that provides vessel and controllers of the courses.
 
     Attributes:
         autopilot: config of the autopilot run.
-        run: its folder.
-        steering: vessel, K and T, rudder limit and step.
-        steady_turn: the smallest turn.
-        peer_notes: configs of its peers as tuned, by name.
+        run: folder of the autopilot run.
+        steering: vessel, K and T, rudder limit and time step.
+        steady_turn: smallest steady turn of the vessel.
+        peer_notes: tuned configs of the peers by name.
     """
 
     autopilot: AutopilotConfig
@@ -201,7 +201,7 @@ def open_autopilot_run(config: CourseTaskConfig, folder: RunFolder) -> Autopilot
     """Read the finished autopilot run: the given one, or the one in the folder of the course.
 
     Raises:
-        UsageError: where it is not finished.
+        UsageError: if it is not finished.
     """
     autopilot = config.load_autopilot_config()
     run_folder = RunFolder.open(
@@ -224,10 +224,10 @@ def open_autopilot_run(config: CourseTaskConfig, folder: RunFolder) -> Autopilot
 
 
 def load_policy(autopilot_run: AutopilotRun, name: str) -> HeadingPolicy:
-    """Return a trained policy of the autopilot's run, at the step of the course.
+    """Return a trained policy of the autopilot run, with the time step of the course.
 
     Raises:
-        UsageError: where the run lacks it, or it is not as it was written.
+        UsageError: if the run has no such policy, or its file was changed.
     """
     steering = autopilot_run.steering
     policy = load_trained_policy(
@@ -243,7 +243,7 @@ def plan_with_guidance(
     """Return the plan of a protocol, and the guidance along it.
 
     Raises:
-        ConfigError: where no course fits the vessel's turns.
+        ConfigError: if no course is possible with the turns of the vessel.
     """
     steering = autopilot_run.steering
     planned_course = plan_course(
@@ -260,7 +260,7 @@ def plan_with_guidance(
 def make_course_guidance(
     config: CourseTaskConfig, planned_course: PlannedCourse, steering: ControlTask
 ) -> CourseGuidance:
-    """Return line of sight with the config's lookahead, drift estimated where it integrates."""
+    """Return the line-of-sight guidance along a course, with a drift estimate if configured."""
     lookahead = config.course.lookahead
     drift = (
         None if config.integral is None else DriftEstimate(lookahead, config.integral, steering.dt)
@@ -269,7 +269,7 @@ def make_course_guidance(
 
 
 class _CourseResults(NamedTuple):
-    """The rows of metrics.json, tracks of nominal flights, and flights of the spread."""
+    """Rows of metrics.json, tracks of the nominal vessel, and results of the random vessels."""
 
     rows: list[dict[str, Any]]
     tracks: list[pd.DataFrame]
@@ -366,13 +366,16 @@ def simulate_course(
     duration: float,
     vessels: Vessels,
 ) -> list[CourseRun]:
-    """Fly each vessel once, from the plan's first point and heading.
+    """Simulate each vessel once, from the first point and heading of the plan.
 
     Args:
-        planned_course: course that cross-track errors are measured from.
-        lookahead: of the plan's guidance in m.
-        duration: in s, after which a flight that has not ended is given up.
-        vessels: that fly.
+        steering: vessel, rudder limit and time step.
+        policy: controller.
+        reference: guidance.
+        planned_course: course to which cross-track errors refer.
+        lookahead: look-ahead distance of the guidance in m.
+        duration: time limit of a simulation in s.
+        vessels: variations of the vessel and their currents.
     """
     vessel = steering.vessel
     n_vessels = len(vessels.variation)
@@ -487,8 +490,8 @@ def _replan_and_verify(
         ).all()
     ):
         raise ExportError(
-            f"{run.path}: another course is planned for '{protocol}' now than the one that was"
-            " flown; carry the run out again with this version"
+            f"{run.path}: the course that is planned for '{protocol}' differs from that of the"
+            " run; repeat the run with this version"
         )
     return planned_course, guidance
 
@@ -504,7 +507,7 @@ def export_model(
 
     Raises:
         UsageError: if the run has no course of this name.
-        ExportError: where another course is planned now than the one that was flown.
+        ExportError: if the planned course differs from that of the run.
     """
     protocols = {f"{config.policy}_{protocol}": protocol for protocol in config.protocols}
     name = request.resolve_model_name(protocols)
