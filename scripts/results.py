@@ -44,6 +44,8 @@ SOURCES: dict[str, tuple[str, ...]] = {
         for path in sorted((ROOT / "configs").rglob("*.yaml"))
         if path.parent.name != "vessels"
     },
+    # needs the package examples/residnet_tasks
+    "thrusters": ("examples/residnet_tasks/configs/thrusters.yaml",),
     "noise": ("configs/studies/jervan2020/noise.yaml",),
     "input_noise": ("configs/studies/halvorsen2019/noise.yaml",),
     "tanker": ("configs/esso_osaka.yaml", "~heads", "~base_of", "~ensembles", "~training"),

@@ -36,7 +36,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FENCE = re.compile(r"```(?P<kind>\w+)\n(?P<text>.*?)```", re.S)
 TEXT = "\n".join(page.read_text() for page in PAGES)
-NAMED = set(re.findall(r"residnet run ((?!configs\b)[a-z_0-9]+)\b(?!\.)", TEXT))
+NAMED = set(re.findall(r"residnet run ((?!configs\b|examples\b)[a-z_0-9]+)\b(?!\.)", TEXT))
 
 
 @dataclass(frozen=True)
