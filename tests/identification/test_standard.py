@@ -17,6 +17,7 @@ from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.layout import SURGE_SWAY_YAW
 from residnet.core.log import Log
+from residnet.core.progress import on_progress
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import InnovationFilter
 from residnet.heads import HeadConfig
@@ -276,6 +277,28 @@ def test_networks_need_logs_of_ten_free_runs() -> None:
     facts = TrainingDataSummary.from_channel_names(NAMES_OF_A_BOAT)
     assert set(make_portfolio(facts)["heads"]) >= {"plsr", "mlp", "lstm"}
     assert set(short(NAMES_OF_A_BOAT)["heads"]) == {"hull_network", "plsr"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "mlp and lstm are left out: the training logs of"),
+        (
+            {"recipe": None, "baseline": {"kind": "regressors"}, "heads": {"net": {"kind": "mlp"}}},
+            "net: the training logs of",
+        ),
+    ],
+)
+def test_a_fit_says_that_logs_are_short_for_networks(
+    logs: PreparedSplits, changes: dict[str, Any], said: str
+) -> None:
+    windows = {"kind": "windows", "length": 15.0, "first": 1.0, "history": 1.0}
+    evaluation = content()["evaluation"] | {"protocols": {"T8": windows}}
+    messages: list[str] = []
+    with on_progress(lambda progress: messages.append(progress.message)):
+        fitter = Fitter(logs, settings(evaluation=evaluation, **changes), FitStore())
+    assert [one for one in messages if said in one and "shorter than ten free runs" in one]
+    assert ("mlp" in fitter.settings.heads) == ("mlp" in changes)
 
 
 def test_short_logs_give_each_axis_the_terms_that_a_symmetric_vessel_has() -> None:

@@ -113,6 +113,8 @@ def test_the_users_trainer_gives_the_result_of_a_fit(
     training = residnet.head_training(
         data, LSTM, name="lstm", baseline="regressors", training=TRAINING, **settings
     )
+    with pytest.raises(UsageError, match="no finished epoch; fit it with your trainer first"):
+        training.finish()
     saved = ModelCheckpoint(tmp_path, monitor="validation", save_last=True)
     # the training stops by itself
     user_trainer = trainer(tmp_path, 100, callbacks=[saved])

@@ -59,8 +59,15 @@ class HeadTrainingRun:
         The head has the weights of the epoch with the smallest validation error.
 
         Raises:
+            UsageError: if the training has no finished epoch.
             FitError: if no epoch gave a finite free run.
         """
+        if self.module.epoch == 0:
+            raise UsageError(
+                "head_training: the training has no finished epoch; fit it with your trainer first,"
+                " and not with strategy='ddp_spawn', whose processes return no learning curve (use"
+                " 'ddp')"
+            )
         from residnet.training.heads import finish_training
         from residnet.training.trainer import make_training_notes
 

@@ -721,17 +721,20 @@ def _resolve_settings(
     )
     if settings.recipe is not None:
         settings = settings.with_parts(summary)
-        if not has_enough_logs_for_networks(summary):
-            log_message(
-                f"  mlp and lstm are left out: the training logs of"
-                f" {summary.n_samples * summary.dt:.0f} s are shorter than ten free runs of"
-                f" {summary.free_run_length:g} s"
-            )
+    has_enough_logs = has_enough_logs_for_networks(summary)
+    shortage = (
+        f"the training logs of {summary.n_samples * summary.dt:.0f} s are shorter than ten free"
+        f" runs of {summary.free_run_length:g} s"
+    )
+    if settings.recipe is not None and not has_enough_logs:
+        log_message(f"  mlp and lstm are left out: {shortage}")
     training_configs = {}
     for name, head_config in settings.heads.items():
         head = head_config.build(samples.names)
         if not isinstance(head, ClosedFormHead):
             training_config = settings.training.get(name, TrainingConfig())
+            if settings.recipe is None and training_config.is_derived and not has_enough_logs:
+                log_message(f"  {name}: {shortage}; a network may not improve on the baseline")
             training_configs[name] = resolve_training(
                 training_config, head, summary, settings.effort
             )
