@@ -1247,7 +1247,7 @@ def make_step_clock(preview: TablePreview, step: str) -> TableClock:
         raise UsageError(
             f"the time between two rows '{truncate(step, 40)}' is no time; write it as '0.1 s'"
         )
-    columns = [*preview.numeric_columns.values(), *preview.text_columns.values()]
+    columns: list[Any] = [*preview.numeric_columns.values(), *preview.text_columns.values()]
     settings = {"step": f"{seconds:.12g} s"}
     return TableClock(settings, seconds * np.arange(len(columns[0])), "", ())
 

@@ -889,7 +889,9 @@ def _find_separator_lines(block: bytes, delimiter: str, n_columns: int) -> list[
         n_columns: number of cells of a regular line.
     """
     sign = delimiter.encode()
-    if delimiter == WHITESPACE_DELIMITER or not re.search(rb"(?m)^[" + sign + rb" ]+$", block):
+    if delimiter == WHITESPACE_DELIMITER or not re.search(
+        rb"(?m)^[" + re.escape(sign) + rb" ]+$", block
+    ):
         return []
     return [
         i
