@@ -16,6 +16,7 @@ import torch
 from exported_models import built
 from tiny import read_json
 
+from residnet.core.names import FORCE_CHANNELS
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
@@ -23,7 +24,6 @@ from residnet.export import EXPORT_FORMATS, get_exporter
 from residnet.export.vessel import ExportedVessel
 from residnet.heads.force import ForceHead
 from residnet.heads.linear import RidgeConfig
-from residnet.physics.signals import FORCE_CHANNELS
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ExportRequest
 

@@ -77,6 +77,7 @@ class ReferenceFilter(Reference):
         super().__init__()
         self.n_state = 9
         intervals = {config.interval for config in configs}
+        # way-points change at steps only, so that a row needs no switch within a step
         steps = max(intervals) / dt
         if len(intervals) > 1 or abs(steps - round(steps)) > 1e-6 * steps or round(steps) < 1:
             interval_text = ", ".join(f"{interval:g} s" for interval in sorted(intervals))
@@ -90,6 +91,7 @@ class ReferenceFilter(Reference):
         points = [
             (
                 *config.waypoints,
+                # rows with fewer way-points hold their last one
                 *[config.waypoints[-1]] * (self.n_waypoints - len(config.waypoints)),
             )
             for config in configs
@@ -121,6 +123,7 @@ class ReferenceFilter(Reference):
                 * dt
             )
             eye = torch.eye(3, dtype=torch.float64)
+            # Horner form of I + A + A^2/2 + A^3/6 + A^4/24, the RK4 step of a linear system
             matrices.append(eye + a @ (eye + a @ (eye + a @ (eye + a / 4.0) / 3.0) / 2.0))
         return torch.stack(matrices)
 
@@ -370,6 +373,7 @@ def required_force(
         return torch.cat(
             (force_now, torch.zeros_like(force_now), torch.zeros_like(force_now)), dim=-1
         )
+    # a command that is held for hold_time acts on average half of it later
     lead_time = lag.delay + 0.5 * hold_time
     force_before = force_at(lead_time - _DIFFERENCE_STEP)
     force_now = force_at(lead_time)
@@ -409,6 +413,7 @@ class LagCompensatedPID(Policy):
         self.n_state = feedback.n_state + 12
         self.dt = dt
         self.has_lag = any(lag is not None for lag in lags)
+        # rows without lag get any stable lag, since `forward` discards its result for them
         effective_lags = [lag or ActuatorLag(frequency=2.0, damping=1.0) for lag in lags]
         lag_table = [
             [float(lag is not None), effective_lag.frequency, effective_lag.damping]
@@ -482,6 +487,7 @@ def sample_filtered_course(config: ReferenceFilterConfig, dt: float) -> PoseDeri
     steps_per_waypoint = reference_filter.steps_per_waypoint
     powers = torch.eye(3, dtype=torch.float64).expand(1, 3, 3, 3)
     step_power = matrix
+    # doubling: powers 0..n-1 times matrix^n give powers n..2n-1, in log2 multiplications
     while len(powers) <= steps_per_waypoint:
         powers = torch.cat((powers, powers @ step_power))
         step_power = step_power @ step_power

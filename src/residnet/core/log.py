@@ -78,6 +78,7 @@ class Log:
         missing = {
             name: CHANNEL_UNITS.get(name, "-") for name in self.channels if name not in self.units
         }
+        # a frozen dataclass allows no assignment; channels with standard names need no unit
         object.__setattr__(self, "units", {**self.units, **missing})
 
     def __len__(self) -> int:
@@ -270,6 +271,7 @@ def _parse_metadata(path: Path, table: Any) -> dict[str, Any]:
         )
     required = {key: metadata.get(key) for key in ("name", "manoeuvre", "units", "meta")}
     meta = required["meta"] if isinstance(required["meta"], dict) else {}
+    # entries of `meta` are optional, but one that is present must have its type
     stored = {**required, **{key: value for key, value in meta.items() if key in _FIELD_TYPES}}
     damaged = [key for key, value in stored.items() if not isinstance(value, _FIELD_TYPES[key])]
     if not damaged and not all(isinstance(unit, str) for unit in metadata["units"].values()):
@@ -302,6 +304,7 @@ def _extract_columns(path: Path, table: Any) -> dict[str, np.ndarray]:
     columns: dict[str, np.ndarray] = {}
     for name in table.column_names:
         values = table.column(name).to_numpy()
+        # kinds of NumPy: float, signed and unsigned integer, bool
         if values.dtype.kind not in "fiub":
             raise DataError(
                 f"{path}: column '{name}' holds no numbers ({values.dtype}); the file is"

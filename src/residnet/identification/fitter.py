@@ -183,6 +183,7 @@ class ValidationScorer:
 
     def __call__(self, model: HybridDynamics) -> Score:
         """Return the divergences and the mean NRMSE of the validation windows, run in float32."""
+        # placeholder name, under which the predictions are returned
         candidate = Candidate("validated", "head", model)
         predictions = run_free_runs(
             [candidate], self.windows, self.logs, self.dt, self.velocity_limits, dtype=torch.float32
@@ -190,6 +191,7 @@ class ValidationScorer:
         errors = FreeRunErrors.from_predictions(self.windows, predictions["validated"], self.logs)
         n_diverged = sum(prediction.has_diverged for prediction in predictions["validated"])
         dof = errors.dof
+        # states that are constant zero have no error and would reduce the mean
         normalized_rmse = (errors.rmse.mean(0) / self.state_scales)[dof.active_indices]
         window = self.windows[0]
         predicted_states = predictions["validated"][0].states
@@ -459,6 +461,7 @@ class Fitter:
             )
             if is_unidentified
         ]
+        # names in fit.json: `open` are unidentified parameters, `feeding` those fixed at zero
         notes["feeding"] = [parameter_names[i] for i in refitted.notes["at_rest"]]
         notes["refit"] = refitted.notes
         return baseline.refresh_table(coefficients, refitted.standard_errors), refitted.covariance

@@ -199,6 +199,7 @@ def _make_plant_candidate(data: SimulatedTrials) -> Candidate | None:
         return None
     command_names = plant.input_names[: plant.n_commands]
     model = RecordedPlantDynamics(plant, data.step, data.substeps)
+    # the remaining inputs, such as wind and current, are not known to the models either
     n_unknown_inputs = len(plant.input_names) - len(command_names)
     return Candidate(
         PLANT, PLANT, model, plant.state_names, command_names, n_unknown_inputs, "baseline"
@@ -304,11 +305,7 @@ class IdentifiedModels(Mapping[str, FittedModel]):
         validation = evaluations.get("validation")
         validation_runs = [] if validation is None else validation.free_runs
         selection_run = next(
-            (
-                selection_run
-                for selection_run in validation_runs
-                if selection_run.protocol == config.selection
-            ),
+            (free_run for free_run in validation_runs if free_run.protocol == config.selection),
             None,
         )
         if validation is None or selection_run is None:
@@ -316,6 +313,8 @@ class IdentifiedModels(Mapping[str, FittedModel]):
                 f"select: no free runs over validation logs by protocol '{config.selection}';"
                 " evaluate the validation split first"
             )
+        # errors are compared by blocks (logs or long segments), since successive windows
+        # are correlated
         blocks, block_numbers = make_selection_blocks(selection_run)
         checked_runs = {
             split: evaluations[split].free_runs
@@ -338,8 +337,8 @@ class IdentifiedModels(Mapping[str, FittedModel]):
                     f"{n_diverged} of its {len(free_run.windows)} {split} windows diverged"
                     f" ({free_run.protocol})",
                 )
-                for split, validation_runs in checked_runs.items()
-                for free_run in validation_runs
+                for split, free_runs in checked_runs.items()
+                for free_run in free_runs
                 if (
                     n_diverged := sum(
                         item.has_diverged for item in free_run.predictions[fitted_model.name]
@@ -361,12 +360,15 @@ class IdentifiedModels(Mapping[str, FittedModel]):
                 )
             )
         selection = select_models(candidates, blocks)
+        # parts that the user has listed are selected by their errors alone
         if self.settings.recipe is None or ENSEMBLE not in self.models:
             return selection
         selection = replace(selection, selected_ensemble=ENSEMBLE, default_ensemble=ENSEMBLE)
         hull_candidate = next(
             (item for item in selection.candidates if item.name == SINGLE_MODEL_NAME), None
         )
+        # a hull that diverged is no usable simulator, so that the selection by errors applies
+        # instead
         if hull_candidate is None or hull_candidate.n_diverged:
             return selection
         faults_text = (
@@ -412,6 +414,7 @@ def run_teacher_forced(model: HybridDynamics, log: PreparedLog) -> TeacherForced
         model: the model, in float64.
         log: prepared log; gaps are filled with 0, and predictions there are meaningless.
     """
+    # in float64, so that the residuals to be tested contain no rounding errors
     model = model.to(torch.float64)
     z = compute_channels(log, model.signals)
     with torch.no_grad():

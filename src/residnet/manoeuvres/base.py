@@ -84,6 +84,7 @@ class Helm:
         forces: Callable[[Tensor], Tensor] | None = None
         side_force: float | None = None
         if isinstance(plant, HullPlant) and isinstance(plant.actuators, ForceCommands):
+            # order of the limits: surge, sway, yaw
             side_force = float(plant.actuators.limit[1])
         if plant.input_names[: plant.n_commands] == ForceCommands.command_names:
             # commands that are forces need no allocation
@@ -385,6 +386,7 @@ def rudder_share(angle: float, helm: RudderRange) -> float:
             " of full steer from -1 to 1"
         )
     share = angle / max_rudder
+    # the margin accepts an angle equal to the limit after its conversion from degrees
     if abs(share) > 1.0 + 1e-9:
         raise UsageError(
             f"the manoeuvre demands {abs(angle) * 57.29578:.4g} deg of rudder, the limit of the"

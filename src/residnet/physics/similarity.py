@@ -97,6 +97,7 @@ def dimension_of_term(factors: Sequence[Factor], units: Mapping[str, str]) -> Di
             if base != DIMENSIONLESS:
                 return None
             continue
+        # magnitudes have no function and keep the dimension of the channel
         root = {"sqrt": 0.5, "ssqrt": 0.5, "inv": -1.0}.get(factor.function, 1.0)
         dimension = dimension.times(base, root * factor.power)
     return dimension
@@ -162,6 +163,7 @@ class Particulars(Config):
             if self.mass is None:
                 return None
             return ReferenceScales(self.mass, self.length, math.sqrt(self.length / GRAVITY))
+        # the systems differ in the reference area only: L^2 (prime I) or L T (prime II)
         area = self.length if system == "prime_i" else self.draught
         if area is None:
             return None
@@ -178,6 +180,7 @@ class Particulars(Config):
         """
         return Particulars(
             length=self.length * scale,
+            # an equal Froude number requires U proportional to sqrt(L)
             speed=self.speed * math.sqrt(scale),
             density=self.density * density_ratio,
             draught=None if self.draught is None else self.draught * scale,
@@ -236,11 +239,13 @@ def estimate_added_mass(particulars: Particulars) -> AddedMass | None:
     draught = particulars.draught
     volume = particulars.mass / particulars.density
     block_coefficient = volume / (length * beam * draught)
+    # no hull fills more than its bounding box; usually the mass or the draught has a wrong unit
     if block_coefficient > 1.0:
         raise UsageError(
             f"mass: {particulars.mass:g} kg displace {volume:.4g} m^3, more than length x beam x"
             f" draught ({length * beam * draught:.4g} m^3); correct the particulars"
         )
+    # pi (T/L)^2 is the sway added mass of a thin plate, which the regressions correct
     slenderness = math.pi * (draught / length) ** 2
     half_density = 0.5 * particulars.density
     return AddedMass(

@@ -101,6 +101,7 @@ class Solution:
         """
         if self.covariance is None:
             raise ValueError("this solution has no standard errors")
+        # rounding may leave a variance that is zero slightly negative
         return self.covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt().T
 
     def predict(self, x: Tensor) -> Tensor:
@@ -150,6 +151,7 @@ def evaluate_regressors(
     if len(channels) > paged.MAX_SAMPLES_IN_MEMORY:
         return ChunkedRegressors(evaluate, channels, columns)
     values = evaluate(channels)
+    # selection by a list copies the matrix, which is avoided if all columns are used
     return values if list(columns) == list(range(values.shape[1])) else values[:, list(columns)]
 
 

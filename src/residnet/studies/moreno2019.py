@@ -1,8 +1,8 @@
 """Document 001 (Moreno-Salinas et al. 2019): additional section in the report of a fit.
 
 The document prints root mean square errors of u, v, r in free runs over whole records on training,
-validation and test data (Tables 2 and 3). Here they have moving-block
-intervals, and joint and separate tuning of the outputs are compared on the same records.
+validation and test data (Tables 2 and 3). This module adds confidence intervals by moving blocks
+and compares joint with separate tuning of the outputs on the same records.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def sections(files: RunFiles) -> list[Section]:
 
 
 def _velocity_column(title: str, axis: int, factor: float, decimals: int) -> Column:
-    """Return a column of a velocity, with its interval and the published value in small print."""
+    """Return a column of a velocity, with its interval and the published value as notes."""
     name = list(_AXES)[axis]
 
     def cell(row: Mapping[str, Any]) -> Cell:
@@ -179,6 +179,7 @@ def _error_row(model: str, split: str, records: Sequence[StoredWindow]) -> dict[
     }
     for axis, name in enumerate(_AXES):
         interval = block_bootstrap_interval(_squared_errors(model, records, axis))
+        # the interval is of the mean square, whose lower limit may be negative
         limits = (max(interval.lower, 0.0), interval.upper)
         row[name] = math.sqrt(interval.mean)
         row[f"{name}_ci95"] = [*map(math.sqrt, limits)] if math.isfinite(interval.lower) else None
@@ -198,6 +199,7 @@ def _difference_row(
         squares = _squared_errors(model, records, axis)
         reference = _squared_errors(reference_model, records, axis)
         interval = block_bootstrap_interval(
+            # paired differences: errors that both models share cancel in the interval
             [a - b for a, b in zip(squares, reference, strict=True)]
         )
         reference_mse = float(np.concatenate(reference).mean())
@@ -246,10 +248,12 @@ def grid_errors(notes: Mapping[str, Any]) -> tuple[GridErrors, GridErrors]:
     if not validation_errors:
         return {}, {}
     errors = np.asarray(notes["cross_validated_error"])
+    # [widths, penalties, outputs]; outputs in different units are only comparable as ratios
     relative = (errors / errors.min(axis=(0, 1))).mean(axis=-1)
     penalties, widths = (
         sorted({grid_point[i] for grid_point in validation_errors}) for i in (0, 1)
     )
+    # the refined grid of a local search is not a complete product, so that its errors have no axes
     if relative.shape != (len(widths), len(penalties)):
         return validation_errors, {}
     return validation_errors, {

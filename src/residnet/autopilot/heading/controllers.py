@@ -104,7 +104,9 @@ class LinearLaw(AnglePolicy):
         return torch.cat((torch.zeros_like(measured[:, :1]), measured), dim=1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        # exact step of the filter; a time constant of zero gives the factor 1, no filter
         filter_factor = 1.0 - torch.exp(-self.dt / self.lag.clamp(min=1e-6))
+        # the difference is wrapped, so that the filter does not turn the long way round at +-pi
         heading = s[:, 1:2] + filter_factor * wrap_angle(x[:, self.psi : self.psi + 1] - s[:, 1:2])
         rate = s[:, 2:3] + filter_factor * (x[:, self.r : self.r + 1] - s[:, 2:3])
         error = wrap_angle(reference - heading)
@@ -427,6 +429,7 @@ class PtosConfig(ObservedConfig):
     damping: Positive | None = None
 
     def build_law(self, limit: float, rate: float | None) -> HeadingLaw:
+        # the time that the rudder needs from zero to its limit
         return ProximateTimeOptimalLaw(0.0 if rate is None else limit / rate)
 
 

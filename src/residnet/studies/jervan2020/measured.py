@@ -387,7 +387,7 @@ def _cross_validate(
     """Fit a model for each fold on the samples outside and away from it, and to all of them.
 
     Raises:
-        FitError: where the training samples do not determine the model.
+        FitError: if the training samples do not determine the model.
     """
     target = measured.forces[model_config.evaluation_force]
     command = measured.forces[model_config.force]
@@ -399,6 +399,7 @@ def _cross_validate(
         motion = record.nu_dot[test], record.nu[test], record.pose[test, HEADING]
         error[test] = model.force.force_residual(target[test], *motion)
         folds.append(model.fit.notes)
+    # fitted to all samples for its coefficients; the errors above are of the folds
     model = fit_model(model_config, replace(measured.record, command=command), believed)
     not_forward = ""
     try:
@@ -440,6 +441,7 @@ def _evaluation_rows(
         reference_errors["reference"] = np.stack(
             [errors[name][:, a] for a, name in enumerate(best_reference)], axis=1
         )
+        # not zero, since an axis without any force would divide by it
         zero_error = np.maximum(errors["zero"].mean(0), 1e-300)
         for name, error in errors.items():
             row = {
@@ -467,7 +469,7 @@ def _evaluation_rows(
 
 
 def is_significantly_better(row: Mapping[str, Any], reference: str) -> list[bool]:
-    """Return whether a model's error lies below another's with 95 % confidence.
+    """Return whether a model's error is smaller than another's with 95 % confidence.
 
     Args:
         reference: `zero`, `believed`, or `reference`, the better of the two on each axis.
@@ -522,6 +524,7 @@ def _score_figure(rows: Sequence[StudyResults]) -> Figure:
     panels = []
     panel_traces = []
     for force in dict.fromkeys(row["force"] for row in rows):
+        # reversed, since the figure counts its rows from the bottom
         force_rows = [row for row in rows if row["force"] == force and row["model"] != "believed"][
             ::-1
         ]
@@ -554,9 +557,9 @@ def _score_figure(rows: Sequence[StudyResults]) -> Figure:
         )
     return Figure(
         "scores",
-        "Errors beside the believed model",
-        "Squared error of each model less that of the believed model where neither saw the"
-        " data, with 95 % intervals.",
+        "Errors compared with the believed model",
+        "Squared error of each model less that of the believed model, both on data not used in"
+        " their fit, with 95 % intervals.",
         styles,
         panels,
         [Case("", panel_traces)],
@@ -716,7 +719,7 @@ def _acceleration_section(results: StudyResults, run: Path) -> Section:
 def _model_table(
     config: ForceResidualConfig, results: StudyResults, group: Mapping[str, StudyResults]
 ) -> Table:
-    """Return the table of the models that are judged on one force (Tables 5.1, 5.2, 5.4, 5.5)."""
+    """Return the table of the models evaluated on one force (Tables 5.1, 5.2, 5.4, 5.5)."""
     believed_mse = group["believed"]["mse"]
     rows = []
     for name, row in group.items():
@@ -797,7 +800,9 @@ def _model_table(
 
 
 def _recommended_model(rows: Sequence[Any]) -> str:
-    """Return the best of the models surely better than no regression, else of these."""
+    """Return the best of the regressions that are significantly better than the reference.
+
+    Without such a regression it is the better of zero force and the believed model."""
     better_rows = [
         row
         for row in rows
