@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from steered_logs import steered_log
 
 from residnet.autopilot.tasks.design import identify_steering
 from residnet.core.errors import DataError, FitError
@@ -77,3 +78,11 @@ def test_what_is_no_response_to_the_rudder_is_refused() -> None:
     ):
         with pytest.raises(error, match=told):
             identify_steering([log.replace(channels=channels)])
+
+
+def test_a_rudder_that_a_controller_set_is_refused() -> None:
+    logs = [steered_log("controller", seed) for seed in (0, 1)]
+    with pytest.raises(DataError, match="a controller set the rudder"):
+        identify_steering(logs)
+    found = identify_steering([steered_log("set_points", seed) for seed in (0, 1)])
+    assert found.response.gain == pytest.approx(0.7, rel=0.1)

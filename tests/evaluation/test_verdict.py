@@ -264,3 +264,38 @@ def test_a_split_that_is_too_short_is_judged_by_a_shorter_protocol() -> None:
         == "T100"
     )
     assert order_protocols(short, "validation", "T100")[0] == "T100"
+
+
+def excitation(state: str, **change: Any) -> dict[str, Any]:
+    """Contents of excitation.json for a rudder in a state."""
+    rudder = {"name": "delta", "state": state, "text": f"delta was {state}"}
+    return {"inputs": [rudder], "directions": [], "closed_loop_test_inputs": [], **change}
+
+
+def test_inputs_that_cannot_be_identified_make_no_good_model() -> None:
+    good = under({"horizons": [horizon(10.0, errors(0.5, 2.0))]})
+    for state, level in (
+        ("excited", "good"),
+        ("held", "good"),
+        ("feedback", "limited"),
+        ("collinear", "limited"),
+    ):
+        judged = evidence(limits_by_protocol=good, excitation=excitation(state))
+        assert rate_model(judged) == level
+        text = " ".join(write_verdict(judged))
+        assert ("the effect of delta cannot be identified" in text) == (level == "limited")
+        assert ("Delta was held." in text) == (state == "held")
+
+
+def test_the_verdict_names_unexcited_directions_and_controlled_test_logs() -> None:
+    direction = {"text": "differential thrust: not excited", "is_excited": False}
+    found = excitation(
+        "excited",
+        directions=[direction, {"text": "common thrust: excited", "is_excited": True}],
+        closed_loop_test_inputs=["delta"],
+        domain=["n was held at 12 1/s."],
+    )
+    text = " ".join(write_verdict(evidence(excitation=found)))
+    assert "Differential thrust: not excited. n was held at 12 1/s." in text
+    assert "common thrust" not in text
+    assert "for operation under the same controller only" in text

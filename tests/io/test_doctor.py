@@ -193,6 +193,8 @@ def test_inspect_log_reports_a_planted_fault_with_figures(
 def test_every_check_above_a_note_is_tested() -> None:
     # groups of causes are named one by one
     named = {"follows", "position_causes", "yaw_causes", "contradicts", "extrapolation"}
+    # tests/io/test_feedback.py
+    named |= {"feedback"}
     named |= {code for fault in FAULTS for code in fault.codes} | {row[1] for row in TOLD}
     assert {check.code for check in CHECKS if check.level != "note"} <= named
     assert {check.stage for check in CHECKS} == STAGE_DESCRIPTIONS.keys()

@@ -525,7 +525,7 @@ def _validate_masks(masks: Any, function_name: str) -> tuple[MaskRule, ...]:
 def _prepare_splits(
     splits: Mapping[str, Sequence[Log]], signals: SignalsConfig, config: PrepareConfig
 ) -> dict[str, list[PreparedLog]]:
-    splits = mask_unexplained_idle(splits, config, signals.input_columns)
+    splits = mask_unexplained_idle(splits, config, signals.regressor_columns)
     n_done = 0
     total = sum(map(len, splits.values()))
     prepared: dict[str, list[PreparedLog]] = {}

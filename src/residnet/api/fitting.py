@@ -30,9 +30,11 @@ from residnet.core.processes import worker_limit
 from residnet.core.progress import ProgressCallback
 from residnet.core.trust import trusting
 from residnet.evaluation.metrics import build_metrics_table, iterate_rollout_columns
+from residnet.evaluation.records import ExcitationFile
 from residnet.evaluation.selection import Selection
 from residnet.evaluation.verdict import VerdictEvidence, order_protocols, write_verdict
 from residnet.heads import HeadConfig
+from residnet.identification.excitation import assess_excitation
 from residnet.identification.fit import fit_models as identify
 from residnet.identification.identified import (
     IdentifiedModels,
@@ -325,6 +327,19 @@ class Models(dict[str, Model]):
             self.selection.to_record().to_content(),
             evaluation.limits_by_protocol,
             protocol=protocol,
+            excitation=self.excitation.to_content(),
+        )
+
+    @cached_property
+    def excitation(self) -> ExcitationFile:
+        """What the training logs excite, and feedback in training and test logs."""
+        splits = {"train": self.identified.training_logs, "test": self.data.splits.get("test", ())}
+        return assess_excitation(
+            splits,
+            self.data.signals,
+            self.settings.prepare.grid.step,
+            next(iter(self.values())).spec.domain,
+            "fit",
         )
 
     @property

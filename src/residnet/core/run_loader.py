@@ -44,6 +44,7 @@ READ_NAMES = frozenset(
     {
         "bands.json",
         "controllers.json",
+        "excitation.json",
         "metrics.json",
         "model.json",
         "model.safetensors",

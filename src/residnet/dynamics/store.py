@@ -25,6 +25,7 @@ from residnet.core.names import require_plain_name, suggest_name
 from residnet.core.ownership import find_run_manifest, read_regular_file
 from residnet.core.run_loader import SIZE_LIMITS, require_trustworthy
 from residnet.core.version import __version__
+from residnet.dynamics.domain_config import OperatingDomain
 from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.time_steps import Integrator
@@ -132,6 +133,7 @@ class ModelSpec(Stored):
         low: minima of velocities and inputs in the training data, SI [n + m].
         high: maxima of velocities and inputs in the training data, SI [n + m].
         band: half widths of the prediction intervals; None if not calibrated.
+        domain: relations and density of the training data; None in models of earlier versions.
         members: members of an ensemble, whose baseline and head are then empty.
         of: quantity that an ensemble averages: accelerations within one free run, or trajectories
             of independent free runs of the members.
@@ -150,6 +152,7 @@ class ModelSpec(Stored):
     low: tuple[float, ...]
     high: tuple[float, ...]
     band: BandTable | None = None
+    domain: OperatingDomain | None = None
     members: tuple[ModelSpec, ...] = ()
     of: Literal["accelerations", "trajectories"] = "accelerations"
 

@@ -470,6 +470,78 @@ class SanityFile(FileRecord):
     findings: tuple[SanityRow, ...]
 
 
+# excitation.json
+
+
+class InputExcitationRow(Record):
+    """How the training logs excite one input that is a regressor of the model.
+
+    Attributes:
+        name: name of the input.
+        low: smallest value, SI.
+        high: largest value, SI.
+        std: standard deviation, SI.
+        bandwidth: frequency in Hz below which 95 % of its power lies; None for a constant input.
+        variance_inflation: ratio by which velocities and other inputs increase the variance of the
+            estimated effect, by leave-one-log-out regression.
+        feedback_source: what a controller may have fed back; None if it cannot be assessed.
+        feedback_share: share of the input that feedback explains beyond its effects.
+        effect_share: share of the input that the velocities before and after it explain.
+        state: excited; held at one value; set by feedback without excitation; or collinear with
+            velocities and other inputs.
+        text: the state in words.
+    """
+
+    name: str
+    low: float
+    high: float
+    std: float
+    bandwidth: float | None
+    variance_inflation: float
+    feedback_source: str | None
+    feedback_share: float | None
+    effect_share: float | None
+    state: Literal["excited", "held", "feedback", "collinear"]
+    text: str
+
+
+class DirectionRow(Record):
+    """Excitation of the sum or the difference of two inputs of the same kind.
+
+    Attributes:
+        name: the direction in words.
+        inputs: names of the inputs.
+        ratio: standard deviation relative to the larger one of sum and difference.
+        is_excited: whether the logs excite the direction.
+        text: the result in words.
+    """
+
+    name: str
+    inputs: tuple[str, str]
+    ratio: float
+    is_excited: bool
+    text: str
+
+
+class ExcitationFile(FileRecord):
+    """excitation.json: what the training logs excite, and feedback in training and test logs.
+
+    Attributes:
+        run: name of the run.
+        inputs: inputs that are regressors of the model.
+        directions: sums and differences of inputs of the same kind.
+        closed_loop_test_inputs: inputs of the test logs that feedback sets.
+        domain: sentences on the relations of the operating domain.
+    """
+
+    schema_name: Literal["residnet.excitation/1"] = Field(alias="schema")
+    run: str
+    inputs: tuple[InputExcitationRow, ...]
+    directions: tuple[DirectionRow, ...]
+    closed_loop_test_inputs: tuple[str, ...]
+    domain: tuple[str, ...]
+
+
 # booklet.json
 
 

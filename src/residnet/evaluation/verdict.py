@@ -60,6 +60,7 @@ class VerdictEvidence:
         protocol: protocol of the rows.
         one_sided_text: finding of the data checks on logs without turns to both sides; free runs on
             such logs cannot validate the turning motion.
+        excitation: contents of excitation.json; may be empty.
     """
 
     selected: str
@@ -71,6 +72,7 @@ class VerdictEvidence:
     data_quality_text: str = ""
     protocol: str = ""
     one_sided_text: str = ""
+    excitation: JsonObject = field(default_factory=dict)
 
 
 LEVEL_TEXTS = {
@@ -112,10 +114,15 @@ def write_verdict(evidence: VerdictEvidence) -> list[str]:
     lead_sentence, *horizon_sentences = (
         [compare_velocity_errors(evidence)] if is_useless(evidence) else describe_horizons(evidence)
     )
+    limitations = [evidence.one_sided_text, *list_unidentifiable_inputs(evidence)]
     sentences = [
         lead_sentence,
-        f"The rating is at most limited, because {evidence.one_sided_text}."
-        * bool(evidence.one_sided_text),
+        *(
+            f"The rating is at most limited, because {limitation}."
+            for limitation in limitations
+            if limitation
+        ),
+        describe_unexcited(evidence),
         evidence.data_quality_text,
         *horizon_sentences,
         describe_soundness(evidence),
@@ -134,11 +141,42 @@ def rate_model(evidence: VerdictEvidence) -> str:
     horizon_entries = known_horizons(evidence)
     if horizon_entries and not any(_has_enough_data(evidence, entry) for entry in horizon_entries):
         return TOO_FEW_WINDOWS
-    return (
-        GOOD_LEVEL
-        if longest_good_horizon(evidence) and not evidence.one_sided_text
-        else LIMITED_LEVEL
-    )
+    has_limitation = bool(evidence.one_sided_text) or bool(list_unidentifiable_inputs(evidence))
+    return GOOD_LEVEL if longest_good_horizon(evidence) and not has_limitation else LIMITED_LEVEL
+
+
+def list_unidentifiable_inputs(evidence: VerdictEvidence) -> list[str]:
+    """Return the inputs whose effect the training logs cannot identify, each with the reason.
+
+    Free runs on logs of the same kind cannot reveal a wrong effect: a controller repeats the
+    relation of the input to the motion, and collinear inputs remain collinear.
+    """
+    return [
+        f"the effect of {row['name']} cannot be identified: {row['text']}"
+        for row in evidence.excitation.get("inputs") or []
+        if row["state"] in ("feedback", "collinear")
+    ]
+
+
+def describe_unexcited(evidence: VerdictEvidence) -> str:
+    """Return sentences on the limits of the operating domain; empty if there are none.
+
+    They name directions that were not excited, inputs that were held, and test logs that a
+    controller steered.
+    """
+    excitation = evidence.excitation
+    directions = [
+        row["text"] for row in excitation.get("directions") or [] if not row["is_excited"]
+    ]
+    held_inputs = [row["text"] for row in excitation.get("inputs") or [] if row["state"] == "held"]
+    sentences = [f"{text[0].upper()}{text[1:]}." for text in (*directions, *held_inputs)]
+    sentences += list(excitation.get("domain") or [])
+    if controlled := excitation.get("closed_loop_test_inputs"):
+        sentences.append(
+            "Shown for operation under the same controller only: in the"
+            f" {evidence.split} logs feedback sets {join_list(list(controlled))}."
+        )
+    return " ".join(sentences)
 
 
 def known_horizons(evidence: VerdictEvidence) -> list[JsonObject]:

@@ -15,9 +15,10 @@ All formats follow these rules, so that a bad sample never yields a non-finite r
   accepted range (NaN is replaced by the previous value), and the pose is integrated with the
   velocities before the step.
 
-The flag `outside` is true for each row to which one of these rules was applied, and for each row
-with an entry beyond the training range. The rules are stateless: the next good sample is processed
-from the state and memory given to it.
+The flag `outside` is true for each row to which one of these rules was applied, for each row with
+an entry beyond the training range, and for each row outside the operating domain: the relations and
+the density of the training data (`residnet.dynamics.domain`). The rules are stateless: the next
+good sample is processed from the state and memory given to it.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from residnet.core.columns import (
 )
 from residnet.core.layout import ATTITUDE, PLANAR_LAYOUT, POSITION
 from residnet.dynamics.base import Dynamics
+from residnet.dynamics.domain import DomainCheck
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 
@@ -126,6 +128,11 @@ class GuardedDynamics(Dynamics):
         margin = torch.cat((torch.zeros_like(pose_limit), margin))
         self.ranges = GuardRanges(lower, upper, margin, torch.float32)
         n_states = len(spec.signals.dof.state_names)
+        self.domain_check = (
+            None
+            if spec.domain is None
+            else DomainCheck(spec.domain, spec.signals.dof.state_names, spec.signals.input_columns)
+        )
         self.state_ranges = GuardRanges(
             lower[:n_states], upper[:n_states], margin[:n_states], torch.float32
         )
@@ -157,6 +164,11 @@ class GuardedDynamics(Dynamics):
         measured_values = torch.cat((x, w), dim=-1)
         replaced_values = self.ranges.replace_unaccepted(measured_values)
         is_inside = self.ranges.is_in_training_range(measured_values)
+        if self.domain_check is not None:
+            is_inside = is_inside & self.domain_check(
+                pose_and_dynamic_states(replaced_values, self.dof),
+                actuator_states(replaced_values, self.dof),
+            )
         # without memory no reduction over an empty dimension, which some formats do not support
         if self.n_state > 0:
             is_memory_valid = self.is_valid_memory(s)

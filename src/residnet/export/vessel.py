@@ -19,6 +19,9 @@ from residnet.core.errors import ExportError
 from residnet.core.layout import SURGE
 from residnet.core.progress import log_message
 from residnet.core.version import __version__
+from residnet.dynamics.domain_config import (
+    describe_domain,
+)
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.engine.rollout import Rollout, trace_rollout
@@ -27,6 +30,7 @@ from residnet.export.base import Exportable, LoadedExport, NumberArray, Rounding
 from residnet.export.guard import GuardedDynamics, hold_measured
 from residnet.export.torchscript import get_size, require_shape, trace_function
 from residnet.heads.base import ResidualHead
+from residnet.physics.signals_config import SignalsConfig
 
 PARITY_STEPS = 2000
 """Number of steps of the parity check, in which errors of the memory would accumulate."""
@@ -56,6 +60,34 @@ _BAND_TEXT = (
     " is like; between the steps they are interpolated, and beyond the last they grow in proportion"
     " to time, without any promise; the position's is the radius about the predicted one"
 )
+
+
+_DOMAIN_TEXT = (
+    "`outside` is true where a velocity or an input is beyond its training_range, where an input"
+    " deviates from its relation by more than the tolerance, and where the density of velocities"
+    " and inputs, |F v(z)|^2 with the monomials v of the scaled channels z up to the degree,"
+    " exceeds the limit"
+)
+
+
+def _input_role(signals: SignalsConfig, name: str) -> str:
+    """Return the role of an input of a model in its card."""
+    if name in signals.unexcited:
+        return "unexcited"
+    return "command" if name in signals.inputs else "exogenous"
+
+
+def _describe_domain(spec: ModelSpec) -> dict[str, Any] | None:
+    """Return the entry of the card on relations and density; None for models without them."""
+    domain = spec.domain
+    if domain is None:
+        return None
+    return {
+        "about": _DOMAIN_TEXT,
+        "in_words": describe_domain(domain, spec.signals.channel_units()),
+        "degree": domain.degree,
+        **domain.model_dump(mode="json", exclude={"factor"}),
+    }
 
 
 class GuardedVesselModule(nn.Module):
@@ -149,8 +181,8 @@ class GuardedVesselModule(nn.Module):
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the state [B, 3 + n] and memory after one step under inputs w [B, m], and a flag.
 
-        `outside` [B] is True for rows with a velocity or input beyond the training range, an entry
-        or memory that is not finite, or a corrected result.
+        `outside` [B] is True for rows with a velocity or input beyond the training range or outside
+        the operating domain, an entry or memory that is not finite, or a corrected result.
         """
         n_rows = get_size(x, 2, 0)
         require_shape("x", x, [n_rows, self.n_states])
@@ -283,7 +315,7 @@ class ExportedVessel(Exportable):
                 {
                     "name": name,
                     "unit": units[name],
-                    "role": "command" if name in spec.signals.inputs else "exogenous",
+                    "role": _input_role(spec.signals, name),
                 }
                 for name in spec.signals.input_columns
             ],
@@ -302,6 +334,7 @@ class ExportedVessel(Exportable):
                 else {"velocities": list(dof.velocities), "about": dof.description}
             ),
             "training_range": {name: list(limits) for name, limits in spec.ranges.items()},
+            "operating_domain": _describe_domain(spec),
             "bad_inputs": {
                 "rules": _BAD_INPUT_RULES,
                 "accepted": dict(zip(units, accepted, strict=True)),

@@ -33,6 +33,7 @@ from residnet.evaluation.band import Band
 from residnet.evaluation.freerun import Candidate, FreeRunErrors, run_free_runs
 from residnet.evaluation.protocol import EvaluationConfig, make_windows
 from residnet.heads.base import ClosedFormHead
+from residnet.identification.domain import estimate_domain
 from residnet.identification.prepared import compute_velocity_limits
 from residnet.identification.recipe import TrainingDataSummary, has_enough_logs_for_networks
 from residnet.identification.settings import FitSettings
@@ -355,6 +356,9 @@ class Fitter:
         self.training_logs = logs["train"]
         self.signals = settings.signals.build()
         self.lower_limits, self.upper_limits = compute_training_ranges(self.training_logs)
+        self.domain = estimate_domain(
+            self.training_logs, settings.signals, settings.prepare.grid.step
+        )
         self.velocity_limits = compute_velocity_limits(
             self.lower_limits,
             self.upper_limits,
@@ -398,6 +402,7 @@ class Fitter:
                 "hold": settings.prepare.hold,
                 "low": self.lower_limits.tolist(),
                 "high": self.upper_limits.tolist(),
+                "domain": self.domain.model_dump(),
             }
         )
 

@@ -432,7 +432,7 @@ def _simulate_manoeuvres(
     spec = fitted_model.spec
     model = fitted_model.model.double()
     actuators = GivenActuators(input_shares, spec.signals.exogenous, spec.dt)
-    actuated = ActuatedDynamics(model, spec.signals.input_columns, spec.hold, actuators)
+    actuated = ActuatedDynamics(model, spec.signals.regressor_columns, spec.hold, actuators)
     initial_state = actuated.make_initial_state(1)
     # trials start at the middle of the training range of the speed, where the model is reliable
     initial_state[:, SURGE] = 0.5 * (max(spec.low[0], 0.0) + spec.high[0])
@@ -459,7 +459,7 @@ def _to_trajectory(simulated_run: ManoeuvreRun, signals: SignalsConfig) -> tuple
     # inputs that are not commanded, such as the wind, are zero
     inputs = [
         channel_values.get(name, channel_values.get(command_name_for(name), zeros))
-        for name in signals.input_columns
+        for name in signals.regressor_columns
     ]
     states = torch.from_numpy(motion.stack(signals.dof.state_names))
     return states, torch.from_numpy(np.stack(inputs, axis=1))[:-1]

@@ -34,7 +34,7 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
         DataError: if a training log has no usable sample, or another log no window of a protocol.
     """
     signals = settings.signals
-    splits = mask_unexplained_idle(splits, settings.prepare, signals.input_columns)
+    splits = mask_unexplained_idle(splits, settings.prepare, signals.regressor_columns)
     prepared = {
         split: paged.PageReleasingList(
             prepare_log(log_part, split, signals.input_columns, settings.prepare, signals.dof)

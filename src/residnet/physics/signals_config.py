@@ -40,6 +40,9 @@ class SignalsConfig(Config):
         exogenous: other input channels. `wind_speed` and `wind_dir` (direction FROM which the true
             wind blows, in earth axes) are transformed to the channels wind_u, wind_v, wind_mag, the
             velocity of the air relative to the vessel in body axes.
+        unexcited: inputs that the logs held at one value, or in proportion to another input. Their
+            effect cannot be identified, so they are no regressors; they remain inputs of the model,
+            which flags values other than those of the logs (`residnet.dynamics.domain`).
         forces: a vessel (by name or file) whose thrusters convert the two inputs to tau_x, tau_y,
             tau_n; or a configuration of thrusters.
         pairs: inputs to port and starboard that are exchanged by mirroring, such as
@@ -54,6 +57,7 @@ class SignalsConfig(Config):
 
     inputs: tuple[str, ...]
     exogenous: tuple[str, ...] = ()
+    unexcited: tuple[str, ...] = ()
     forces: str | DifferentialThrustConfig | None = None
     pairs: tuple[tuple[str, str], ...] = ()
     velocities: tuple[Literal["u", "v", "r", "w", "p", "q"], ...] = Field(
@@ -62,7 +66,7 @@ class SignalsConfig(Config):
 
     @model_validator(mode="after")
     def _validate_combination(self) -> SignalsConfig:
-        for name in self.inputs:
+        for name in (*self.inputs, *self.unexcited):
             require_plain_name(name)
         self._validate_exogenous()
         if self.with_thrusters().forces is not None and len(self.inputs) != 2:
@@ -118,9 +122,7 @@ class SignalsConfig(Config):
 
     def _validate_input_names(self) -> None:
         """Refuse inputs that occur twice or have the name of a computed channel."""
-        duplicates = {
-            name for name in self.inputs if name in self.exogenous or self.inputs.count(name) > 1
-        }
+        duplicates = {name for name in self.input_columns if self.input_columns.count(name) > 1}
         if duplicates:
             raise ValueError(f"inputs {sorted(duplicates)} are named twice")
         paired_names = [name for pair in self.pairs for name in pair]
@@ -134,7 +136,7 @@ class SignalsConfig(Config):
             + (FORCE_CHANNELS if self.forces is not None else ())
             + (WIND_CHANNELS if self.exogenous else ())
         )
-        if conflicting := [name for name in self.inputs if name in computed]:
+        if conflicting := [n for n in (*self.inputs, *self.unexcited) if n in computed]:
             raise ValueError(
                 f"input '{conflicting[0]}' is a state or a computed channel of the model;"
                 " remove it or rename it in the channel map"
@@ -142,7 +144,12 @@ class SignalsConfig(Config):
 
     @property
     def input_columns(self) -> tuple[str, ...]:
-        """Names of the columns of w [B, m]: inputs, then exogenous channels."""
+        """Names of the columns of w [B, m]: inputs, exogenous channels, unexcited inputs."""
+        return self.inputs + self.exogenous + self.unexcited
+
+    @property
+    def regressor_columns(self) -> tuple[str, ...]:
+        """Names of the columns of w that the motion of the model depends on."""
         return self.inputs + self.exogenous
 
     @property

@@ -16,7 +16,7 @@ from residnet.core.log import Log
 from residnet.preprocessing.align import GridConfig, align_to_grid
 from residnet.preprocessing.masks import MaskRule, apply_masks
 from residnet.preprocessing.motion import original_input_names
-from residnet.quality import actuators, excitation, frames, inputs, values
+from residnet.quality import actuators, excitation, feedback, frames, inputs, values
 from residnet.quality.between import LogSet
 from residnet.quality.clock import find_clock_rate_errors
 from residnet.quality.effects import FindingEffects
@@ -41,6 +41,7 @@ __all__ = [
     "build_inspection",
     "compute_condition_number",
     "excitation",
+    "feedback",
     "find_clock_rate_errors",
     "frames",
     "inputs",

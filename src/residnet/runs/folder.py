@@ -95,6 +95,7 @@ class RunFolder:
         self.booklet = path / "booklet.json"
         self.selection = path / "selection.json"
         self.sanity = path / "sanity.json"
+        self.excitation = path / "excitation.json"
         self.bands = path / "bands.json"
 
     @classmethod
@@ -272,6 +273,10 @@ class RunFolder:
             UsageError: if there is no such file, or it is not readable.
         """
         return read_json(self.metrics)
+
+    def read_excitation(self) -> dict[str, Any]:
+        """Return the contents of excitation.json; empty for runs of earlier versions."""
+        return read_json(self.excitation) if self.excitation.is_file() else {}
 
     def read_fit_notes(self, model: str) -> dict[str, Any]:
         """Return the content of models/<model>/fit.json; empty if the file does not exist."""

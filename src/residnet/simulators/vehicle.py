@@ -94,6 +94,14 @@ def load_learned_vehicle(run: Path, name: str = "selected") -> Vehicle:
     command_columns = slice(dof.n_dynamic, dof.n_dynamic + len(spec.signals.inputs))
     lower = torch.tensor(spec.low)
     upper = torch.tensor(spec.high)
+    # no wind; unexcited inputs stay where the logs held them
+    unexcited_columns = slice(dof.n_dynamic + len(spec.signals.regressor_columns), None)
+    calm_inputs = torch.cat(
+        (
+            torch.zeros(len(spec.signals.exogenous)),
+            0.5 * (lower[unexcited_columns] + upper[unexcited_columns]),
+        )
+    )
     return _with_cruise_speed(
         Vehicle(
             spec.name,
@@ -103,7 +111,7 @@ def load_learned_vehicle(run: Path, name: str = "selected") -> Vehicle:
             len(spec.signals.inputs),
             lower[command_columns],
             upper[command_columns],
-            torch.zeros(len(spec.signals.exogenous)),
+            calm_inputs,
             torch.zeros(len(dof.state_names)),
             float(max(abs(lower[0]), abs(upper[0]))),
         )

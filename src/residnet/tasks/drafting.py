@@ -227,7 +227,9 @@ def draft_fit_config(
     missing_text = _explain_missing_steering(
         inputs, draft_logs.dof, list(draft_logs.complete_logs.values()), draft_notes
     )
-    inputs = draft_logs.keep_inputs(inputs, draft_notes)
+    unexcited = find_unexcited_inputs(list(draft_logs.complete_logs.values()), inputs)
+    all_inputs = draft_logs.keep_inputs((*inputs, *unexcited), draft_notes)
+    inputs = all_inputs[: len(inputs)]
     dof = draft_logs.dof
     finding_codes, quality_warnings = _data_quality_warnings(list(draft_logs.logs.values()), inputs)
     # importing torch takes 190 MB: the inspection of long logs is done before
@@ -247,14 +249,12 @@ def draft_fit_config(
     preparation_recipe = PreparationPlan.from_logs(
         list(draft_logs.complete_logs.values()), inputs, dof, masks
     )
-    signals = {"inputs": list(inputs)}
-    if not dof.is_planar:
-        signals["velocities"] = list(dof.velocities)
-        draft_notes.add_guess(("signals", "velocities"), dof.description)
-    signals |= (
-        {"exogenous": list(preparation_recipe.wind_channels)}
-        if preparation_recipe.wind_channels
-        else {}
+    signals = _choose_signals(
+        inputs,
+        dict(zip(all_inputs[len(inputs) :], unexcited.values(), strict=True)),
+        dof,
+        preparation_recipe.wind_channels,
+        draft_notes,
     )
     _note_unused_channels(draft_logs, draft_notes, has_wind=bool(preparation_recipe.wind_channels))
     preparation = preparation_recipe.to_config()
@@ -687,6 +687,75 @@ def choose_inputs(logs: Sequence[Log], draft_notes: DraftNotes) -> tuple[str, ..
             INPUTS_KEY, f"of {len(inputs)} possible inputs the first {_MAX_INPUTS} are taken"
         )
     return tuple(inputs[:_MAX_INPUTS])
+
+
+def _choose_signals(
+    inputs: Sequence[str],
+    unexcited: Mapping[str, str],
+    dof: DegreesOfFreedom,
+    wind_channels: Sequence[str],
+    draft_notes: DraftNotes,
+) -> dict[str, list[str]]:
+    """Return the section `signals` of a config.
+
+    Args:
+        unexcited: reason for each unexcited input.
+    """
+    signals = {"inputs": list(inputs)}
+    if not dof.is_planar:
+        signals["velocities"] = list(dof.velocities)
+        draft_notes.add_guess(("signals", "velocities"), dof.description)
+    if wind_channels:
+        signals["exogenous"] = list(wind_channels)
+    if unexcited:
+        signals["unexcited"] = list(unexcited)
+        draft_notes.add_note(("signals", "unexcited"), "; ".join(unexcited.values()))
+    return signals
+
+
+def find_unexcited_inputs(logs: Sequence[Log], inputs: Sequence[str]) -> dict[str, str]:
+    """Return actuators that the logs held at one value, or in proportion to a selected input.
+
+    Their effect cannot be identified. They remain inputs of the model, so that it can flag other
+    values. Only channels whose name says that they are actuators count.
+
+    Args:
+        logs: logs in SI units.
+        inputs: selected inputs.
+
+    Returns:
+        Name of each such input -> what the logs hold, in words.
+    """
+    unexcited: dict[str, str] = {}
+    for name in logs[0].channels if inputs else ():
+        measured_names = {name.removeprefix("cmd_"), f"n_{name.removeprefix('cmd_')}"} - {name}
+        if (
+            name in (*_NON_INPUT_CHANNELS, *inputs)
+            or not all(name in log.channels for log in logs)
+            or match_input_channel(parse_name(name)) is None
+            or measured_names & {*inputs, *unexcited}
+            or len(inputs) + len(unexcited) >= _MAX_INPUTS
+        ):
+            continue
+        values = np.concatenate([log[name] for log in logs])
+        if not np.isfinite(values).all():
+            continue
+        level = float(np.median(values))
+        if float(values.std()) <= _MIN_RELATIVE_STD * float(np.abs(values).max()):
+            unexcited[name] = f"{name} stays at {level:.4g}: other values are flagged as outside"
+            continue
+        for input_name in inputs:
+            # the same command in another unit is no actuator of its own
+            is_same_kind = name.split("_")[0] == input_name.split("_")[0]
+            if not is_same_kind or logs[0].units[name] != logs[0].units[input_name]:
+                continue
+            input_values = np.concatenate([log[input_name] for log in logs])
+            if _are_duplicates(values, input_values):
+                unexcited[name] = (
+                    f"{name} moves as {input_name} does: values that do not are flagged as outside"
+                )
+                break
+    return unexcited
 
 
 def _is_actuator_name(name: str, draft_notes: DraftNotes) -> bool:

@@ -77,7 +77,7 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
     """
     task, fit_config = (None, None) if config is None else _load_logs_task(config)
     inputs, masks = (
-        (fit_config.signals.input_columns, fit_config.prepare.masks)
+        (fit_config.signals.regressor_columns, fit_config.prepare.masks)
         if fit_config is not None
         else (None, ())
     )

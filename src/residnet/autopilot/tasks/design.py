@@ -37,6 +37,7 @@ from residnet.io.drafting.questions import DraftNotes
 from residnet.io.drafting.reading import find_log_files, read_drafted
 from residnet.preprocessing.channel_values import estimate_noise_std
 from residnet.preprocessing.motion import MotionConfig, complete_motion
+from residnet.quality.feedback import detect_feedback
 from residnet.tasks.registry import open_finished_task
 
 _RUDDER_CHANNELS = ("cmd_delta", "delta")
@@ -75,7 +76,8 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
         longest_delay: largest delay of the search, in s.
 
     Raises:
-        DataError: if a log lacks the channels, or the rudder is nearly constant.
+        DataError: if a log lacks the channels, the rudder is nearly constant, or a controller set
+            it without independent excitation, so that K and T cannot be identified.
         FitError: if no response to the rudder is found.
     """
     if not logs:
@@ -89,6 +91,7 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
             f"steering: the rudder of the logs varies by only {max_rudder_std:.2g} rad (rms);"
             " K and T need turns, such as a zigzag"
         )
+    _require_excitation(logs, records)
     logs_with_motion = [
         complete_motion(log, MotionConfig()) if {"x", "y", "psi"} <= log.channels.keys() else log
         for log in logs
@@ -102,6 +105,31 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
         float(np.median([record.dt for record in records])),
         max(float(np.abs(record.rudder).max()) for record in records),
     )
+
+
+def _require_excitation(logs: Sequence[Log], records: Sequence[ManoeuvreRecord]) -> None:
+    """Refuse a rudder that a controller set from the heading, without steps or manoeuvres.
+
+    Raises:
+        DataError: where feedback explains the rudder beyond its effect on the yaw rate.
+    """
+    signals = []
+    for log, record in zip(logs, records, strict=True):
+        heading = np.cumsum(record.yaw_rate) * record.dt
+        if "psi" in log.channels and np.isfinite(log["psi"]).sum() > _MIN_SAMPLES:
+            is_finite = np.isfinite(log["psi"])
+            grid = log.t[0] + record.dt * np.arange(len(record.rudder))
+            heading = np.interp(grid, log.t[is_finite], np.unwrap(log["psi"][is_finite]))
+        signals.append({"psi": heading, "r": record.yaw_rate, "rudder": record.rudder})
+    step = float(np.median([record.dt for record in records]))
+    for feedback in detect_feedback(signals, ("rudder",), step):
+        if feedback.is_closed_loop:
+            raise DataError(
+                "steering: a controller set the rudder: feedback from the heading explains"
+                f" {100 * feedback.share:.0f} % of what the yaw rate does not, so that K and T"
+                " cannot be identified; log a zigzag, 3-2-1-1 or steps of the course, or give K"
+                " and T, such as 0.12,18"
+            )
 
 
 def _estimate_noise(logs: Sequence[Log], name: str) -> float:

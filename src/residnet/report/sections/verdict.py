@@ -90,6 +90,7 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
         quality_summary,
         protocol,
         next((finding["text"] for finding in one_sided_findings if finding["level"] != "note"), ""),
+        run.read_json("excitation.json"),
     )
 
 

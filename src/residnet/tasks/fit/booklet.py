@@ -145,7 +145,7 @@ def _build_craft(
     spec = fitted_model.spec
     model = fitted_model.model.double()
     gear = GivenActuators(inputs, spec.signals.exogenous, spec.dt)
-    actuated = ActuatedDynamics(model, spec.signals.input_columns, spec.hold, gear)
+    actuated = ActuatedDynamics(model, spec.signals.regressor_columns, spec.hold, gear)
     start = actuated.make_initial_state(1)
     for name, value in config.initial.items():
         if name not in actuated.state_names:

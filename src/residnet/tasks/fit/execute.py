@@ -19,6 +19,7 @@ from residnet.evaluation.goodness import build_goodness_file
 from residnet.evaluation.soundness import build_sanity_file
 from residnet.evaluation.verdict import list_model_objections, rate_model, write_verdict
 from residnet.export.vessel import ExportedVessel
+from residnet.identification.excitation import assess_excitation
 from residnet.identification.fit import fit_models
 from residnet.identification.identified import (
     build_goodness_rows,
@@ -89,6 +90,12 @@ def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
     log_message(f"  selected: {selection.selected}{predictor_text}")
     folder.write_record(folder.selection, selection.to_record())
     folder.write_record(folder.sanity, build_sanity_file(identified_models.sanity_findings))
+    folder.write_record(
+        folder.excitation,
+        assess_excitation(
+            logs, config.signals, time_step, fitted_models[0].spec.domain, config.name
+        ),
+    )
     names = (selection.selected, selection.selected_ensemble, selection.default_model)
     write_evaluation(folder, config, evaluations, names, logs)
     for table_path, result_table in {
@@ -173,6 +180,7 @@ def evaluate_on_logs(
         for source_path, target_path in (
             (run.bands, folder.bands),
             (run.selection, folder.selection),
+            (run.excitation, folder.excitation),
         ):
             if source_path.is_file():
                 folder.write(target_path, source_path.read_text(encoding="utf-8"))

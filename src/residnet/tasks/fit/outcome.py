@@ -50,7 +50,7 @@ def write_inspection(
     )
 
     begin_stage("examining logs")
-    inputs = config.signals.input_columns
+    inputs = config.signals.regressor_columns
     masks = (*config.prepare.masks, SpikeMask())
     logs = [log for members in splits.values() for log in members]
     split_of = {log.name: split for split, members in splits.items() for log in members}

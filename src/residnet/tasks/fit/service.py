@@ -498,10 +498,13 @@ class NextTrials:
     Attributes:
         model: name of the refitted baseline.
         plan: candidate and selected trials.
+        missing_excitation: for each input or direction that the training logs do not excite, a
+            sentence on the trial that would excite it.
     """
 
     model: str
     plan: TrialPlan
+    missing_excitation: tuple[str, ...] = ()
 
     @property
     def table(self) -> Table:
@@ -541,8 +544,8 @@ class NextTrials:
         )
 
     def to_text(self) -> str:
-        """Return the table and the recommendation as text."""
-        return f"{self.table.to_text()}\n{self.recommendation}"
+        """Return the table, the recommendation and what no trial has excited as text."""
+        return "\n".join((self.table.to_text(), self.recommendation, *self.missing_excitation))
 
     def write_files(self, folder: Path) -> list[Path]:
         """Write the selected manoeuvres as YAML, tracks as CSV, and a page; returns the files."""
@@ -582,7 +585,8 @@ class NextTrials:
         )
         table = Section("Candidates", [self.table], is_folded=True)
         about = f"For {self.model}."
-        page = write_page(folder, "Next trials", about, [self.recommendation], [shown, table])
+        summary = [self.recommendation, *self.missing_excitation]
+        page = write_page(folder, "Next trials", about, summary, [shown, table])
         return [trials, tracks, page]
 
 
@@ -639,4 +643,38 @@ def plan_next_trials(
             trial_limits,
             goal,
         ),
+        advise_excitation(
+            run.read_excitation(),
+            [name for name in input_shares if input_shares[name].steer],
+        ),
     )
+
+
+def advise_excitation(
+    excitation: Mapping[str, Any], steering_inputs: Sequence[str]
+) -> tuple[str, ...]:
+    """Return a sentence for each input or direction that the training logs do not excite.
+
+    Args:
+        excitation: contents of excitation.json; may be empty.
+        steering_inputs: names of the inputs that steer.
+    """
+    sentences = []
+    for row in excitation.get("inputs") or []:
+        name = row["name"]
+        if row["state"] == "excited":
+            continue
+        manoeuvre = (
+            "a zigzag, a 3-2-1-1 or random steps in open loop"
+            if name in steering_inputs
+            else "steps between at least three levels"
+        )
+        sentences.append(f"Not excited: {row['text']}; run {manoeuvre} of {name}.")
+    for row in excitation.get("directions") or []:
+        if not row["is_excited"]:
+            first, second = row["inputs"]
+            sentences.append(
+                f"Not excited: {row['name']}; run steps of {first} and {second} independent of"
+                " each other."
+            )
+    return tuple(sentences)

@@ -211,7 +211,9 @@ def _build_model_craft(
         )
     # a learned model has no input for wave loads
     wind_only = programme.disturbance.model_copy(update={"waves": None})
-    actuated = ActuatedDynamics(model.double(), spec.signals.input_columns, spec.hold, actuators)
+    actuated = ActuatedDynamics(
+        model.double(), spec.signals.regressor_columns, spec.hold, actuators
+    )
     logged_channels = (
         *actuated.state_names,
         *actuators.input_names[: actuators.n_commands],

@@ -405,7 +405,7 @@ class AutopilotConfig(PackageTask, ComputingTask):
             / "models"
             / resolve_model_name(learned_config.run, learned_config.model)
         )
-        return SteeredModel(model, spec.signals.input_columns, spec.hold, self.steered_vessel)
+        return SteeredModel(model, spec.signals.regressor_columns, spec.hold, self.steered_vessel)
 
     def with_scaled_times(self) -> AutopilotConfig:
         """Return the config with its times multiplied by its pace, the pace itself being one.

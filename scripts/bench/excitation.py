@@ -1,0 +1,144 @@
+"""Does a verdict of "good" hold in open loop, and does `outside` flag what logs did not excite?
+
+    python scripts/bench/excitation.py [--kinds pid alike ...] [--seed 101] [--effort 0.1]
+
+For each kind of boat of `excitation_boats.py`, logs are written, drafted by `residnet new` and
+fitted by `residnet run`. The predictor then predicts windows of 10 s of new logs of the same kind,
+and of open-loop flights whose inputs step by themselves within the logged range of each. Printed
+for each kind: the level, the states of the inputs, the share of steps flagged as outside in both
+sets, and of the open-loop windows inside the domain (less than a tenth of the steps flagged) the
+share whose error of position or heading exceeds the prediction interval.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import bench
+import excitation_boats as boats
+import numpy as np
+import torch
+
+from residnet.dynamics.store import ModelSpec, load_model, resolve_model_name
+from residnet.export.guard import GuardedDynamics
+from residnet.report.run_reader import RunFiles
+from residnet.report.sections.verdict import verdict_level
+
+_HORIZON = 10.0
+_HISTORY = 2.0
+_N_NEW_LOGS = 4
+_N_FLIGHTS = 8
+
+
+def run_residnet(*arguments: str, folder: Path) -> str:
+    """Run a command of residnet in a folder; return what it printed."""
+    command = [sys.executable, "-m", "residnet", *arguments]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(arguments)}: {done.stderr.strip() or done.stdout.strip()}")
+    return done.stdout
+
+
+def read_table(path: Path) -> np.ndarray:
+    """Read a table of a boat in SI units and rad [T, c]."""
+    table = np.genfromtxt(path, delimiter=",", skip_header=1)
+    table[:, [3, 6, -1]] = np.radians(table[:, [3, 6, -1]])
+    table[:, 3] = np.unwrap(table[:, 3])
+    return table
+
+
+def input_columns(spec: ModelSpec, header: list[str]) -> list[int]:
+    """Return the column of each input of a model in the tables of a boat."""
+    names = [name.removesuffix("_rps").removesuffix("_deg") for name in header]
+    return [names.index(name) for name in spec.signals.input_columns]
+
+
+def judge(
+    spec: ModelSpec, guarded: GuardedDynamics, table: np.ndarray, columns: list[int]
+) -> tuple[np.ndarray, list[bool]]:
+    """Return the flags of all steps of measured samples, and of windows inside whether they fail.
+
+    Returns:
+        Flags [T], and for each window inside the domain whether its error at the end exceeds the
+        prediction interval of position or heading.
+    """
+    y = torch.from_numpy(table[:, 1:7])
+    w = torch.from_numpy(table[:, columns])
+    w = torch.cat((0.5 * (w[1:] + w[:-1]), w[-1:])) if spec.hold == "mean" else w
+    with torch.no_grad():
+        flags = guarded.replace_bad_inputs(y, w, torch.zeros(len(y), guarded.n_state).to(y))[3]
+    steps = round(_HORIZON / spec.dt)
+    past = round(_HISTORY / spec.dt)
+    assert spec.band is not None
+    widths = {
+        name: float(np.interp(steps, spec.band.steps, getattr(spec.band, name)))
+        for name in ("heading", "position")
+    }
+    failures = []
+    for start in range(past, len(table) - steps, steps):
+        x = y[start : start + 1].clone()
+        # one noisy sample is a worse initial state than a local line
+        fit = np.polyfit(np.arange(-5, 6), table[start - 5 : start + 6, 1:7], 1)
+        x[0] = torch.from_numpy(fit[1])
+        s = guarded.warmup(y[None, start - past : start], w[None, start - past : start])
+        n_outside = 0
+        with torch.no_grad():
+            for k in range(start, start + steps):
+                x, s, outside = guarded.flagged_step(x, w[k : k + 1], s)
+                n_outside += int(outside.any())
+        if n_outside > 0.1 * steps:
+            continue
+        end = table[start + steps]
+        position_error = float(np.hypot(x[0, 0] - end[1], x[0, 1] - end[2]))
+        heading_error = abs((float(x[0, 2]) - end[3] + np.pi) % (2 * np.pi) - np.pi)
+        failures.append(position_error > widths["position"] or heading_error > widths["heading"])
+    return flags.numpy(), failures
+
+
+def main() -> None:
+    """Print the table."""
+    options = bench.options(__doc__, kinds=dict.fromkeys(boats.KINDS), seed=101, effort=0.1, out="")
+    root = Path(options.out or tempfile.mkdtemp())
+    print("kind          level     flagged: same kind, open loop   failed inside   inputs")
+    for number, kind in enumerate(options.kinds):
+        began = time.process_time()
+        seed = options.seed + number
+        folder = root / f"{kind}_{seed}"
+        boat = boats.write_logs(kind, seed, folder / "log")
+        run_residnet("new", "log", "--out", "boat.yaml", folder=folder)
+        run_residnet(
+            "run", "boat.yaml", "-s", f"effort={options.effort}", "--out", "run", folder=folder
+        )
+        run = RunFiles(folder / "run")
+        spec, model = load_model(run.path / "models" / resolve_model_name(run.path, "predictor"))
+        guarded = GuardedDynamics(model.double(), spec).double().eval()
+        columns = input_columns(spec, boats.log_header(boat))
+        logs = [read_table(path) for path in sorted((folder / "log").glob("*.csv"))]
+        fresh = []
+        for k in range(_N_NEW_LOGS):
+            rows = boats.sail(boat, boats.KINDS[kind][1](boat), 100.0)[100:]
+            boats.write_table(folder / "fresh" / f"{k}.csv", boat, rows)
+            fresh.append(judge(spec, guarded, read_table(folder / "fresh" / f"{k}.csv"), columns))
+        flown = []
+        for k, rows in enumerate(boats.open_loop_flights(boat, logs, _N_FLIGHTS)):
+            boats.write_table(folder / "open" / f"{k}.csv", boat, rows)
+            flown.append(judge(spec, guarded, read_table(folder / "open" / f"{k}.csv"), columns))
+        shares = [np.concatenate([flags for flags, _ in part]).mean() for part in (fresh, flown)]
+        failed = [failure for _, failures in flown for failure in failures]
+        excitation = json.loads((run.path / "excitation.json").read_text())
+        states = ", ".join(f"{row['name']} {row['state']}" for row in excitation["inputs"])
+        failed_share = f"{np.mean(failed):.0%} of {len(failed)}" if failed else "none inside"
+        print(
+            f"{kind:13s} {verdict_level(run):9s} {shares[0]:9.1%} {shares[1]:9.1%}"
+            f"   {failed_share:>16s}   {states} ({time.process_time() - began:.0f} s)",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

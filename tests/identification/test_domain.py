@@ -1,0 +1,114 @@
+"""Operating domain and excitation from training logs."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from steered_logs import Steering, steered_log
+
+from residnet.core.layout import SURGE_SWAY_YAW
+from residnet.dynamics.domain import DomainCheck
+from residnet.dynamics.domain_config import (
+    MAX_TABLE_BYTES,
+    OperatingDomain,
+)
+from residnet.identification.domain import estimate_domain
+from residnet.identification.excitation import assess_excitation
+from residnet.physics.signals_config import SignalsConfig
+
+STATES = ("x", "y", "psi", "u", "v", "r")
+
+
+def prepared(log: Any, names: tuple[str, ...], **added: np.ndarray) -> Any:
+    """A prepared log with what the domain reads."""
+    channels = {**log.channels, **added}
+    y = np.stack([channels[name] for name in STATES], axis=1)
+    w = np.stack([channels[name] for name in names], axis=1)
+    usable = np.ones(len(y), dtype=bool)
+    return SimpleNamespace(y=y, smoothed=y, w=w, usable=usable, dof=SURGE_SWAY_YAW)
+
+
+def flagged(domain: OperatingDomain, log: Any, names: tuple[str, ...]) -> float:
+    """Return the share of samples outside the domain."""
+    check = DomainCheck(domain, STATES, names, torch.float64)
+    return float((~check(torch.from_numpy(log.y), torch.from_numpy(log.w))).double().mean())
+
+
+def logs_of(steering: Steering, seeds: range, names: tuple[str, ...] = ("delta",)) -> list[Any]:
+    return [prepared(steered_log(steering, seed), names) for seed in seeds]
+
+
+def test_new_logs_of_the_same_kind_are_inside() -> None:
+    signals = SignalsConfig(inputs=("delta",))
+    domain = estimate_domain(logs_of("steps", range(6)), signals, 0.1)
+    assert domain.channels == ("u", "v", "r", "delta")
+    assert domain.degree == 2
+    assert 8 * len(domain.factor) <= MAX_TABLE_BYTES
+    shares = [flagged(domain, log, ("delta",)) for log in logs_of("steps", range(10, 16))]
+    assert np.mean(shares) < 0.02
+
+
+def test_open_loop_is_outside_of_logs_of_a_controller() -> None:
+    signals = SignalsConfig(inputs=("delta",))
+    domain = estimate_domain(logs_of("controller", range(6)), signals, 0.1)
+    assert [one.kind for one in domain.relations] == ["feedback"]
+    same = [flagged(domain, log, ("delta",)) for log in logs_of("controller", range(10, 14))]
+    assert np.mean(same) < 0.03
+    driven = [flagged(domain, log, ("delta",)) for log in logs_of("steps", range(4))]
+    assert np.mean(driven) > 0.9
+
+
+def test_inputs_that_were_held_or_alike_have_a_relation() -> None:
+    random = np.random.default_rng(0)
+    names = ("n_port", "delta", "n_stbd", "trim")
+    signals = SignalsConfig(inputs=("n_port", "delta"), unexcited=("n_stbd", "trim"))
+    logs = []
+    for seed in range(4):
+        log = steered_log("steps", seed)
+        n = np.repeat(random.uniform(6, 14, 30), 100)
+        logs.append(prepared(log, names, n_port=n, n_stbd=n, trim=np.full(3000, 0.1)))
+    domain = estimate_domain(logs, signals, 0.1)
+    assert [(one.input, one.kind) for one in domain.relations] == [
+        ("n_stbd", "proportional"),
+        ("trim", "held"),
+    ]
+    assert flagged(domain, logs[0], names) < 0.02
+    turned = prepared(
+        steered_log("steps", 0),
+        names,
+        n_port=logs[0].w[:, 0],
+        n_stbd=logs[0].w[:, 0] + 2.0,
+        trim=np.full(3000, 0.1),
+    )
+    assert flagged(domain, turned, names) == 1.0
+    file = assess_excitation({"train": logs}, signals, 0.1, domain, "test")
+    assert {row.name: row.state for row in file.inputs} == {
+        "n_port": "excited",
+        "delta": "excited",
+    }
+    assert [row.text for row in file.directions if not row.is_excited] == [
+        "differential thrust of n_port and n_stbd: not excited"
+    ]
+
+
+def test_inputs_without_excitation_have_a_state() -> None:
+    random = np.random.default_rng(0)
+    names = ("n", "n_copy", "trim", "delta")
+    logs = []
+    for seed in range(4):
+        n = np.repeat(random.uniform(6, 14, 30), 100)
+        noisy = n + 0.01 * random.standard_normal(3000)
+        log = steered_log("controller", seed)
+        logs.append(prepared(log, names, n=n, n_copy=noisy, trim=np.full(3000, 0.1)))
+    signals = SignalsConfig(inputs=names)
+    file = assess_excitation({"train": logs, "test": logs}, signals, 0.1, None, "test")
+    assert {row.name: row.state for row in file.inputs} == {
+        "n": "collinear",
+        "n_copy": "collinear",
+        "trim": "held",
+        "delta": "feedback",
+    }
+    assert file.closed_loop_test_inputs == ("delta",)
