@@ -137,7 +137,7 @@ def test_vessels_without_planes_and_mixed_axes_are_refused() -> None:
         ({"test": {**given["test"], "depth": None}}, "conditions.stated.depth"),
         ({"policies": {"learned": {"start": None}}}, "a depth policy begins with a peer"),
         ({"policies": {"learned": {"start": "pid"}}}, "or of kind depth with such a pitch"),
-        ({"pace": 2.0}, "leave out 'predictive' and 'pace'"),
+        ({"pace": 2.0}, "remove 'predictive' and 'pace'"),
     ):
         with pytest.raises(ValidationError, match=message):
             AutopilotConfig.model_validate({**given, **change})
