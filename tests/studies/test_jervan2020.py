@@ -334,7 +334,7 @@ def test_constant_force_needs_a_vessel_that_turns() -> None:
     force = torch.tensor([200.0, 100.0], dtype=torch.float64)
     y = x @ torch.randn(4, 3, generator=random, dtype=torch.float64) + earthly @ force
     torch.testing.assert_close(estimate_earth_force(x, y, earthly), force, rtol=1e-8, atol=1e-6)
-    with pytest.raises(FitError, match="kept its heading"):
+    with pytest.raises(FitError, match="heading hardly changed"):
         estimate_earth_force(x, y, earthly[:1].expand(500, 3, 2))
 
 

@@ -83,7 +83,7 @@ def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
     assert rows["rbf_joint", "test"]["v"] == pytest.approx(9 / 16 - 1)
     assert isinstance(errors, Table)
     cells = {(row.label, row.cells[0].text): row.cells for row in errors.rows}
-    shown = cells["polynomial p = 2, together", "test"][1]
+    shown = cells["polynomial p = 2, joint tuning", "test"][1]
     assert shown == Cell("0.0700", "0.0700 to 0.0700; published 0.2249")
     assert isinstance(figure, Figure)
     assert figure.static_images[0].stat().st_size > 10_000
