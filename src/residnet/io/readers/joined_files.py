@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import Seconds
 from residnet.core.errors import DataError, ResidnetError
+from residnet.core.frames import unwrap_angle
 from residnet.core.log import Level, Log, Remark, make_remark
 from residnet.core.names import STATE_NAMES
 from residnet.io.readers.base import ConfiguredReader, hash_files, require_file
@@ -25,6 +26,7 @@ from residnet.io.readers.tables import (
 )
 from residnet.io.readers.timestamps import detect_unix_unit
 from residnet.preprocessing.align import GridConfig, resample_at
+from residnet.preprocessing.compatibility.clock import ClockEstimate, estimate_clock_from_rate
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.preprocessing.statistics import OverlappingBlocks
 
@@ -39,6 +41,10 @@ _MIN_ALTERNATIVE_OFFSET = 3.0
 """Smallest distance in s of an alternative offset from the optimum."""
 _BLOCK_SECONDS = 2.5
 """Length in s of the blocks whose change of velocity is explained; derivatives are too noisy."""
+_MIN_TURN_MARGIN = 8.0
+"""Smallest log-likelihood ratio of an offset from turns to the next best one."""
+_MIN_TURN_CORRELATION = 0.7
+"""Smallest correlation of a yaw rate with the derivative of the heading on another clock."""
 _MAX_SAMPLES = 3000
 """Largest number of samples of the motion for the search."""
 
@@ -164,10 +170,7 @@ class JoinedConfig(ConfiguredReader):
                 f"log {log.name}: the channels {', '.join(other_log.channels)} of {part_name} exist"
                 " already; leave this part out"
             )
-        shift, offset_remark = self._choose_clock_offset(
-            log, other_log.replace(channels=new_channels), part_name
-        )
-        t = other_log.t + shift
+        t, offset_remark = self._convert_times(log, other_log, new_channels, part_name)
         step = float(np.median(np.diff(log.t)))
         in_overlap = (log.t >= t[0]) & (log.t <= t[-1])
         if in_overlap.sum() < 2:
@@ -192,26 +195,68 @@ class JoinedConfig(ConfiguredReader):
             meta={**log.meta, "findings": findings},
         )
 
+    def _convert_times(
+        self,
+        log: Log,
+        other_log: Log,
+        new_channels: Mapping[str, np.ndarray],
+        part_name: str,
+    ) -> tuple[np.ndarray, Remark]:
+        """Return the times [T] of another log on the clock of the log with the motion.
+
+        The offset is as configured, or follows from a heading and a yaw rate in different files,
+        from dates, or from the accelerations that the commands explain.
+
+        Args:
+            log: log with the motion.
+            other_log: log of another part.
+            new_channels: channels of the other log that the log lacks.
+            part_name: name of this part.
+
+        Returns:
+            The times, and a remark about their source.
+        """
+        configured_shift = self.shift.get(part_name)
+        if configured_shift is not None:
+            text = f"{part_name}: clock offset {configured_shift:g} s (configured)"
+            return other_log.t + configured_shift, make_remark("note", "joined", text)
+        date_offset = _offset_from_dates(log, other_log)
+        turn_estimate = estimate_clock_from_turns(log, other_log)
+        if turn_estimate is not None:
+            text = (
+                f"{part_name}: clock offset {turn_estimate.seconds:+.3f} s, standard error"
+                f" {turn_estimate.standard_error:.2g} s, from yaw rate against heading (correlation"
+                f" {turn_estimate.correlation:.3f}, margin to the next best offset"
+                f" {turn_estimate.margin:.0f})"
+            )
+            if abs(turn_estimate.drift) > 1e-5:
+                text += f", drift {1e6 * turn_estimate.drift:+.0f} ppm"
+            difference = 0.0 if date_offset is None else date_offset - turn_estimate.seconds
+            if abs(difference) > _COARSE_STEP:
+                text += f"; the dates of both files differ from it by {difference:+.2f} s"
+            figures = turn_estimate._asdict()
+            remark = make_remark("note", "joined", text, **figures)
+            return turn_estimate.convert_times(other_log.t), remark
+        shift, remark = self._choose_clock_offset(
+            log, other_log.replace(channels=dict(new_channels)), part_name, date_offset
+        )
+        return other_log.t + shift, remark
+
     def _choose_clock_offset(
-        self, log: Log, other_log: Log, part_name: str
+        self, log: Log, other_log: Log, part_name: str, date_offset: float | None
     ) -> tuple[float, Remark]:
-        """Choose the offset between two clocks: as configured, from dates, or estimated.
+        """Choose the offset between two clocks from dates, or estimate it.
 
         Args:
             log: log with the motion.
             other_log: log of another part.
             part_name: name of this part.
+            date_offset: offset from the dates of both logs; None if they have none.
 
         Returns:
             The time in s to add to the other clock, and a remark, which is a warning if the offset
             is ambiguous or contradicts the dates.
         """
-        configured_shift = self.shift.get(part_name)
-        if configured_shift is not None:
-            return configured_shift, make_remark(
-                "note", "joined", f"{part_name}: clock offset {configured_shift:g} s (configured)"
-            )
-        date_offset = _offset_from_dates(log, other_log)
         advice = f"set `shift: {{{part_name}: ...}}`"
         try:
             estimate = estimate_clock_offset(log, other_log)
@@ -271,6 +316,38 @@ def _offset_from_dates(log: Log, other_log: Log) -> float | None:
     if not other_log.t[0] - other_log.t[-1] < epoch_difference < log.t[-1] - log.t[0]:
         return None
     return epoch_difference + float(log.t[0] - other_log.t[0])
+
+
+def estimate_clock_from_turns(log: Log, other_log: Log) -> ClockEstimate | None:
+    """Estimate the time to add to another clock if both logs have a heading or a yaw rate.
+
+    Returns:
+        The estimate; None without these channels, or if the turns do not determine the offset.
+    """
+    if not ({"psi", "r"} & log.channels.keys() and {"psi", "r"} & other_log.channels.keys()):
+        return None
+    heading = unwrap_angle(log["psi"]) if "psi" in log.channels else _integrate(log.t, log["r"])
+    if "r" in other_log.channels:
+        yaw_rate = other_log["r"]
+    else:
+        yaw_rate = np.gradient(unwrap_angle(other_log["psi"]), other_log.t)
+    estimate = estimate_clock_from_rate(log.t, heading, other_log.t, yaw_rate)
+    if (
+        estimate is None
+        or estimate.margin < _MIN_TURN_MARGIN
+        or abs(estimate.correlation) < _MIN_TURN_CORRELATION
+    ):
+        return None
+    return estimate
+
+
+def _integrate(t: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Return the integral [T] of a rate over time, across gaps by linear interpolation."""
+    is_finite = np.isfinite(rate)
+    if is_finite.sum() < 2:
+        return np.full(t.size, np.nan)
+    gap_free = np.interp(t, t[is_finite], rate[is_finite])
+    return np.append(0.0, np.cumsum(0.5 * np.diff(t) * (gap_free[1:] + gap_free[:-1])))
 
 
 def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:

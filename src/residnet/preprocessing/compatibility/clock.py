@@ -1,0 +1,235 @@
+"""Estimate the offset between two clocks from a heading on one and a yaw rate on the other.
+
+The derivative of the heading is cross-correlated with the yaw rate over all offsets. Around the
+maximum the heading is regressed on the integral of the yaw rate, with the offset, the drift, and
+bias and scale of the gyro as parameters. Nothing is assumed about the vessel.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from residnet.preprocessing.derivatives import fit_local_polynomials
+
+_GRID_STEP = 0.1
+"""Step in s of the offsets of the cross-correlation; doubled for long recordings."""
+_MAX_GRID_SAMPLES = 200_000
+"""Largest number of grid samples of a recording."""
+_MIN_OVERLAP = 0.4
+"""Smallest overlap, as a share of the shorter recording."""
+_HEADING_WINDOW_SECONDS = 1.0
+"""Window in s of the local parabolas that differentiate the heading."""
+_EXCLUDED_SECONDS = 1.0
+"""Distance in s from the optimum within which an offset is no alternative."""
+_MAX_ITERATIONS = 30
+_KNOT_SECONDS = 10.0
+_MAX_KNOTS = 60
+"""Distance and largest number of the knots of the random walk between heading and integral."""
+_MAX_GAPS = 10
+"""Largest number of gaps of the yaw rate across which its integral may jump."""
+_STUDENT_DOF = 5.0
+"""Degrees of freedom of the residuals' Student distribution, robust against outliers."""
+_N_SECTIONS = 20
+"""Number of sections of the sandwich covariance, because residuals are correlated."""
+_MIN_DRIFT_SECONDS = 600.0
+"""Smallest overlap in s over which a drift of the clock is estimated."""
+
+
+class ClockEstimate(NamedTuple):
+    """Estimated offset between two clocks.
+
+    Attributes:
+        seconds: time in s to add to the clock of the yaw rate, at the middle of the overlap.
+        standard_error: standard error of the offset in s.
+        drift: share by which the clock of the yaw rate runs slow; 0 if it was not estimated.
+        middle: time in the middle of the overlap in s, on the clock of the heading.
+        correlation: correlation of the yaw rate with the derivative of the heading.
+        margin: logarithm of the likelihood ratio to the best offset farther than one second away,
+            per 2 s of the overlap: neighbouring samples of a yaw rate are not independent.
+    """
+
+    seconds: float
+    standard_error: float
+    drift: float
+    middle: float
+    correlation: float
+    margin: float
+
+    def convert_times(self, t: np.ndarray) -> np.ndarray:
+        """Return times [T] of the clock of the yaw rate on the clock of the heading."""
+        return np.asarray(t + self.seconds + self.drift * (t + self.seconds - self.middle))
+
+
+def estimate_clock_from_rate(
+    heading_times: np.ndarray, heading: np.ndarray, rate_times: np.ndarray, yaw_rate: np.ndarray
+) -> ClockEstimate | None:
+    """Estimate the time to add to the clock of a gyro so that it follows a heading.
+
+    Args:
+        heading_times: [T] in s, increasing.
+        heading: [T] in rad, unwrapped; NaN for missing values.
+        rate_times: [K] in s, increasing.
+        yaw_rate: [K], of any scale and sign; NaN for missing values.
+
+    Returns:
+        The estimate; None if there are too few values or no turns.
+    """
+    has_heading = np.isfinite(heading) & np.isfinite(heading_times)
+    has_rate = np.isfinite(yaw_rate) & np.isfinite(rate_times)
+    if min(int(has_heading.sum()), int(has_rate.sum())) < 50:
+        return None
+    heading_times = heading_times[has_heading]
+    heading = heading[has_heading]
+    rate_times = rate_times[has_rate]
+    yaw_rate = yaw_rate[has_rate]
+    coarse = _correlate_rates(heading_times, heading, rate_times, yaw_rate)
+    return coarse and _refine_offset(coarse, heading_times, heading, rate_times, yaw_rate)
+
+
+def _correlate_rates(
+    heading_times: np.ndarray, heading: np.ndarray, rate_times: np.ndarray, yaw_rate: np.ndarray
+) -> ClockEstimate | None:
+    """Maximise the normalised cross-correlation over all offsets with sufficient overlap."""
+    durations = (heading_times[-1] - heading_times[0], rate_times[-1] - rate_times[0])
+    step = max(_GRID_STEP, float(np.median(np.diff(heading_times))) / 2.0)
+    step = max(step, float(max(durations)) / _MAX_GRID_SAMPLES)
+    grids = (
+        np.arange(heading_times[0], heading_times[-1], step),
+        np.arange(rate_times[0], rate_times[-1], step),
+    )
+    window = max(5, 2 * round(0.5 * _HEADING_WINDOW_SECONDS / step) + 1)
+    if min(grids[0].size, grids[1].size) < 3 * window:
+        return None
+    resampled_heading = np.interp(grids[0], heading_times, heading)[:, None]
+    reference = fit_local_polynomials(resampled_heading, window, 2, step)[1][:, 0]
+    signal = np.interp(grids[1], rate_times, yaw_rate)
+    reference = reference - reference.mean()
+    signal = signal - signal.mean()
+    size = 1 << (reference.size + signal.size - 1).bit_length()
+
+    def correlate(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Return the sum of first[i + lag] second[i] for each lag modulo the size."""
+        spectrum = np.fft.rfft(first, size) * np.conj(np.fft.rfft(second, size))
+        return np.asarray(np.fft.irfft(spectrum, size))
+
+    in_reference = np.ones(reference.size)
+    in_signal = np.ones(signal.size)
+    counts = np.maximum(correlate(in_reference, in_signal), 1.0)
+    reference_sum = correlate(reference, in_signal)
+    signal_sum = correlate(in_reference, signal)
+    reference_energy = correlate(reference**2, in_signal) - reference_sum**2 / counts
+    signal_energy = correlate(in_reference, signal**2) - signal_sum**2 / counts
+    product = correlate(reference, signal) - reference_sum * signal_sum / counts
+    # a stretch of the overlap without turns has no energy and decides nothing
+    floor = 1e-6 * float(reference @ reference) * float(signal @ signal)
+    if floor <= 0.0:
+        return None
+    correlation = product / np.sqrt(np.maximum(reference_energy * signal_energy, floor))
+    correlation = np.clip(correlation, -0.9999, 0.9999)
+    has_overlap = counts >= _MIN_OVERLAP * min(reference.size, signal.size)
+    # log-likelihood ratio of a regression with this correlation: longer overlaps are surer
+    independent_share = min(step / 2.0, 1.0)
+    scores = -0.5 * independent_share * counts * np.log(1.0 - correlation**2) * has_overlap
+    best = int(np.argmax(scores))
+    lags = np.arange(size)
+    lags = np.where(lags < reference.size, lags, lags - size)
+    is_distant = np.abs(lags - lags[best]) * step > _EXCLUDED_SECONDS
+    margin = float(scores[best] - scores[is_distant].max(initial=0.0))
+    seconds = float(grids[0][0] + lags[best] * step - grids[1][0])
+    return ClockEstimate(seconds, step, 0.0, 0.0, float(correlation[best]), margin)
+
+
+def _refine_offset(
+    coarse: ClockEstimate,
+    heading_times: np.ndarray,
+    heading: np.ndarray,
+    rate_times: np.ndarray,
+    yaw_rate: np.ndarray,
+) -> ClockEstimate:
+    """Refine an offset by regressing the heading on the shifted integral of the yaw rate.
+
+    Args:
+        coarse: result of the cross-correlation.
+        heading_times: [T] in s.
+        heading: [T] in rad.
+        rate_times: [K] in s.
+        yaw_rate: [K].
+
+    Returns:
+        The refined estimate; the coarse one if the regression does not converge near it.
+    """
+    half_steps = 0.5 * np.diff(rate_times)
+    integral = np.append(0.0, np.cumsum(half_steps * (yaw_rate[1:] + yaw_rate[:-1])))
+    start = max(heading_times[0], rate_times[0] + coarse.seconds)
+    stop = min(heading_times[-1], rate_times[-1] + coarse.seconds)
+    middle = 0.5 * float(start + stop)
+    in_overlap = (heading_times > start + 1.0) & (heading_times < stop - 1.0)
+    # a heading within a gap of the yaw rate would be compared with an interpolated integral
+    intervals = np.diff(rate_times)
+    next_sample = np.searchsorted(rate_times, heading_times - coarse.seconds).clip(
+        1, rate_times.size - 1
+    )
+    max_interval = 3.5 * float(np.median(intervals)) + 1e-9
+    in_overlap &= intervals[next_sample - 1] < max_interval
+    t = heading_times[in_overlap]
+    # the integral of the gyro's noise is a random walk: a piecewise linear function absorbs it
+    n_knots = int(np.clip((stop - start) / _KNOT_SECONDS, 2, _MAX_KNOTS))
+    knots = np.linspace(start, stop, n_knots)
+    walk = np.maximum(1.0 - np.abs(t[:, None] - knots) / (knots[1] - knots[0]), 0.0)
+    # the integral over a gap is unknown: one step at each of the longest gaps
+    longest_gaps = np.argsort(intervals)[-_MAX_GAPS:]
+    gap_times = rate_times[longest_gaps[intervals[longest_gaps] >= max_interval]] + coarse.seconds
+    nuisance = np.column_stack((walk, (t[:, None] > gap_times).astype(np.float64)))
+    response = heading[in_overlap]
+    if t.size < 30:
+        return coarse
+    seconds = coarse.seconds
+    has_drift = bool(stop - start > _MIN_DRIFT_SECONDS)
+    drift = 0.0
+    weights = np.ones(t.size)
+    columns = np.zeros((t.size, 0))
+    residual = response
+    for _ in range(_MAX_ITERATIONS):
+        shifted = t - seconds - drift * (t - middle)
+        rate = np.interp(shifted, rate_times, yaw_rate)
+        columns = np.column_stack((np.interp(shifted, rate_times, integral), nuisance))
+        slope = -rate * np.linalg.lstsq(columns, response, rcond=None)[0][0]
+        columns = np.column_stack((slope, slope * (t - middle) * has_drift, columns))
+        root_weights = np.sqrt(weights)[:, None]
+        scales = np.abs(columns).max(axis=0)
+        scales[scales == 0.0] = 1.0
+        solution = np.linalg.lstsq(
+            columns / scales * root_weights, response * root_weights[:, 0], rcond=1e-12
+        )[0]
+        residual = response - columns / scales @ solution
+        solution = solution / scales
+        spread = max(float(np.median(np.abs(residual))) / 0.6745, 1e-9)
+        weights = (_STUDENT_DOF + 1.0) / (_STUDENT_DOF + (residual / spread) ** 2)
+        seconds += float(np.clip(solution[0], -0.3, 0.3))
+        drift += float(np.clip(solution[1], -1e-4, 1e-4)) if has_drift else 0.0
+        if abs(solution[0]) < 1e-4:
+            break
+    if abs(seconds - coarse.seconds) > 5.0 * max(coarse.standard_error, 0.2):
+        return coarse
+    scales = np.abs(columns).max(axis=0)
+    scales[scales == 0.0] = 1.0
+    scaled = columns / scales
+    bread = np.linalg.pinv(scaled.T @ (scaled * weights[:, None]))
+    scores = scaled * (weights * residual)[:, None]
+    sections = (np.arange(t.size) * _N_SECTIONS) // t.size
+    section_scores = np.stack([scores[sections == k].sum(axis=0) for k in range(_N_SECTIONS)])
+    covariance = bread @ section_scores.T @ section_scores @ bread
+    covariance *= _N_SECTIONS / (_N_SECTIONS - 1.0)
+    # few sections underestimate it: it is no smaller than with first-order autoregressive residuals
+    centred = residual - residual.mean()
+    energy = max(float(centred @ centred), 1e-300)
+    autocorrelation = min(max(float(centred[1:] @ centred[:-1]) / energy, 0.0), 0.98)
+    degrees_of_freedom = max(t.size - columns.shape[1], 1)
+    variance = float((weights * residual**2).sum()) / degrees_of_freedom
+    variance *= (1.0 + autocorrelation) / (1.0 - autocorrelation)
+    standard_error = float(np.sqrt(max(covariance[0, 0], variance * bread[0, 0])) / scales[0])
+    return coarse._replace(
+        seconds=seconds, standard_error=standard_error, drift=drift, middle=middle
+    )
