@@ -1,0 +1,816 @@
+"""Flight path reconstruction: states and instrument errors from the kinematics alone.
+
+Position, heading and velocities are reconciled without a model of the vessel's forces (Klein and
+Morelli, Aircraft System Identification, 2006, ch. 10; Jategaonkar, Flight Vehicle System
+Identification, 2006, ch. 10). The derivatives of u, v, r are driven by white noise (jerk). States
+and errors are estimated jointly by Gauss-Newton on a banded system bordered by the errors; noise
+levels by restricted maximum likelihood with stochastic traces (Hutchinson 1990); the evidence by
+Laplace's approximation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.signal import savgol_filter
+from scipy.special import gammaln
+
+from residnet.core.errors import DataError
+from residnet.core.frames import unwrap_angle
+from residnet.preprocessing.compatibility.sensors import (
+    CURRENT_NAMES,
+    N_STATES,
+    PSI,
+    R_DOT,
+    U_DOT,
+    V_DOT,
+    NodeStates,
+    R,
+    Sensor,
+    U,
+    V,
+    X,
+    Y,
+    compute_ground_velocity,
+)
+
+_COMPLEX_STEP = 1e-20
+_STUDENT_DOF = 5.0
+"""Degrees of freedom of the Student distribution of the measurement noise."""
+_MAX_ITERATIONS = 25
+_CURVATURE_ITERATIONS = (4, 8)
+_CURVATURE_STEP = 1e-3
+"""Iterations in which the curvature's gradient is updated, and step of its difference quotient."""
+_N_PROBES = 3
+"""Random vectors per noise level in the estimate of a trace."""
+_N_SECTIONS = 20
+"""Sections of the sandwich covariance, because residuals of filtered channels are correlated."""
+_WEAKENED_SMOOTHNESS = 100.0
+"""Factor on the jerk intensities that shows which errors the sensors determine."""
+_MAX_GROWTH = 3.0
+"""Largest growth of a standard error that is determined by the sensors."""
+_STANDARD_ERROR_FACTOR = 1.25
+"""Factor on standard errors for coverage of 95 % in simulated draws (tests/preprocessing)."""
+_MAX_NODES = 20_000
+_MIN_SAMPLES = 20
+_HEADING_WINDOW = 1.0
+_VELOCITY_WINDOW = 2.0
+"""Windows in s of the polynomials that give the first guess of the states."""
+_POSE_TOLERANCES = (1e-7, 2e-6)
+"""Standard deviations in rad and m of the integration over a step, so that it is invertible."""
+
+
+class Prior(NamedTuple):
+    """Normal prior of an instrument error.
+
+    Attributes:
+        mean: expected value.
+        std: standard deviation.
+    """
+
+    mean: float
+    std: float
+
+
+@dataclass(frozen=True)
+class ErrorEstimate:
+    """Estimated instrument error.
+
+    Attributes:
+        value: in SI units.
+        standard_error: larger one of the standard errors from the curvature and from a sandwich
+            over sections of the log.
+        growth: factor on the standard error if the jerk intensities are a hundred times larger.
+        prior_std: standard deviation of the prior.
+    """
+
+    value: float
+    standard_error: float
+    growth: float
+    prior_std: float
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether sensors determine the error; otherwise the smoothness of the motion does."""
+        return self.growth <= _MAX_GROWTH and self.standard_error < 0.5 * self.prior_std
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the error is determined and differs from zero by 3.5 standard errors."""
+        return self.is_determined and abs(self.value) > 3.5 * self.standard_error
+
+
+@dataclass(frozen=True)
+class SensorFit:
+    """Residuals of a sensor.
+
+    Attributes:
+        noise_std: standard deviation of the noise in the unit of the values.
+        autocorrelation: of successive residuals.
+        outlier_share: share of residuals beyond five standard deviations.
+    """
+
+    noise_std: float
+    autocorrelation: float
+    outlier_share: float
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Reconstructed motion of a log.
+
+    Attributes:
+        t: times of the nodes [K] in s.
+        states: x, y, psi, u, v, r through the water, and the derivatives of u, v, r, [K, 9].
+        errors: name -> estimate.
+        sensors: name of a sensor -> its residuals.
+        jerk_intensity: power spectral densities of the jerk of u, v, r.
+        deviance: minus twice the logarithm of the evidence.
+        n_measurements: number of measured values.
+    """
+
+    t: np.ndarray
+    states: np.ndarray
+    errors: dict[str, ErrorEstimate]
+    sensors: dict[str, SensorFit]
+    jerk_intensity: np.ndarray
+    deviance: float
+    n_measurements: int
+
+    @property
+    def bic(self) -> float:
+        """Bayesian information criterion."""
+        return self.deviance + len(self.errors) * float(np.log(max(self.n_measurements, 2)))
+
+
+def reconstruct(
+    sensors: Sequence[Sensor], errors: Mapping[str, Prior], step: float
+) -> Reconstruction:
+    """Reconstruct the motion of a vessel and the errors of its instruments.
+
+    Args:
+        sensors: measurements; at least a position, a heading or a velocity.
+        errors: name of an instrument error -> prior, for the errors named by the sensors and the
+            components of a current.
+        step: time between nodes in s.
+
+    Raises:
+        DataError: if the sensors have too few values or the log is too long for the step.
+    """
+    problem = _Problem(sensors, errors, step)
+    return problem.estimate()
+
+
+@dataclass
+class _Residuals:
+    """Whitened residuals of one group and their derivatives.
+
+    Attributes:
+        group: name of the noise level.
+        nodes: node before each residual [N].
+        values: [N].
+        by_state: state (those of the next node follow after the ninth) -> derivative [N].
+        by_error: index of an error -> derivative [N].
+        sensor: sensor of a measurement; None for a dynamic equation.
+    """
+
+    group: str
+    nodes: np.ndarray
+    values: np.ndarray
+    by_state: dict[int, np.ndarray]
+    by_error: dict[int, np.ndarray] = field(default_factory=dict)
+    sensor: Sensor | None = None
+
+    @property
+    def weights(self) -> np.ndarray | float:
+        """Weights [N] of the Student distribution."""
+        if self.sensor is None:
+            return 1.0
+        return np.asarray((_STUDENT_DOF + 1.0) / (_STUDENT_DOF + self.values**2))
+
+    @property
+    def cost(self) -> float:
+        """Minus twice the log-density without constants."""
+        if self.sensor is None:
+            return float(self.values @ self.values)
+        return float((_STUDENT_DOF + 1.0) * np.log1p(self.values**2 / _STUDENT_DOF).sum())
+
+
+@dataclass
+class _Solver:
+    """Factors of a linearised problem.
+
+    Attributes:
+        banded_factor: Cholesky factor of the states.
+        gradient: of the states [K * 9].
+        border: second derivatives by errors and states [P, K * 9].
+        schur: second derivatives by the errors with the states eliminated [P, P].
+        error_gradient: [P].
+        state_solution: solution for the gradient [K * 9].
+        border_solution: solution for the border [K * 9, P].
+    """
+
+    banded_factor: np.ndarray
+    gradient: np.ndarray
+    border: np.ndarray
+    schur: np.ndarray
+    error_gradient: np.ndarray
+    state_solution: np.ndarray
+    border_solution: np.ndarray
+
+
+class _Problem:
+    """Joint estimation of states and errors on a grid of nodes."""
+
+    def __init__(self, sensors: Sequence[Sensor], errors: Mapping[str, Prior], step: float) -> None:
+        self.sensors = [sensor.select_finite() for sensor in sensors]
+        self.sensors = [sensor for sensor in self.sensors if len(sensor.t) >= _MIN_SAMPLES]
+        if not self.sensors:
+            raise DataError(
+                f"no sensor has {_MIN_SAMPLES} values for a data compatibility analysis; record a"
+                " longer log"
+            )
+        reference = [sensor for sensor in self.sensors if not sensor.clock] or self.sensors
+        start = min(float(sensor.t[0]) for sensor in reference)
+        stop = max(float(sensor.t[-1]) for sensor in reference)
+        n_nodes = int(np.ceil((stop - start) / step - 1e-6)) + 1
+        if n_nodes > _MAX_NODES:
+            raise DataError(
+                f"{n_nodes} nodes are too many for a data compatibility analysis (at most"
+                f" {_MAX_NODES}); increase the step"
+            )
+        self.step = step
+        self.n_nodes = max(n_nodes, 8)
+        self.t = start + step * np.arange(self.n_nodes)
+        used_names = {name for s in self.sensors for name in (s.clock, *s.error_names)}
+        self.names = [name for name in errors if name in used_names or name in CURRENT_NAMES]
+        self.prior_means = np.array([errors[name].mean for name in self.names], dtype=np.float64)
+        self.prior_stds = np.array([errors[name].std for name in self.names], dtype=np.float64)
+        self.jerk_intensity = np.ones(3)
+        self.curvature_gradient = np.zeros(len(self.names))
+
+    def estimate(self) -> Reconstruction:
+        """Iterate states, errors and noise levels until they are stationary."""
+        states = self._guess_states()
+        errors = self.prior_means.copy()
+        residuals = self._linearize(states, errors)
+        n_calm = 0
+        for iteration in range(_MAX_ITERATIONS):
+            solver = self._factorize(residuals, errors)
+            if iteration in _CURVATURE_ITERATIONS or n_calm == 1:
+                self.curvature_gradient = self._differentiate_curvature(states, errors, solver)
+                solver = self._factorize(residuals, errors)
+            error_step = np.zeros(errors.size)
+            if errors.size:
+                reduced_gradient = solver.error_gradient - solver.border @ solver.state_solution
+                error_step = -np.linalg.solve(solver.schur, reduced_gradient)
+            state_step = -(solver.state_solution + solver.border_solution @ error_step)
+            state_step = state_step.reshape(self.n_nodes, N_STATES)
+            cost = self._compute_cost(residuals, errors)
+            share = 1.0
+            # backtracking line search
+            for _ in range(6):
+                candidate = self._linearize(
+                    states + share * state_step, errors + share * error_step
+                )
+                new_cost = self._compute_cost(candidate, errors + share * error_step)
+                if new_cost < cost + 1e-6 * abs(cost) + 1e-3:
+                    break
+                share *= 0.4
+            states = states + share * state_step
+            errors = errors + share * error_step
+            residuals = candidate
+            noise_change = 0.0
+            if iteration:
+                noise_change = self._update_noise(residuals, solver)
+                residuals = self._linearize(states, errors)
+            is_calm = abs(cost - new_cost) < 0.3 + 1e-5 * abs(cost) and noise_change < 0.03
+            n_calm = n_calm + 1 if is_calm and share == 1.0 else 0
+            if n_calm >= 2:
+                break
+        return self._summarize(states, errors, residuals)
+
+    # --- first guess -------------------------------------------------------------------------
+
+    def _guess_states(self) -> np.ndarray:
+        """Return a first guess of the states [K, 9], and set the first noise levels."""
+        by_kind: dict[str, Sensor] = {}
+        for sensor in self.sensors:
+            by_kind.setdefault(sensor.kind, sensor)
+        states = np.zeros((self.n_nodes, N_STATES))
+
+        def resample(sensor: Sensor, values: np.ndarray) -> np.ndarray:
+            return np.interp(self.t, sensor.t, values)
+
+        def smooth(values: np.ndarray, seconds: float, derivative: int = 0) -> np.ndarray:
+            window = max(5, int(seconds / self.step) // 2 * 2 + 1)
+            window = max(min(window, (self.n_nodes - 1) // 2 * 2 - 1), 3)
+            return np.asarray(savgol_filter(values, window, 2, deriv=derivative, delta=self.step))
+
+        width = _VELOCITY_WINDOW
+        position = by_kind.get("position")
+        if position is not None:
+            width = max(width, 5.0 * float(np.median(np.diff(position.t))))
+            for state in (X, Y):
+                states[:, state] = smooth(resample(position, position.values[:, state]), width)
+        north_rate, east_rate = (smooth(states[:, state], width, 1) for state in (X, Y))
+        if "heading" in by_kind:
+            heading = by_kind["heading"]
+            unwrapped = unwrap_angle(heading.values[:, 0] / heading.factor)
+            states[:, PSI] = smooth(resample(heading, unwrapped), _HEADING_WINDOW)
+        elif position is not None:
+            states[:, PSI] = smooth(np.unwrap(np.arctan2(east_rate, north_rate)), width)
+        if "yaw_rate" in by_kind and "heading" not in by_kind:
+            rate = by_kind["yaw_rate"]
+            states[:, R] = resample(rate, rate.values[:, 0] / rate.factor)
+            if position is None:
+                states[:, PSI] = np.cumsum(states[:, R]) * self.step
+        else:
+            states[:, R] = smooth(states[:, PSI], _HEADING_WINDOW, 1)
+        current = [
+            float(self.prior_means[self.names.index(name)]) if name in self.names else 0.0
+            for name in CURRENT_NAMES
+        ]
+        cosine = np.cos(states[:, PSI])
+        sine = np.sin(states[:, PSI])
+        if position is not None:
+            north_rate = north_rate - current[0]
+            east_rate = east_rate - current[1]
+            states[:, U] = north_rate * cosine + east_rate * sine
+            states[:, V] = east_rate * cosine - north_rate * sine
+        else:
+            for kind, state in (("surge", U), ("sway", V), ("speed", U)):
+                if kind in by_kind and not states[:, state].any():
+                    sensor = by_kind[kind]
+                    states[:, state] = resample(sensor, sensor.values[:, 0] / sensor.factor)
+            states[:, X] = np.cumsum(states[:, U] * cosine - states[:, V] * sine) * self.step
+            states[:, Y] = np.cumsum(states[:, U] * sine + states[:, V] * cosine) * self.step
+        for state, rate, seconds in ((U, U_DOT, width), (V, V_DOT, width), (R, R_DOT, 1.0)):
+            states[:, rate] = smooth(states[:, state], seconds, 1)
+        self.jerk_intensity = np.array(
+            [
+                3.0 * self.step * np.mean(np.gradient(states[:, rate], self.step) ** 2) + 1e-10
+                for rate in (U_DOT, V_DOT, R_DOT)
+            ]
+        )
+        self.sensors = [_guess_noise(sensor) for sensor in self.sensors]
+        return states
+
+    # --- linearisation -----------------------------------------------------------------------
+
+    def _linearize(self, states: np.ndarray, errors: np.ndarray) -> list[_Residuals]:
+        """Return the whitened residuals of all equations and their derivatives."""
+        parameters = dict(zip(self.names, errors.tolist(), strict=True))
+        groups = self._linearize_dynamics(states, parameters)
+        for index, sensor in enumerate(self.sensors):
+            groups += self._linearize_sensor(index, sensor, states, parameters)
+        return groups
+
+    def _linearize_dynamics(
+        self, states: np.ndarray, parameters: Mapping[str, float]
+    ) -> list[_Residuals]:
+        """Return the residuals of white jerk and of the kinematics over each step."""
+        h = self.step
+        nodes = np.arange(self.n_nodes - 1)
+        ones = np.ones(nodes.size)
+        groups = []
+        for axis, (state, rate) in enumerate(((U, U_DOT), (V, V_DOT), (R, R_DOT))):
+            # covariance of velocity and acceleration under white jerk, decorrelated
+            velocity_error = states[1:, state] - states[:-1, state] - h * states[:-1, rate]
+            rate_error = states[1:, rate] - states[:-1, rate]
+            by_velocity = 1.0 / np.sqrt(self.jerk_intensity[axis] * h**3 / 3.0)
+            by_rate = 1.0 / np.sqrt(self.jerk_intensity[axis] * h / 4.0)
+            slope = 1.5 / h
+            name = f"jerk {axis}"
+            after = N_STATES + state
+            after_rate = N_STATES + rate
+            derivatives = {state: -by_velocity, rate: -h * by_velocity, after: by_velocity}
+            groups.append(
+                _Residuals(
+                    name,
+                    nodes,
+                    velocity_error * by_velocity,
+                    {key: factor * ones for key, factor in derivatives.items()},
+                )
+            )
+            derivatives = {
+                state: slope * by_rate,
+                rate: (slope * h - 1.0) * by_rate,
+                after: -slope * by_rate,
+                after_rate: by_rate,
+            }
+            groups.append(
+                _Residuals(
+                    name,
+                    nodes,
+                    (rate_error - slope * velocity_error) * by_rate,
+                    {key: factor * ones for key, factor in derivatives.items()},
+                )
+            )
+        heading_weight, position_weight = self._pose_weights
+        heading_error = (
+            states[1:, PSI] - states[:-1, PSI] - h / 2.0 * (states[1:, R] + states[:-1, R])
+        )
+        heading_error = heading_error - h**2 / 12.0 * (states[:-1, R_DOT] - states[1:, R_DOT])
+        heading_derivatives = (
+            {PSI: -1.0, R: -h / 2.0, R_DOT: -(h**2) / 12.0},
+            {PSI: 1.0, R: -h / 2.0, R_DOT: h**2 / 12.0},
+        )
+        groups.append(
+            _Residuals(
+                "pose",
+                nodes,
+                heading_error * heading_weight,
+                {
+                    side * N_STATES + key: factor * heading_weight * ones
+                    for side, part in enumerate(heading_derivatives)
+                    for key, factor in part.items()
+                },
+            )
+        )
+        sides = [
+            {key: states[rows, key] for key in range(N_STATES)}
+            for rows in (slice(-1), slice(1, None))
+        ]
+        current = [parameters.get(name, 0.0) for name in CURRENT_NAMES]
+        position_errors = _integrate_position(sides[0], sides[1], h, *current)
+        derivatives_by_axis: list[dict[int, np.ndarray]] = [{}, {}]
+        for side in (0, 1):
+            for state in (X, Y, PSI, U, V, R, U_DOT, V_DOT):
+                moved = [dict(sides[0]), dict(sides[1])]
+                moved[side][state] = moved[side][state] + 1j * _COMPLEX_STEP
+                for axis, error in enumerate(_integrate_position(moved[0], moved[1], h, *current)):
+                    if np.iscomplexobj(error):
+                        derivatives_by_axis[axis][side * N_STATES + state] = (
+                            np.imag(error) / _COMPLEX_STEP * position_weight
+                        )
+        for axis, name in enumerate(CURRENT_NAMES):
+            by_error = (
+                {self.names.index(name): -h * position_weight * ones} if name in self.names else {}
+            )
+            groups.append(
+                _Residuals(
+                    "pose",
+                    nodes,
+                    position_errors[axis] * position_weight,
+                    derivatives_by_axis[axis],
+                    by_error,
+                )
+            )
+        return groups
+
+    @property
+    def _pose_weights(self) -> tuple[float, float]:
+        """Inverse standard deviations of the integration of heading and position over a step."""
+        q = self.jerk_intensity
+        share = self.step**5 / 720.0
+        return (
+            1.0 / float(np.sqrt(q[2] * share + _POSE_TOLERANCES[0] ** 2)),
+            1.0 / float(np.sqrt(max(q[0], q[1]) * share + _POSE_TOLERANCES[1] ** 2)),
+        )
+
+    def _linearize_sensor(
+        self, index: int, sensor: Sensor, states: np.ndarray, parameters: dict[str, float]
+    ) -> list[_Residuals]:
+        """Return the residuals of a sensor by complex-step differentiation."""
+        times = sensor.t + parameters.get(sensor.clock, 0.0)
+        location = (times - self.t[0]) / self.step
+        is_inside = (location > -1e-6) & (location < self.n_nodes - 1 + 1e-6)
+        location = np.clip(location[is_inside], 0.0, self.n_nodes - 1 - 1e-9)
+        values = sensor.values[is_inside]
+        is_on_nodes = not sensor.clock and bool(np.abs(location - np.round(location)).max() < 1e-4)
+        nodes = (np.round(location) if is_on_nodes else np.floor(location)).astype(int)
+        nodes = np.clip(nodes, 0, self.n_nodes - (1 if is_on_nodes else 2))
+        fraction = None if is_on_nodes else location - nodes
+        before = {key: states[nodes, key] for key in range(N_STATES)}
+        next_nodes = np.minimum(nodes + 1, self.n_nodes - 1)
+        after = {key: states[next_nodes, key] for key in range(N_STATES)}
+        predicted = sensor.predict(parameters, before, after, self.step, fraction)
+        by_state: list[dict[int, np.ndarray]] = [{} for _ in predicted]
+        by_error: list[dict[int, np.ndarray]] = [{} for _ in predicted]
+        scale = 1.0 / (sensor.noise_std * _COMPLEX_STEP)
+        for side in (0,) if is_on_nodes else (0, 1):
+            for state in sensor.select_states(is_on_nodes=is_on_nodes):
+                moved = [dict(before), dict(after)]
+                moved[side][state] = moved[side][state] + 1j * _COMPLEX_STEP
+                for k, column in enumerate(
+                    sensor.predict(parameters, moved[0], moved[1], self.step, fraction)
+                ):
+                    if np.iscomplexobj(column):
+                        by_state[k][side * N_STATES + state] = np.imag(column) * scale
+        for name in {*sensor.error_names, *CURRENT_NAMES} & {*self.names}:
+            moved_parameters = {**parameters, name: parameters[name] + 1j * _COMPLEX_STEP}
+            for k, column in enumerate(
+                sensor.predict(moved_parameters, before, after, self.step, fraction)
+            ):
+                if np.iscomplexobj(column):
+                    by_error[k][self.names.index(name)] = np.imag(column) * scale
+        if sensor.clock in self.names and fraction is not None:
+            moved_fraction = fraction + 1j * _COMPLEX_STEP / self.step
+            for k, column in enumerate(
+                sensor.predict(parameters, before, after, self.step, moved_fraction)
+            ):
+                by_error[k][self.names.index(sensor.clock)] = np.imag(column) * scale
+        groups = []
+        for k, column in enumerate(predicted):
+            difference = column - values[:, k]
+            if sensor.is_angular:
+                angle = difference / sensor.factor
+                difference = (angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))) * sensor.factor
+            groups.append(
+                _Residuals(
+                    f"sensor {index}",
+                    nodes,
+                    difference / sensor.noise_std,
+                    by_state[k],
+                    by_error[k],
+                    sensor,
+                )
+            )
+        return groups
+
+    def _compute_cost(self, residuals: Sequence[_Residuals], errors: np.ndarray) -> float:
+        """Return minus twice the log-density, with the linearised curvature of the states."""
+        prior = float((((errors - self.prior_means) / self.prior_stds) ** 2).sum())
+        curvature = 2.0 * float(self.curvature_gradient @ errors)
+        return prior + curvature + sum(group.cost for group in residuals)
+
+    def _differentiate_curvature(
+        self, states: np.ndarray, errors: np.ndarray, solver: _Solver
+    ) -> np.ndarray:
+        """Return the gradient [P] of half the log-determinant of the states' Hessian.
+
+        Joint estimates of states and a scale are biased: a smaller state needs less jerk. The
+        marginal likelihood of the errors contains this determinant.
+        """
+        gradient = np.zeros(errors.size)
+        log_determinant = float(np.log(solver.banded_factor[0]).sum())
+        scale_names = {sensor.scale for sensor in self.sensors}
+        for index, name in enumerate(self.names):
+            if name not in scale_names:
+                continue
+            moved = errors.copy()
+            moved[index] += _CURVATURE_STEP
+            factor = self._factorize(self._linearize(states, moved), moved).banded_factor
+            gradient[index] = (float(np.log(factor[0]).sum()) - log_determinant) / _CURVATURE_STEP
+        return gradient
+
+    # --- normal equations --------------------------------------------------------------------
+
+    def _factorize(self, residuals: Sequence[_Residuals], errors: np.ndarray) -> _Solver:
+        """Factorise the normal equations, banded in the states and dense in the errors."""
+        n_nodes = self.n_nodes
+        n_errors = errors.size
+        band = np.zeros((2 * N_STATES, n_nodes, N_STATES))
+        gradient = np.zeros((n_nodes + 1, N_STATES))
+        border = np.zeros((n_errors, n_nodes + 1, N_STATES))
+        corner = np.diag(1.0 / self.prior_stds**2)
+        error_gradient = (errors - self.prior_means) / self.prior_stds**2
+        for group in residuals:
+            weights = group.weights
+            weighted = weights * group.values
+            nodes = group.nodes
+            for first, first_derivative in group.by_state.items():
+                side, state = divmod(first, N_STATES)
+                target = slice(side, n_nodes + side)
+                gradient[target, state] += np.bincount(nodes, first_derivative * weighted, n_nodes)
+                weighted_derivative = first_derivative * weights
+                for second, second_derivative in group.by_state.items():
+                    if second >= first:
+                        product = np.bincount(
+                            nodes, weighted_derivative * second_derivative, n_nodes
+                        )
+                        # a product of two states of the next node belongs to that node
+                        band[second - first, side:, state] += product[: n_nodes - side]
+                for index, derivative in group.by_error.items():
+                    border[index, target, state] += np.bincount(
+                        nodes, weighted_derivative * derivative, n_nodes
+                    )
+            for index, derivative in group.by_error.items():
+                error_gradient[index] += float((derivative * weighted).sum())
+                for other_index, other_derivative in group.by_error.items():
+                    corner[index, other_index] += float(
+                        (derivative * weights * other_derivative).sum()
+                    )
+        flat_band = band.reshape(2 * N_STATES, n_nodes * N_STATES)
+        flat_band[0] += 1e-9
+        flat_gradient = gradient[:n_nodes].reshape(-1)
+        flat_border = border[:, :n_nodes].reshape(n_errors, n_nodes * N_STATES)
+        factor = cholesky_banded(flat_band, lower=True, overwrite_ab=True, check_finite=False)
+        right_sides = np.vstack([flat_gradient[None], flat_border]).T
+        solution = cho_solve_banded((factor, True), right_sides, check_finite=False)
+        border_solution = solution[:, 1:]
+        return _Solver(
+            factor,
+            flat_gradient,
+            flat_border,
+            corner - flat_border @ border_solution,
+            error_gradient + self.curvature_gradient,
+            solution[:, 0],
+            border_solution,
+        )
+
+    # --- noise levels ------------------------------------------------------------------------
+
+    def _update_noise(self, residuals: Sequence[_Residuals], solver: _Solver) -> float:
+        """Update noise levels to the restricted maximum likelihood; return the largest change.
+
+        A noise level is the sum of squares over the residual degrees of freedom. Those that the
+        estimates use are a trace, estimated with random signs.
+        """
+        rng = np.random.default_rng(0)
+        names = ["jerk 0", "jerk 1", "jerk 2"]
+        names += [f"sensor {k}" for k, s in enumerate(self.sensors) if not s.is_noise_known]
+        groups_by_name = {name: [g for g in residuals if g.group == name] for name in names}
+        right_sides = []
+        by_errors = []
+        for name in names:
+            for _ in range(_N_PROBES):
+                by_states, by_error = self._multiply_signs(groups_by_name[name], rng)
+                right_sides.append(by_states)
+                by_errors.append(by_error)
+        solutions = cho_solve_banded(
+            (solver.banded_factor, True), np.array(right_sides).T, check_finite=False
+        )
+        schur_inverse = np.linalg.inv(solver.schur) if self.names else solver.schur
+        largest_change = 0.0
+        for k, name in enumerate(names):
+            used = []
+            for probe in range(k * _N_PROBES, (k + 1) * _N_PROBES):
+                trace = float(right_sides[probe] @ solutions[:, probe])
+                reduced = by_errors[probe] - solver.border @ solutions[:, probe]
+                used.append(trace + float(reduced @ schur_inverse @ reduced))
+            n_residuals = sum(group.values.size for group in groups_by_name[name])
+            squares = sum(
+                float((group.weights * group.values**2).sum()) for group in groups_by_name[name]
+            )
+            free = max(n_residuals - float(np.mean(used)), 0.003 * n_residuals, 2.0)
+            ratio = squares / free
+            kind, _, number = name.partition(" ")
+            if kind == "jerk":
+                ratio = float(np.clip(ratio, 0.1, 10.0))
+                self.jerk_intensity[int(number)] = max(
+                    self.jerk_intensity[int(number)] * ratio, 1e-12
+                )
+                largest_change = max(largest_change, abs(float(np.log(ratio))) / 3.0)
+            else:
+                sensor = self.sensors[int(number)]
+                factor = float(np.sqrt(np.clip(ratio, 0.05, 20.0)))
+                noise_std = max(sensor.noise_std * factor, sensor.min_noise_std)
+                largest_change = max(
+                    largest_change, abs(float(np.log(noise_std / sensor.noise_std)))
+                )
+                self.sensors[int(number)] = replace(sensor, noise_std=noise_std)
+        return largest_change
+
+    def _multiply_signs(
+        self, groups: Sequence[_Residuals], rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the transposed derivatives of a group times random signs, by states and errors."""
+        by_states = np.zeros((self.n_nodes + 1, N_STATES))
+        by_errors = np.zeros(len(self.names))
+        for group in groups:
+            signs = rng.choice((-1.0, 1.0), group.values.size) * np.sqrt(group.weights)
+            for key, derivative in group.by_state.items():
+                side, state = divmod(key, N_STATES)
+                by_states[side : self.n_nodes + side, state] += np.bincount(
+                    group.nodes, derivative * signs, self.n_nodes
+                )
+            for index, derivative in group.by_error.items():
+                by_errors[index] += float((derivative * signs).sum())
+        return by_states[: self.n_nodes].reshape(-1), by_errors
+
+    # --- results -----------------------------------------------------------------------------
+
+    def _summarize(
+        self, states: np.ndarray, errors: np.ndarray, residuals: list[_Residuals]
+    ) -> Reconstruction:
+        """Return estimates with standard errors, growth and evidence."""
+        solver = self._factorize(residuals, errors)
+        standard_errors = self._compute_standard_errors(residuals, errors, solver)
+        intensity = self.jerk_intensity.copy()
+        growth = np.ones(errors.size)
+        if errors.size:
+            self.jerk_intensity = _WEAKENED_SMOOTHNESS * intensity
+            weakened = self._factorize(self._linearize(states, errors), errors)
+            self.jerk_intensity = intensity
+            growth = np.sqrt(
+                np.diag(np.linalg.inv(weakened.schur)) / np.diag(np.linalg.inv(solver.schur))
+            )
+        return Reconstruction(
+            self.t,
+            states,
+            {
+                name: ErrorEstimate(
+                    float(errors[k]),
+                    float(standard_errors[k]),
+                    float(growth[k]),
+                    float(self.prior_stds[k]),
+                )
+                for k, name in enumerate(self.names)
+            },
+            self._summarize_sensors(residuals),
+            intensity,
+            self._compute_deviance(residuals, errors, solver),
+            sum(group.values.size for group in residuals if group.sensor is not None),
+        )
+
+    def _compute_standard_errors(
+        self, residuals: Sequence[_Residuals], errors: np.ndarray, solver: _Solver
+    ) -> np.ndarray:
+        """Return standard errors [P]: the larger of curvature and sandwich over sections."""
+        if not errors.size:
+            return np.zeros(0)
+        covariance = np.linalg.inv(solver.schur)
+        prior_gradient = (errors - self.prior_means) / self.prior_stds**2
+        scores = np.tile(prior_gradient / _N_SECTIONS, (_N_SECTIONS, 1))
+        for group in residuals:
+            # derivative by the errors with the states eliminated
+            profile = np.zeros((group.values.size, errors.size))
+            for index, derivative in group.by_error.items():
+                profile[:, index] += derivative
+            for key, derivative in group.by_state.items():
+                rows = np.minimum(group.nodes * N_STATES + key, self.n_nodes * N_STATES - 1)
+                profile -= derivative[:, None] * solver.border_solution[rows]
+            profile *= (group.weights * group.values)[:, None]
+            sections = group.nodes * _N_SECTIONS // self.n_nodes
+            for index in range(errors.size):
+                scores[:, index] += np.bincount(sections, profile[:, index], _N_SECTIONS)
+        sandwich = covariance @ (scores.T @ scores) @ covariance * _N_SECTIONS / (_N_SECTIONS - 1)
+        variance = np.maximum(np.diag(covariance), np.diag(sandwich))
+        return np.asarray(_STANDARD_ERROR_FACTOR * np.sqrt(variance))
+
+    def _summarize_sensors(self, residuals: Sequence[_Residuals]) -> dict[str, SensorFit]:
+        fits = {}
+        for group in residuals:
+            if group.sensor is None:
+                continue
+            weighted = np.sqrt(group.weights) * (group.values - group.values.mean())
+            energy = max(float(weighted @ weighted), 1e-300)
+            fits[group.sensor.name] = SensorFit(
+                group.sensor.noise_std,
+                float(weighted[1:] @ weighted[:-1]) / energy,
+                float((np.abs(group.values) > 5.0).mean()),
+            )
+        return fits
+
+    def _compute_deviance(
+        self, residuals: Sequence[_Residuals], errors: np.ndarray, solver: _Solver
+    ) -> float:
+        """Return minus twice the log-evidence by Laplace's approximation.
+
+        Powers of the step are left out: they are equal for all hypotheses with one grid.
+        """
+        half = 0.5 * _STUDENT_DOF
+        student_constant = -2.0 * float(
+            gammaln(half + 0.5) - gammaln(half) - 0.5 * np.log(_STUDENT_DOF * np.pi)
+        )
+        deviance = 2.0 * float(np.log(solver.banded_factor[0]).sum())
+        deviance -= self.n_nodes * N_STATES * float(np.log(2.0 * np.pi))
+        deviance += self._compute_cost(residuals, errors)
+        deviance -= 2.0 * float(self.curvature_gradient @ errors)
+        for group in residuals:
+            n = group.values.size
+            if group.sensor is not None:
+                deviance += n * (2.0 * float(np.log(group.sensor.noise_std)) + student_constant)
+                continue
+            deviance += n * float(np.log(2.0 * np.pi))
+            if group.group.startswith("jerk"):
+                deviance += n * float(np.log(self.jerk_intensity[int(group.group[-1])]))
+        heading_weight, position_weight = self._pose_weights
+        return deviance - 2.0 * (self.n_nodes - 1) * float(
+            np.log(heading_weight) + 2.0 * np.log(position_weight)
+        )
+
+
+def _guess_noise(sensor: Sensor) -> Sensor:
+    """Return a sensor with a first guess of its noise from third differences."""
+    if sensor.noise_std:
+        return sensor
+    values = sensor.values
+    if sensor.is_angular:
+        values = unwrap_angle(values[:, 0] / sensor.factor)[:, None] * sensor.factor
+    differences = np.abs(np.diff(values, n=3, axis=0))
+    noise_std = float(np.median(differences)) / 0.6745 / np.sqrt(20.0)
+    smallest = max(1e-6 * (1.0 + float(np.abs(values).max())), sensor.min_noise_std)
+    return replace(sensor, noise_std=max(noise_std, smallest))
+
+
+def _integrate_position(
+    before: NodeStates, after: NodeStates, step: float, north: float, east: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the change of the position over a step beyond Simpson's rule, north and east."""
+    middle = {
+        state: 0.5 * (before[state] + after[state]) + step / 8.0 * (before[rate] - after[rate])
+        for state, rate in ((PSI, R), (U, U_DOT), (V, V_DOT))
+    }
+    velocities = [compute_ground_velocity(node, north, east) for node in (before, middle, after)]
+    errors = []
+    for axis, state in enumerate((X, Y)):
+        integral = velocities[0][axis] + 4.0 * velocities[1][axis] + velocities[2][axis]
+        errors.append(after[state] - before[state] - step / 6.0 * integral)
+    return errors[0], errors[1]
