@@ -18,6 +18,18 @@ from residnet.core.layout import DegreesOfFreedom
 from residnet.core.names import BOW_WIND_CHANNELS, CHANNEL_UNITS, port_starboard_pairs
 from residnet.core.units import si_unit, to_si, unit_names
 from residnet.io.drafting.questions import DraftNotes
+from residnet.io.drafting.velocities import (
+    BODY_AXES,
+    EXCHANGED_EARTH_AXES,
+    HeadingOffset,
+    MeaningChoice,
+    MeasuredVelocities,
+    choose_meaning,
+    estimate_drift_free_offset,
+    make_measured_velocities,
+    measure_contradiction,
+    require_compatible,
+)
 from residnet.io.header_vocabulary import (
     guess_scaling,
     guess_unit_from_size,
@@ -327,6 +339,8 @@ READER_KEY = ("data", "reader")
 CHANNELS_KEY = (*READER_KEY, "channels")
 _OVERRULING_CORRELATION = 0.9
 """Smallest correlation for which an estimated factor overrules the header."""
+_MIN_BODY_CONSISTENCY = 0.85
+"""Smallest consistency with position and heading of u and v that are certainly in body axes."""
 _MAX_WIND_SPREAD_RATIO = 0.8
 """Largest ratio of true-wind standard deviations for a reference other than that of the name.
 
@@ -702,16 +716,20 @@ class ChannelMapper:
         self._motions: list[Motion | None] = [None] * len(logs)
         self._psi_unit = "rad"
         self._sign_flipped: set[str] = set()
+        self._is_swapped = False
+        self._is_earth_fixed = False
+        self._heading_offset: HeadingOffset | None = None
 
     def draft_entries(self) -> dict[str, dict[str, Any]]:
         """Return channel -> entry."""
         if {"x", "y", "psi"} <= set(self._names):
-            self._drop_earth_fixed_velocities()
+            self._choose_velocity_meaning()
             self._choose_heading_frame()
             for name in [
                 velocity_name for velocity_name in ("u", "v", "r") if velocity_name in self._names
             ]:
                 self._drop_inconsistent_velocity(name)
+            self._require_compatible_velocities()
         elif "psi" in self._names:
             self._psi_unit = self._infer_unit("psi")
         self._choose_wind_reference()
@@ -778,6 +796,7 @@ class ChannelMapper:
             text = f"position, heading and velocities are inconsistent ({score:.2f} of 1)"
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"{text}: check units and axes")
         # swapped columns have been exchanged by name
+        self._is_swapped = self._pose_frame.is_swapped
         self._pose_frame = PoseFrame(False, self._pose_frame.is_from_east)
 
     def _search_heading_frame(self) -> float:
@@ -854,74 +873,132 @@ class ChannelMapper:
             return gain < -MIN_STANDARD_ERRORS * standard_error
         return False
 
-    def _drop_earth_fixed_velocities(self) -> None:
-        """Leave out velocities vx and vy that are in earth axes instead of body axes.
+    def _choose_velocity_meaning(self) -> None:
+        """Choose whether u and v are in body axes, in earth axes, or a speed.
 
-        The names are ambiguous. The motion from position and heading alone decides.
+        Frame and heading are determined without the velocities. Velocities in earth axes are
+        rotated to body axes for the further tests; a speed is left out.
         """
-        axis_velocities = [
-            name
-            for name in ("u", "v")
-            if name in self._names
-            and match_axis_velocity(parse_name(self._names[name])) is not None
-        ]
-        if not axis_velocities:
+        names = [name for name in ("u", "v") if name in self._names]
+        if not names:
             return
-        other_names = {
-            name: column for name, column in self._names.items() if name not in axis_velocities
-        }
-        reference_mapper = ChannelMapper(
-            other_names, self._logs, DraftNotes(), self._degrees_per_count, self._candidate_frames
-        )
-        reference_mapper._choose_heading_frame()
-        unrotated_tables = [
-            RawTable(table.t, {**table.columns, "psi": np.zeros(table.t.size)})
+        choice = MeaningChoice(BODY_AXES, BODY_AXES, np.inf, "")
+        as_named = self._try_heading_frame(self._names)
+        # a vessel that sways as much as it surges has a frame with its velocities only
+        is_consistent = as_named._score_consistency(as_named._motions) > _MIN_BODY_CONSISTENCY
+        # in a far too large unit the heading is constant, and earth axes look like body axes
+        unit_from_size, _ = guess_unit_from_size("psi", self._concatenate_values("psi"))
+        header_unit = parse_header_unit(self._names["psi"], "rad")
+        is_consistent &= (header_unit or unit_from_size) == as_named._psi_unit
+        reference = as_named
+        if len(names) < 2 or not is_consistent:
+            other_names = {n: column for n, column in self._names.items() if n not in names}
+            reference = self._try_heading_frame(other_names)
+            if logs := reference._measure_velocities(names, self._logs):
+                choice = choose_meaning(logs)
+        meaning = choice.meaning
+        if choice.is_ambiguous:
+            options = (choice.meaning.description, choice.runner_up.description)
+            columns = " and ".join(f"'{self._names[name]}'" for name in names)
+            question = f"meaning of {columns} (the margin {choice.margin:.0f} decides nothing)"
+            answer = self._draft_notes.ask_question(
+                (*CHANNELS_KEY, names[-1]), question, options[0], choice.text, options
+            )
+            meaning = choice.meaning if answer == options[0] else choice.runner_up
+        if meaning == BODY_AXES:
+            for name in names:
+                if match_axis_velocity(parse_name(self._names[name])) is not None:
+                    text = "assumed in body axes, consistent with position and heading"
+                    self._draft_notes.add_guess((*CHANNELS_KEY, name), text)
+            return
+        if "speed" in meaning.components:
+            name = ("u", "v")[meaning.components.index("speed")]
+            column = self._names.pop(name)
+            text = f"'{column}' is left out, {name} is derived from positions: {choice.text}"
+            self._draft_notes.add_note(CHANNELS_KEY, text)
+            return
+        if meaning == EXCHANGED_EARTH_AXES:
+            self._names["u"], self._names["v"] = self._names["v"], self._names["u"]
+        self._draft_notes.add_guess((*CHANNELS_KEY, "u"), choice.text)
+        self._is_earth_fixed = True
+        self._logs = [
+            reference._rotate_to_body(table, meaning == EXCHANGED_EARTH_AXES)
             for table in self._logs
         ]
-        earth_fixed_motions = [
-            estimate_motion(table, "rad", POSE_FRAMES[0]) for table in unrotated_tables
-        ]
 
-        def mean_correlation(
-            motions: Sequence[Motion | None], component_of: Mapping[str, str]
-        ) -> float:
-            velocity_tables = [
-                RawTable(
-                    table.t,
-                    {
-                        component_of[n]: table.columns[n]
-                        for n in axis_velocities
-                        if n in table.columns
-                    },
-                )
-                for table in self._logs
-            ]
-            return float(
-                np.mean(
-                    [
-                        fit_to_motion(velocity_tables, motions, component_of[n]).correlation
-                        for n in axis_velocities
-                    ]
+    def _try_heading_frame(self, names: Mapping[str, str]) -> ChannelMapper:
+        """Return a mapper of some of the channels with its frame, without notes."""
+        mapper = ChannelMapper(
+            names, self._logs, DraftNotes(), self._degrees_per_count, self._candidate_frames
+        )
+        mapper._choose_heading_frame()
+        return mapper
+
+    def _measure_velocities(
+        self, names: Sequence[str], logs: Sequence[RawTable]
+    ) -> list[MeasuredVelocities]:
+        """Return the motion of the logs with columns of velocities, on uniform grids.
+
+        Args:
+            names: channels of the columns, u or v or both.
+            logs: tables with these columns.
+        """
+        measured = []
+        north, east = ("y", "x") if self._is_swapped else ("x", "y")
+        for table, motion in zip(logs, self._motions, strict=True):
+            if motion is None or not {*names} <= table.columns.keys():
+                continue
+            heading = convert_heading(table, self._psi_unit, self._pose_frame)
+
+            def resample(values: np.ndarray, t: np.ndarray, grid: np.ndarray) -> np.ndarray:
+                is_finite = np.isfinite(values) & np.isfinite(t)
+                if is_finite.sum() < 2:
+                    return np.full(grid.size, np.nan)
+                return np.interp(grid, t[is_finite], values[is_finite])
+
+            position = [resample(table.columns[n], table.t, motion.t) for n in (north, east)]
+            measured.append(
+                make_measured_velocities(
+                    motion.t,
+                    (motion.surge_velocity, motion.sway_velocity),
+                    np.stack(position, axis=1),
+                    resample(heading, table.t, motion.t),
+                    {name: resample(table.columns[name], table.t, motion.t) for name in names},
                 )
             )
+        return measured
 
-        direct = {"u": "u", "v": "v"}
-        exchanged = {"u": "v", "v": "u"}
-        best_correlation = max(
-            mean_correlation(earth_fixed_motions, direct),
-            mean_correlation(earth_fixed_motions, exchanged),
-        )
-        if (
-            best_correlation > _OVERRULING_CORRELATION
-            and best_correlation > mean_correlation(reference_mapper._motions, direct) + 0.05
-        ):
-            columns = ", ".join(self._names.pop(name) for name in axis_velocities)
-            text = f"{columns} are velocities in earth axes, not in body axes; left out"
-            self._draft_notes.add_note(CHANNELS_KEY, f"{text}: u and v are derived from positions")
+    def _rotate_to_body(self, table: RawTable, is_exchanged: bool) -> RawTable:
+        """Return a table with u and v in body axes, from north and east."""
+        if not {"u", "v", "psi"} <= table.columns.keys():
+            return table
+        heading = convert_heading(table, self._psi_unit, self._pose_frame)
+        north, east = (table.columns[name] for name in ("v", "u")[:: 1 if is_exchanged else -1])
+        u, v = rotate(north, east, -heading)
+        return RawTable(table.t, {**table.columns, "u": u, "v": v})
+
+    def _require_compatible_velocities(self) -> None:
+        """Stop where integrated velocities contradict the positions."""
+        if not {"u", "v"} <= self._names.keys():
+            self._heading_offset = estimate_drift_free_offset(
+                self._measure_velocities((), self._logs)
+            )
             return
-        for name in axis_velocities:
-            text = "assumed in body axes, consistent with position and heading"
-            self._draft_notes.add_guess((*CHANNELS_KEY, name), text)
+        tables = []
+        for table in self._logs:
+            columns = dict(table.columns)
+            for name, fit in ((n, fit_to_motion(self._logs, self._motions, n)) for n in ("u", "v")):
+                unit = parse_header_unit(self._names[name], "m/s") or fit.matching_unit("m/s")
+                factor = to_si(unit) if unit else 1.0
+                sign = -1.0 if fit.is_significant and fit.factor < 0.0 else 1.0
+                if name in columns:
+                    columns[name] = sign * factor * columns[name]
+            tables.append(RawTable(table.t, columns))
+        logs = self._measure_velocities(("u", "v"), tables)
+        contradiction = measure_contradiction(logs)
+        if contradiction is not None:
+            require_compatible(contradiction, [self._names[name] for name in ("u", "v")])
+            self._heading_offset = contradiction.heading_offset
 
     def _score_consistency(self, motions: Sequence[Motion | None]) -> float:
         """Return the consistency of position, heading and velocities, at most 1."""
@@ -1068,16 +1145,13 @@ class ChannelMapper:
             )
         if name == "psi":
             if MAGNETIC_PATTERN.search(column):
-                text = (
-                    f"'{column}' is magnetic by its name, and is assumed true: set `offset` to"
-                    " minus the magnetic declination"
-                )
-                self._draft_notes.add_guess((*CHANNELS_KEY, name), text)
+                entry |= self._correct_magnetic_heading(column)
             entry["unit"] = self._psi_unit
             return entry | ({"frame": "enu"} if self._pose_frame.is_from_east else {})
         if name in ("u", "v", "r") and {"x", "y", "psi"} <= set(self._names):
             fit = fit_to_motion(self._logs, self._motions, name)
-            return entry | self._settle_rate(name, fit, "position and heading")
+            frame = {"frame": "ned"} if self._is_earth_fixed and name in ("u", "v") else {}
+            return entry | self._settle_rate(name, fit, "position and heading") | frame
         if name == "r" and "psi" in self._names:
             return entry | self._settle_rate(
                 name, self._fit_rate_to_angle("psi", self._psi_unit, name), "headings"
@@ -1094,6 +1168,27 @@ class ChannelMapper:
             return entry | scaling.settings
         sign = -1 if name in self._sign_flipped else self._conventional_sign(name)
         return entry | {"unit": self._infer_unit(name)} | ({"sign": sign} if sign < 0 else {})
+
+    def _correct_magnetic_heading(self, column: str) -> dict[str, Any]:
+        """Return the offset of a magnetic heading from the motion, noting how it was estimated."""
+        key = (*CHANNELS_KEY, "psi")
+        offset = self._heading_offset
+        if self._pose_frame.is_from_east or offset is None or not offset.is_determined:
+            text = (
+                f"'{column}' is magnetic by its name, and is assumed true: set `offset` to"
+                " minus the magnetic declination"
+            )
+            self._draft_notes.add_guess(key, text)
+            return {}
+        factor = to_si(self._psi_unit, "rad")
+        text = (
+            f"'{column}' is magnetic by its name; the motion gives an offset of"
+            f" {np.degrees(offset.angle):.1f} deg, standard error"
+            f" {np.degrees(offset.standard_error):.1f} deg, {offset.source}: compare it with minus"
+            " the magnetic declination"
+        )
+        self._draft_notes.add_guess(key, text)
+        return {"offset": float(f"{offset.angle / factor:.3g}")}
 
     def _conventional_sign(self, name: str) -> int:
         """Return -1 for v and r of tables with a ROS pose (positive to port, REP 103), else 1."""

@@ -371,6 +371,12 @@ def _convert_entries(
                 keys[1]: sources[second_entry["column"]][1],
                 "unit": first_entry["unit"],
             }
+    if entries.get("u", {}).get("frame") == "ned":
+        north, east = (entries.pop(name) for name in ("u", "v"))
+        velocity = {"kind": "earth_fixed", "topic": topic, "unit": north["unit"]}
+        settings["velocity"] = velocity | {"north": north["column"], "east": east["column"]}
+        draft_notes.move_key((*CHANNELS_KEY, "u"), (*READER_KEY, "velocity"))
+        draft_notes.move_key((*CHANNELS_KEY, "v"), (*READER_KEY, "velocity"))
     heading = entries.pop("psi")
     topic, heading_field = sources[heading["column"]]
     settings["heading"] = {"kind": "angle", "topic": topic, "field": heading_field}
@@ -954,8 +960,8 @@ def _draft_trip_parts(
     )
     text = (
         f"files whose names differ only in {' and '.join(part_order)} are joined as one trip;"
-        " without dates in both, the clock offset is estimated from the motion that the"
-        " commands explain"
+        " the clock offset follows from a yaw rate against a heading, from dates, or from the"
+        " motion that the commands explain"
     )
     draft_notes.add_guess((*READER_KEY, "parts"), text)
     parts = {part_name: part_settings[part_name] for part_name in part_order}

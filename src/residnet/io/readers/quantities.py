@@ -27,6 +27,8 @@ _IDENTITY = (1.0, 0.0)
 _NEGATE = (-1.0, 0.0)
 _EAST_TO_NORTH = (-1.0, math.pi / 2.0)
 _EARTH_CHANNELS = ("x", "y", "z", "psi", "wind_dir", "current_north", "current_east")
+EARTH_VELOCITIES = ("u", "v")
+"""Channels of a table that are the velocities to the north and to the east in the frame `ned`."""
 QUATERNION = ("qx", "qy", "qz", "qw")
 """Channels with the parts of a quaternion, from which tables without a heading derive it."""
 COSINE_SUFFIX = "_cos"
@@ -87,16 +89,19 @@ class Conversion(Config):
             conversion_factor(self.unit, CHANNEL_UNITS.get(name))
         except ValueError as error:
             raise ValueError(f"channel {name}: {error}") from error
-        if self.frame != "as_measured" and name not in _FRAME_CONVERSIONS[self.frame]:
+        if self.frame != "as_measured" and not self.is_frame_defined(self.frame, name):
             valid_frames = (
-                ", ".join(frame for frame, table in _FRAME_CONVERSIONS.items() if name in table)
-                or "none"
+                ", ".join(f for f in _FRAME_CONVERSIONS if self.is_frame_defined(f, name)) or "none"
             )
             raise ValueError(
                 f"channel {name}: frame '{self.frame}' does not define it (frames that do:"
                 f" {valid_frames}); map the column with this quantity, with sign: -1 if it has the"
                 " opposite direction"
             )
+
+    def is_frame_defined(self, frame: Frame, name: str) -> bool:
+        """Return whether a frame defines the direction of a channel."""
+        return name in _FRAME_CONVERSIONS[frame]
 
     def si_unit_of(self, name: str) -> str:
         """Return the SI unit of the values that a channel of this name receives."""
@@ -119,7 +124,9 @@ class Conversion(Config):
             Values [T] in SI.
         """
         frame_factor, frame_offset = (
-            _FRAME_CONVERSIONS[self.frame][name] if self.frame != "as_measured" else _IDENTITY
+            _FRAME_CONVERSIONS[self.frame].get(name, _IDENTITY)
+            if self.frame != "as_measured"
+            else _IDENTITY
         )
         gain = frame_factor * self.sign * to_si(self.unit, CHANNEL_UNITS.get(name)) * self.scale
         values = gain * (raw_values - self.offset) + frame_offset
@@ -203,6 +210,11 @@ class ChannelMap(Conversion):
     hemisphere: str | None = None
     letter_o: LetterO | None = None
     hold: bool = False
+
+    def is_frame_defined(self, frame: Frame, name: str) -> bool:
+        """Return whether a frame defines a channel; u and v in `ned` are velocities to N and E."""
+        is_earth_velocity = frame == "ned" and name in EARTH_VELOCITIES
+        return is_earth_velocity or super().is_frame_defined(frame, name)
 
     @property
     def is_angle(self) -> bool:

@@ -20,7 +20,7 @@ from pydantic import Field, field_validator, model_validator
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError, UsageError
-from residnet.core.frames import unwrap_angle
+from residnet.core.frames import rotate, unwrap_angle
 from residnet.core.log import Log, Remark, make_remark
 from residnet.core.names import suggest_name, truncate
 from residnet.core.units import canonical_unit, to_si
@@ -41,6 +41,7 @@ from residnet.io.readers.clock_repair import find_unique_rows, repair_clock
 from residnet.io.readers.manoeuvre_kinds import resolve_manoeuvre
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
+    EARTH_VELOCITIES,
     QUATERNION,
     SINE_SUFFIX,
     ChannelMap,
@@ -200,6 +201,15 @@ class TableConfig(ConfiguredReader, ABC):
             raise ValueError(
                 f"a quaternion needs all of {', '.join(QUATERNION)}; add {missing_names}"
             )
+        earth_velocities = [
+            name for name in EARTH_VELOCITIES if name in channels and channels[name].frame == "ned"
+        ]
+        has_heading = {"psi", "psi" + COSINE_SUFFIX, "qw"} & channels.keys()
+        if earth_velocities and (len(earth_velocities) < 2 or not has_heading):
+            raise ValueError(
+                f"channel {earth_velocities[0]}: velocities in earth axes need both u (north) and"
+                " v (east) with frame: ned, and a heading psi"
+            )
         return channels
 
     @abstractmethod
@@ -249,6 +259,8 @@ class TableConfig(ConfiguredReader, ABC):
         findings += new_findings
         _add_yaw_of_quaternion(path, channels, channel_maps)
         _add_angles_of_components(channels)
+        if "u" in channels and channel_maps["u"].frame == "ned":
+            channels["u"], channels["v"] = rotate(channels["u"], channels["v"], -channels["psi"])
         derived_units = {"x": "m", "y": "m"}
         units = {
             n: channel_maps[n].si_unit_of(n) if n in channel_maps else derived_units.get(n, "rad")

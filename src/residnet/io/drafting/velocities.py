@@ -1,0 +1,382 @@
+"""Meaning of columns of velocities: body axes, earth axes or speed, from position and heading."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from residnet.core.errors import DataError
+from residnet.core.frames import rotate
+from residnet.preprocessing.compatibility.hypotheses import (
+    MIN_MARGIN,
+    Hypothesis,
+    choose_stretch,
+    compare,
+)
+from residnet.preprocessing.compatibility.sensors import Sensor, SensorKind
+
+MAX_CONTRADICTION = 0.1
+"""Largest share of the distance by which integrated velocities may leave the positions."""
+_MAX_UNEXPLAINED_SHARE = 0.35
+"""Largest unexplained share of the columns under a meaning that replaces the one of the names."""
+_MIN_IMPROVEMENT = 0.5
+"""Largest ratio of unexplained shares from which a meaning replaces the one of the names."""
+_CONSISTENT_SHARE = 0.1
+"""Unexplained share below which columns have the meaning of their names."""
+_MAX_COMPARED_LOGS = 2
+_MAX_NODES = 300
+_NODE_STEP = 0.5
+"""Logs, nodes and smallest step in s of the comparison by evidence."""
+_N_WINDOWS = 12
+"""Windows of a log over which velocities are integrated."""
+_MIN_HEADING_OFFSET = np.radians(2.0)
+_MAX_HEADING_OFFSET = np.radians(40.0)
+
+
+class Meaning(NamedTuple):
+    """Meaning of columns mapped to u and v.
+
+    Attributes:
+        components: components of the motion of u and v.
+        description: text for the user.
+    """
+
+    components: tuple[str, str]
+    description: str
+
+
+BODY_AXES = Meaning(("surge", "sway"), "velocities in body axes")
+EARTH_AXES = Meaning(("north", "east"), "velocities in earth axes, north and east")
+EXCHANGED_EARTH_AXES = Meaning(("east", "north"), "velocities in earth axes, east and north")
+SPEED_AS_V = Meaning(("surge", "speed"), "v is the speed")
+SPEED_AS_U = Meaning(("speed", "sway"), "u is the speed")
+_PAIR_MEANINGS = (BODY_AXES, EARTH_AXES, EXCHANGED_EARTH_AXES, SPEED_AS_V)
+_SINGLE_MEANINGS = {"u": (BODY_AXES,), "v": (BODY_AXES, SPEED_AS_V)}
+
+
+@dataclass(frozen=True)
+class MeasuredVelocities:
+    """Columns of velocities of one log, and its motion from position and heading.
+
+    Attributes:
+        t: times [T] in s of a uniform grid.
+        position: north and east [T, 2] in m.
+        heading: [T] in rad.
+        components: surge, sway, north, east, speed -> velocity [T] in m/s, from the positions.
+        columns: u, v -> column [T] in any unit.
+    """
+
+    t: np.ndarray
+    position: np.ndarray
+    heading: np.ndarray
+    components: Mapping[str, np.ndarray]
+    columns: Mapping[str, np.ndarray]
+
+
+class MeaningChoice(NamedTuple):
+    """Chosen meaning.
+
+    Attributes:
+        meaning: most likely one.
+        runner_up: the next one.
+        margin: difference of the BIC between both; infinite if it was not needed.
+        text: reasons, one line.
+    """
+
+    meaning: Meaning
+    runner_up: Meaning
+    margin: float
+    text: str
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether the user must choose."""
+        return self.margin < MIN_MARGIN
+
+
+def make_measured_velocities(
+    t: np.ndarray,
+    velocities: tuple[np.ndarray, np.ndarray],
+    position: np.ndarray,
+    heading: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+) -> MeasuredVelocities:
+    """Create the velocities of a log.
+
+    Args:
+        t: times [T] in s.
+        velocities: surge and sway [T] from the positions in m/s.
+        position: north and east [T, 2] in m.
+        heading: [T] in rad.
+        columns: u, v -> column [T].
+    """
+    surge, sway = velocities
+    north, east = rotate(surge, sway, heading)
+    components = {
+        "surge": surge,
+        "sway": sway,
+        "north": north,
+        "east": east,
+        "speed": np.hypot(surge, sway),
+    }
+    return MeasuredVelocities(t, position, heading, components, columns)
+
+
+def choose_meaning(logs: Sequence[MeasuredVelocities]) -> MeaningChoice:
+    """Choose the meaning of the columns u and v.
+
+    The columns are regressed on the components of the motion from positions. If these contradict
+    the names of the columns, the meanings are compared by their evidence.
+
+    Args:
+        logs: logs with the same columns, at least one.
+    """
+    names = [name for name in ("u", "v") if name in logs[0].columns]
+    meanings = _PAIR_MEANINGS if len(names) == 2 else _SINGLE_MEANINGS[names[0]]
+    shares = {
+        meaning: _compute_unexplained_share(logs, names, meaning.components) for meaning in meanings
+    }
+    ranking = sorted(shares, key=lambda meaning: shares[meaning])
+    best = ranking[0]
+    if (
+        len(meanings) < 2
+        or best == BODY_AXES
+        or shares[BODY_AXES] < _CONSISTENT_SHARE
+        or shares[best] > min(_MAX_UNEXPLAINED_SHARE, _MIN_IMPROVEMENT * shares[BODY_AXES])
+    ):
+        return MeaningChoice(BODY_AXES, best, np.inf, "")
+    evidence = _compare_by_evidence(logs, names, {best, BODY_AXES, *ranking[1:2]})
+    ranking = sorted(evidence, key=lambda meaning: evidence[meaning])
+    columns_text = " and ".join(names)
+    alternatives = "; ".join(
+        f"{meaning.description}: BIC {evidence[meaning] - evidence[ranking[0]]:+.0f}, unexplained"
+        f" {100.0 * shares[meaning]:.1f} %"
+        for meaning in ranking[1:]
+    )
+    text = (
+        f"{columns_text} are {ranking[0].description} (unexplained"
+        f" {100.0 * shares[ranking[0]]:.1f} %); alternatives: {alternatives}"
+        if len(names) == 2
+        else f"{ranking[0].description} (unexplained {100.0 * shares[ranking[0]]:.1f} %);"
+        f" alternatives: {alternatives}"
+    )
+    margin = evidence[ranking[1]] - evidence[ranking[0]]
+    return MeaningChoice(ranking[0], ranking[1], margin, text)
+
+
+def _fit_factors(
+    logs: Sequence[MeasuredVelocities], names: Sequence[str], components: tuple[str, str]
+) -> dict[str, float]:
+    """Regress columns on components of the motion; both columns have one factor up to the sign."""
+    products = {}
+    energies = {}
+    for name in names:
+        component = components[("u", "v").index(name)]
+        pairs = [_select_pairs(log, name, component) for log in logs]
+        products[name] = sum(float(column @ reference) for column, reference in pairs)
+        energies[name] = sum(float(reference @ reference) for _, reference in pairs)
+    size = sum(map(abs, products.values())) / max(sum(energies.values()), 1e-12)
+    signs = {name: -1.0 if products[name] < 0.0 else 1.0 for name in names}
+    if "speed" in components:
+        signs[("u", "v")[components.index("speed")]] = 1.0
+    return {name: signs[name] * size for name in names}
+
+
+def _select_pairs(
+    log: MeasuredVelocities, name: str, component: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the samples of a column and of a component without jumps of the positions."""
+    column = log.columns[name]
+    reference = log.components[component]
+    speed = log.components["speed"]
+    is_valid = np.isfinite(column) & np.isfinite(reference)
+    if is_valid.any():
+        is_valid &= speed <= 3.0 * float(np.quantile(speed[is_valid], 0.95)) + 1e-9
+    return column[is_valid], reference[is_valid]
+
+
+def _compute_unexplained_share(
+    logs: Sequence[MeasuredVelocities], names: Sequence[str], components: tuple[str, str]
+) -> float:
+    """Return the RMS residual of the columns over their RMS."""
+    factors = _fit_factors(logs, names, components)
+    residual = total = 0.0
+    for name in names:
+        component = components[("u", "v").index(name)]
+        for log in logs:
+            column, reference = _select_pairs(log, name, component)
+            residual += float(((column - factors[name] * reference) ** 2).sum())
+            total += float((column**2).sum())
+    return float(np.sqrt(residual / total)) if total > 0.0 else 1.0
+
+
+def _compare_by_evidence(
+    logs: Sequence[MeasuredVelocities], names: Sequence[str], meanings: set[Meaning]
+) -> dict[Meaning, float]:
+    """Return the BIC of each meaning beyond the best one, summed over the liveliest logs."""
+    liveliness = [float(np.nanstd(np.gradient(log.heading, log.t))) for log in logs]
+    order = np.argsort(liveliness)[::-1][:_MAX_COMPARED_LOGS]
+    totals = dict.fromkeys(meanings, 0.0)
+    for index in order.tolist():
+        log = logs[index]
+        step = max(float(np.median(np.diff(log.t))), _NODE_STEP)
+        stride = max(round(step / float(np.median(np.diff(log.t)))), 1)
+        activity = (np.gradient(log.heading, log.t)) ** 2
+        start, stop = choose_stretch(log.t, activity, step, _MAX_NODES)
+        rows = np.flatnonzero((log.t >= start) & (log.t <= stop))[::stride]
+        t = log.t[rows]
+        hypotheses = {}
+        for meaning in meanings:
+            factors = _fit_factors(logs, names, meaning.components)
+            kinds = dict(zip(("u", "v"), meaning.components, strict=True))
+            hypotheses[meaning.description] = Hypothesis(
+                [
+                    Sensor("position", t, log.position[rows]),
+                    Sensor("heading", t, log.heading[rows], min_noise_std=1e-3),
+                    *(
+                        Sensor(
+                            cast("SensorKind", kinds[name]),
+                            t,
+                            log.columns[name][rows],
+                            name=name,
+                            factor=factors[name],
+                            min_noise_std=0.005 * float(np.nanstd(log.columns[name]) + 1e-9),
+                        )
+                        for name in names
+                    ),
+                ]
+            )
+        ranking = compare(hypotheses, stride * float(np.median(np.diff(log.t))))
+        margins = {ranked.name: ranked.margin for ranked in ranking}
+        for meaning in meanings:
+            totals[meaning] += margins[meaning.description]
+    return totals
+
+
+class HeadingOffset(NamedTuple):
+    """Constant angle by which a heading is too large.
+
+    Attributes:
+        angle: in rad.
+        standard_error: over windows of all logs in rad.
+        source: how it was estimated, for the user.
+    """
+
+    angle: float
+    standard_error: float
+    source: str
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the offset differs from zero by 3.5 standard errors and more than 2 deg."""
+        return abs(self.angle) > max(3.5 * self.standard_error, _MIN_HEADING_OFFSET)
+
+
+class Contradiction(NamedTuple):
+    """Difference between integrated velocities and positions.
+
+    Attributes:
+        share: of the distance travelled that a heading offset, a scale and a current do not
+            explain.
+        heading_offset: of all logs.
+    """
+
+    share: float
+    heading_offset: HeadingOffset
+
+
+def measure_contradiction(logs: Sequence[MeasuredVelocities]) -> Contradiction | None:
+    """Compare displacements with integrals of u, v in body axes over windows of each log.
+
+    A heading offset and a scale (for all logs), and a current (for each log) are fitted, so that
+    they are no contradiction.
+
+    Args:
+        logs: logs with u and v in body axes in m/s.
+
+    Returns:
+        The difference; None without windows in motion.
+    """
+    displacements: list[complex] = []
+    integrals: list[complex] = []
+    durations: list[float] = []
+    log_numbers: list[int] = []
+    for number, log in enumerate(logs):
+        velocity = (log.columns["u"] + 1j * log.columns["v"]) * np.exp(1j * log.heading)
+        track = log.position[:, 0] + 1j * log.position[:, 1]
+        bounds = np.linspace(0, log.t.size - 1, _N_WINDOWS + 1).astype(int)
+        dt = np.diff(log.t)
+        increments = 0.5 * dt * (velocity[1:] + velocity[:-1])
+        for first, last in itertools.pairwise(bounds.tolist()):
+            integral = increments[first:last].sum()
+            displacement = track[last] - track[first]
+            if np.isfinite(integral) and np.isfinite(displacement) and last > first:
+                displacements.append(displacement)
+                integrals.append(integral)
+                durations.append(log.t[last] - log.t[first])
+                log_numbers.append(number)
+    distance = float(np.abs(displacements).sum()) if displacements else 0.0
+    if len(displacements) < _N_WINDOWS or distance <= 0.0:
+        return None
+    response = np.array(displacements)
+    columns = np.zeros((response.size, 1 + len(logs)), dtype=np.complex128)
+    columns[:, 0] = integrals
+    columns[np.arange(response.size), 1 + np.array(log_numbers)] = durations
+    solution = np.linalg.lstsq(columns, response, rcond=1e-10)[0]
+    residual = response - columns @ solution
+    gain = complex(solution[0])
+    spread = float(np.sqrt(np.mean(np.abs(residual) ** 2) / max(response.size - 3, 1)))
+    spread /= max(float(np.sqrt(np.mean(np.abs(columns[:, 0]) ** 2))), 1e-9)
+    angle = -float(np.angle(gain))
+    if abs(angle) > _MAX_HEADING_OFFSET or not 0.5 < abs(gain) < 2.0:
+        residual = response - columns[:, 0]
+        angle = 0.0
+    offset = HeadingOffset(angle, spread, "from velocities against positions")
+    return Contradiction(float(np.abs(residual).sum()) / distance, offset)
+
+
+def estimate_drift_free_offset(logs: Sequence[MeasuredVelocities]) -> HeadingOffset | None:
+    """Estimate a heading offset as the mean angle from the track to the heading.
+
+    Without measured velocities a mean drift angle and an offset cannot be separated.
+
+    Args:
+        logs: motion from positions and heading.
+    """
+    velocities = []
+    for log in logs:
+        velocity = log.components["surge"] + 1j * log.components["sway"]
+        for part in np.array_split(velocity[np.isfinite(velocity)], _N_WINDOWS):
+            if part.size:
+                velocities.append(complex(part.mean()))
+    total = complex(np.sum(velocities)) if velocities else 0j
+    if abs(total) == 0.0:
+        return None
+    angles = np.angle(np.array(velocities) * np.conj(total))
+    standard_error = float(np.std(angles) / np.sqrt(max(angles.size - 1, 1)))
+    source = "if the mean drift angle is zero"
+    return HeadingOffset(-float(np.angle(total)), standard_error, source)
+
+
+def require_compatible(contradiction: Contradiction, columns: Sequence[str]) -> None:
+    """Stop if integrated velocities leave the positions.
+
+    Args:
+        contradiction: of the logs.
+        columns: names of the columns of the velocities.
+
+    Raises:
+        DataError: if the share exceeds a tenth of the distance.
+    """
+    if contradiction.share > MAX_CONTRADICTION:
+        raise DataError(
+            f"the velocities {' and '.join(columns)}, integrated, differ from the positions by"
+            f" {100.0 * contradiction.share:.0f} % of the distance travelled (at most"
+            f" {100.0 * MAX_CONTRADICTION:.0f} % is possible); no heading offset, scale, current or"
+            " frame explains it: these channels are not one motion; check units and clocks, or"
+            " leave these columns out of a channel map"
+        )

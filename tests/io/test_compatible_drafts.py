@@ -1,0 +1,158 @@
+"""Drafts whose columns have another meaning than their names say: frames and speeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+from simulated_motion import BOATS, TrueMotion, simulate_motion
+
+from residnet.core.config import validate_config
+from residnet.core.errors import ConfigError, DataError
+from residnet.io.drafting.questions import DraftNotes
+from residnet.io.drafting.reading import DraftResult, read_drafted
+from residnet.io.readers import ReaderConfig
+
+TIMES = np.arange(0.0, 79.0, 0.2)
+
+
+def write_run(
+    path: Path, motion: TrueMotion, rng: np.random.Generator, velocities: dict[str, np.ndarray]
+) -> Path:
+    """Write a table with position, heading, yaw rate and further columns."""
+    pose = {
+        "x [m]": motion.sample("x", TIMES) + rng.normal(0.0, 0.03, TIMES.size),
+        "y [m]": motion.sample("y", TIMES) + rng.normal(0.0, 0.03, TIMES.size),
+        "psi [deg]": np.degrees(motion.sample("psi", TIMES)),
+        "r [deg/s]": np.degrees(motion.sample("r", TIMES)),
+    }
+    noisy = {name: v + rng.normal(0.0, 0.01, v.size) for name, v in velocities.items()}
+    pd.DataFrame({"t [s]": TIMES, **pose, **noisy}).to_csv(path, index=False)
+    return path
+
+
+def compute_velocities(motion: TrueMotion) -> dict[str, np.ndarray]:
+    """Return the velocities in body axes, in earth axes, and the speed and drift angle."""
+    u, v, psi = (motion.sample(name, TIMES) for name in ("u", "v", "psi"))
+    earth = (u + 1j * v) * np.exp(1j * psi)
+    return {
+        "u": u,
+        "v": v,
+        "north": earth.real,
+        "east": earth.imag,
+        "speed": np.hypot(u, v),
+        "drift": -np.degrees(np.arctan2(v, u)),
+    }
+
+
+def draft(folder: Path, columns: dict[str, str], **draft_options: object) -> DraftResult:
+    """Draft and read two runs with some velocities under other names."""
+    folder.mkdir(exist_ok=True)
+    paths = []
+    for seed in (1, 2):
+        rng = np.random.default_rng(seed)
+        motion = simulate_motion(BOATS["catamaran"], rng, duration=80.0)
+        velocities = compute_velocities(motion)
+        renamed = {name: velocities[quantity] for name, quantity in columns.items()}
+        paths.append(write_run(folder / f"run{seed}.csv", motion, rng, renamed))
+    return read_drafted(paths, DraftNotes(**draft_options))  # type: ignore[arg-type]
+
+
+def true_motion(seed: int) -> TrueMotion:
+    return simulate_motion(BOATS["catamaran"], np.random.default_rng(seed), duration=80.0)
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"u [m/s]": "north", "v [m/s]": "east"},
+        {"u [m/s]": "east", "v [m/s]": "north"},
+        {"vx [m/s]": "north", "vy [m/s]": "east"},
+    ],
+)
+def test_earth_fixed_velocities_are_rotated(tmp_path: Path, columns: dict[str, str]) -> None:
+    result = draft(tmp_path / "earth", columns)
+    channels = result.reader["channels"]
+    assert channels["u"]["frame"] == channels["v"]["frame"] == "ned"
+    assert columns[channels["u"]["column"]] == "north"
+    for seed, log in enumerate(result.logs.values(), 1):
+        motion = true_motion(seed)
+        for name in ("u", "v"):
+            errors = log[name] - motion.sample(name, TIMES)
+            assert float(np.sqrt(np.mean(errors**2))) < 0.03
+    reasons = [text for _, text in result.draft_notes.guessed_values]
+    assert any("earth axes" in text and "BIC +" in text for text in reasons)
+
+
+def test_body_velocities_stay(tmp_path: Path) -> None:
+    result = draft(tmp_path / "body", {"u [m/s]": "u", "v [m/s]": "v"})
+    assert "frame" not in result.reader["channels"]["u"]
+    log = next(iter(result.logs.values()))
+    assert log["v"] == pytest.approx(true_motion(1).sample("v", TIMES), abs=0.06)
+
+
+def test_speed_beside_a_drift_angle_is_no_sway(tmp_path: Path) -> None:
+    result = draft(tmp_path / "speed", {"V [m/s]": "speed", "Drift angle [deg]": "drift"})
+    assert "v" not in result.reader["channels"]
+    assert any("v is the speed" in text for _, text in result.draft_notes.notes)
+    named = draft(tmp_path / "sway", {"v [m/s]": "v"})
+    assert named.reader["channels"]["v"]["column"] == "v [m/s]"
+
+
+def test_velocities_of_another_run_stop_the_draft(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    motion = simulate_motion(BOATS["catamaran"], rng, duration=80.0)
+    other = compute_velocities(
+        simulate_motion(BOATS["catamaran"], np.random.default_rng(9), duration=80.0)
+    )
+    turned = {"u [m/s]": other["north"], "v [m/s]": other["east"]}
+    path = write_run(tmp_path / "run.csv", motion, rng, turned)
+    with pytest.raises(DataError, match=r"integrated, differ from the positions by \d+ %"):
+        read_drafted([path], DraftNotes())
+
+
+def test_earth_velocities_need_both_columns_and_a_heading() -> None:
+    entry = {"column": "u", "unit": "m/s", "frame": "ned"}
+    settings = {"kind": "csv", "time": {"column": "t"}, "channels": {"u": entry}}
+    with pytest.raises(ConfigError, match=r"both u .north. and v .east."):
+        validate_config(settings, ReaderConfig, "draft")
+
+
+@pytest.mark.parametrize("has_velocities", [True, False])
+def test_magnetic_heading_gets_the_offset_of_the_motion(
+    tmp_path: Path, has_velocities: bool
+) -> None:
+    rng = np.random.default_rng(4)
+    motion = simulate_motion(BOATS["catamaran"], rng, duration=80.0)
+    velocities = {"u [m/s]": motion.sample("u", TIMES), "v [m/s]": motion.sample("v", TIMES)}
+    path = write_run(tmp_path / "run.csv", motion, rng, velocities if has_velocities else {})
+    table = pd.read_csv(path)
+    table = table.rename(columns={"psi [deg]": "Heading magnetic [deg]"})
+    table["Heading magnetic [deg]"] -= 12.4
+    table.to_csv(path, index=False)
+    result = read_drafted([path], DraftNotes())
+    offset = result.reader["channels"]["psi"]["offset"]
+    assert offset == pytest.approx(-12.4, abs=0.5 if has_velocities else 3.0)
+    (log,) = result.logs.values()
+    errors = np.degrees(log["psi"] - motion.sample("psi", TIMES))
+    assert float(np.abs((errors + 180.0) % 360.0 - 180.0).max()) < 3.5
+    reasons = [text for _, text in result.draft_notes.guessed_values]
+    source = "velocities against positions" if has_velocities else "mean drift angle is zero"
+    assert any(source in reason for reason in reasons)
+
+
+def test_earth_fixed_velocities_of_a_matlab_struct(tmp_path: Path) -> None:
+    motion = true_motion(1)
+    velocities = compute_velocities(motion)
+    columns = {name: motion.sample(name, TIMES) for name in ("x", "y", "psi", "r")}
+    columns |= {"u": velocities["north"], "v": velocities["east"], "time": TIMES}
+    path = tmp_path / "run.mat"
+    scipy.io.savemat(path, {"run": columns})
+    result = read_drafted([path], DraftNotes())
+    assert result.reader["velocity"]["kind"] == "earth_fixed"
+    (log,) = result.logs.values()
+    errors = log["v"] - np.interp(log.t, TIMES, motion.sample("v", TIMES))
+    assert float(np.nanmax(np.abs(errors))) < 0.1
