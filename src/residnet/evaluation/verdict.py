@@ -225,6 +225,8 @@ def longest_good_horizon(evidence: VerdictEvidence) -> float:
     for horizon_entry in known_horizons(evidence):
         if not _has_enough_data(evidence, horizon_entry):
             return longest_horizon
+        if contradicts_positions(horizon_entry):
+            continue
         models = horizon_entry["models"]
         selected_errors = models[evidence.selected]
         error_intervals = models[evidence.selected]["intervals"]
@@ -259,6 +261,15 @@ def longest_good_horizon(evidence: VerdictEvidence) -> float:
                 return longest_horizon
         longest_horizon = float(horizon_entry["seconds"])
     return longest_horizon
+
+
+def contradicts_positions(horizon_entry: JsonObject) -> bool:
+    """Return whether measured velocities, integrated, leave the positions by a tenth of the way.
+
+    Then velocities and positions are not one motion, and no model is good by them.
+    """
+    floor = float(horizon_entry["floor"].get("position", 0.0))
+    return floor > _MAX_DISTANCE_SHARE * float(horizon_entry["sailed"])
 
 
 def describe_horizons(evidence: VerdictEvidence) -> list[str]:
@@ -341,8 +352,17 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
         + f" at mean speeds of {format_number(main_entry['slowest'], 2)} to"
         f" {format_number(main_entry['fastest'], 2)} m/s" * has_position + "."
     )
+    contradiction_sentences = []
+    if contradicts_positions(main_entry):
+        share = main_entry["floor"]["position"] / main_entry["sailed"]
+        contradiction_sentences = [
+            "The measured velocities, integrated, leave the measured positions by"
+            f" {100.0 * share:.0f} % of the way: check frames, units and clocks of both before any"
+            " model is used."
+        ]
     return [
         lead_sentence,
+        *contradiction_sentences,
         f"Reference models:"
         f" {'; '.join([*reference_texts, *([noise_floor_text] if has_noise_floor else [])])}.",
         *criterion_sentences,
