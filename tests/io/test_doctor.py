@@ -104,6 +104,13 @@ TOLD: list[tuple[Log, str, str, str, dict[str, float]]] = [
     (changed(psi=PSI - 1.2), "frames", "will mislead", "+68.8 deg added", {"best_offset": 1.2}),
     (KNOTS, "frames", "will mislead", "kn taken as m/s", {"speed_ratio": 1.944}),
     (changed(psi=PSI + 0.14), "frames", "will mislead", "compass offset", {"offset": -0.14}),
+    (
+        changed(r=9.0 * np.sign(LOG["r"])),
+        "impossible_rate",
+        "will mislead",
+        "than a vessel can",
+        {},
+    ),
     (changed(r=-LOG["r"]), "follows_r", "will mislead", "opposite sign", {"correlation": -1}),
     (changed(r=np.degrees(LOG["r"])), "follows_r", "will mislead", "deg/s taken as rad/s", {}),
     (changed(r=RANDOM.normal(size=50).repeat(40) / 20), "follows_r", "fatal", "one motion", {}),

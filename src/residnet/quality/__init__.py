@@ -64,6 +64,9 @@ STAGE_DESCRIPTIONS = {
 }
 """Stage -> state of the log that its checks receive, in the order of execution."""
 
+_VELOCITY_DEPENDENT = ("propeller_sign", "rudder_bias")
+"""Codes of findings about actuators that need velocities in correct frames."""
+
 
 def inspect_log(
     log: Log, inputs: Sequence[str] | None = None, masks: Sequence[MaskRule] = ()
@@ -110,10 +113,15 @@ def inspect_log(
     ]
     invalid = np.logical_or.reduce([np.zeros(len(log), dtype=bool), *invalid_masks])
     trusted_statistics = statistics if invalid.mean() > 0.5 else statistics.mask_samples(invalid)
-    findings += _check_on_grid(trusted_statistics)
+    grid_findings = _check_on_grid(trusted_statistics)
+    actuator_findings = run_checks("actuators", trusted_statistics)
+    if any(finding.code == "frames" and finding.level != "note" for finding in grid_findings):
+        # signs and offsets of actuators follow from velocities, which are wrong
+        actuator_findings = [f for f in actuator_findings if f.code not in _VELOCITY_DEPENDENT]
     findings += [
+        *grid_findings,
         *run_checks("inputs", statistics),
-        *run_checks("actuators", trusted_statistics),
+        *actuator_findings,
         *run_checks("excitation", statistics),
     ]
     masked = ~apply_masks(log, masks).usable if masks else np.zeros(len(log), dtype=bool)

@@ -549,9 +549,16 @@ def check_contradicting_logs(logs: LogSet, make_finding: Check) -> Iterator[Find
     if dead_steering:
         # without the steering no log explains another
         return
+    # no log is accused by a model that does not explain the agreeing logs
+    adequate = consensus.adequate if consensus.outliers else None
+    if adequate is None:
+        return
+    consensus = adequate
     fleet = consensus.fleet
     n_inliers = len(consensus.inliers)
     for i in consensus.outliers:
+        if not consensus.is_outlier(i):
+            continue
         log = fleet.logs[i]
         hypothesis = rank_hypotheses(consensus, i)[0]
         split = logs.splits.get(log.name, "")

@@ -83,6 +83,13 @@ MIN_CONTAMINATION = 1.6
 1.5 at most without one (`quickstart`; 1 in 48 random fleets); more in 33 of 36 random fleets in
 which two logs share a fault.
 """
+MAX_LACK_OF_FIT = 1.25
+"""RMSE of the agreeing logs over that with terms of third degree, above which terms are missing."""
+MAX_UNEXPLAINED_MOTION = 0.35
+"""Unexplained share of the motion of the agreeing logs above which no log is accused.
+
+It is .02 to .31 in fleets with valid records (scripts/bench/fleets.py).
+"""
 RANGE_MARGIN = 0.1
 """Share of the inliers' range by which an input may exceed it without extrapolation."""
 SIZE_MARGIN = 0.02
@@ -120,6 +127,7 @@ def compute_block_features(
     inputs: Sequence[str],
     *,
     homogeneous: bool,
+    enriched: bool = False,
 ) -> list[np.ndarray]:
     """Compute the regression features of a log, one array per feature.
 
@@ -131,7 +139,22 @@ def compute_block_features(
         homogeneous: forces of second degree in velocities and revolutions only, as of a hull in
             water, which extrapolate to other speeds; else a polynomial with constant and linear
             terms, which fits more vessels.
+        enriched: all features of both forms and terms of third degree, for the test of lack of fit.
     """
+    if enriched:
+        forms = [
+            compute_block_features(log, units, velocities, inputs, homogeneous=form)
+            for form in (False, True)
+        ]
+        columns = [*forms[0], *forms[1]]
+        states = [log[name] for name in velocities]
+        drives = [log[n] for n in inputs if not n.startswith(("wind", "current"))]
+        columns += [x**3 for x in states]
+        columns += [a * a * b for a, b in itertools.permutations(states, 2)]
+        if len(drives) <= 4:
+            columns += [a**3 for a in drives]
+            columns += [np.abs(x) * a for a in drives for x in states[1:]]
+        return columns
     states = [log[name] for name in velocities]
     u = states[0]
     columns = [x * np.abs(x) for x in states]
@@ -328,9 +351,11 @@ class Fleet:
         if errors[False] < POLYNOMIAL_PREFERENCE * errors[True]:
             self._standardize(homogeneous=False)
 
-    def _standardize(self, *, homogeneous: bool) -> float:
+    def _standardize(self, *, homogeneous: bool, enriched: bool = False) -> float:
         """Set the data in one form of features; return the median leave-one-out error."""
         self.homogeneous = homogeneous
+        self.enriched = enriched
+        self.__dict__.pop("feature_groups", None)
         raw = [self.assemble(log) for log in self.logs]
         self.usable = [i for i, data in enumerate(raw) if data.is_sufficient]
 
@@ -363,7 +388,12 @@ class Fleet:
             samples = {name: log[name][sample_index] for name in needed}
             dt = np.diff(log.t[sample_index], axis=1)
             columns = compute_block_features(
-                samples, log.units, self.velocities, self.inputs, homogeneous=self.homogeneous
+                samples,
+                log.units,
+                self.velocities,
+                self.inputs,
+                homogeneous=self.homogeneous,
+                enriched=self.enriched,
             )
             trapezoids = [0.5 * ((c[:, 1:] + c[:, :-1]) * dt).sum(1) for c in columns]
             integrals.append(np.stack(trapezoids, axis=-1))
@@ -394,6 +424,12 @@ class Fleet:
         copied_fleet = copy.copy(self)
         copied_fleet.data = [data.get(i, current) for i, current in enumerate(self.data)]
         return copied_fleet
+
+    def enrich(self) -> Fleet:
+        """Return the fleet with terms of third degree among the features."""
+        enriched_fleet = copy.copy(self)
+        enriched_fleet._standardize(homogeneous=self.homogeneous, enriched=True)
+        return enriched_fleet
 
     def fit_leave_one_out(self, members: Sequence[int], of: Iterable[int]) -> dict[int, RidgeFit]:
         """Fit the members once for each log, without that log.
@@ -580,6 +616,27 @@ class Consensus:
     def has_majority(self) -> bool:
         """Whether more than half of the logs are inliers, so that the outliers are wrong."""
         return len(self.inliers) > max(1.0, len(self.fleet.usable) / 2.0)
+
+    @cached_property
+    def adequate(self) -> Consensus | None:
+        """The consensus whose model explains the agreeing logs; None if no model does.
+
+        Where terms of third degree explain the inliers clearly better, the features lack terms of
+        the vessel (lack of fit), and a log with another manoeuvre is no contradiction. Then the
+        model with these terms decides.
+        """
+        if len(self.inliers) < 2:
+            return self
+        enriched = Consensus(self.fleet.enrich(), self.inliers, self.outliers)
+        ratios = [
+            self.excess_var[i]
+            / np.maximum(enriched.excess_var[i], 1e-2 * self.fleet.data[i].noise_var + 1e-12)
+            for i in self.inliers
+        ]
+        has_lack_of_fit = float(np.median(ratios, axis=0).max()) > MAX_LACK_OF_FIT**2
+        consensus = enriched if has_lack_of_fit else self
+        is_explained = float(consensus.compute_residual_share().max()) < MAX_UNEXPLAINED_MOTION
+        return consensus if is_explained else None
 
     def compute_rmse_ratio(self, i: int) -> float:
         """Return the RMSE of a log over the usual RMSE, for its worst velocity."""

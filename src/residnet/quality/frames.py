@@ -51,6 +51,7 @@ _CONVENTION_TEXTS = {
     ("y reversed", -90): "x and y exchanged (x is north, y is east)",
     ("v reversed", 0): "v positive to port (frame: body_fpu)",
     ("v reversed", 180): "u positive astern (sign: -1)",
+    ("earth axes", 0): "u, v as velocities in earth axes (frame: ned)",
 }
 _PLANAR_MOTION = (*POSE_NAMES, "u", "v")
 
@@ -138,6 +139,7 @@ def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
             "v reversed": trapezoidal_mean(
                 np.exp(1j * log["psi"]) * (u - 1j * v), position_half_window
             ),
+            "earth axes": trapezoidal_mean(u + 1j * v, position_half_window),
         },
         central_difference(log["psi"], yaw_half_window),
         {
@@ -178,9 +180,27 @@ class FrameAgreement:
     speed_ratio: float
 
     @property
+    def best_name(self) -> str:
+        """Convention with the largest coherence; on a straight course the declared one."""
+        return max(
+            self.overlaps,
+            key=lambda name: abs(self.overlaps[name]) + 1e-3 * (name == "as declared"),
+        )
+
+    @property
+    def is_better_undeclared(self) -> bool:
+        """Whether another convention leaves less than half of the incoherence of the declared."""
+        best = abs(self.overlaps[self.best_name])
+        declared = self.overlaps["as declared"].real
+        is_material = best > declared + 0.02 or 1.0 - best < 0.1 * (1.0 - declared)
+        is_half = best > 0.8 and 1.0 - best < 0.5 * (1.0 - declared)
+        return self.best_name != "as declared" and is_half and is_material
+
+    @property
     def is_consistent(self) -> bool:
         """Whether frames and units agree, so that smaller inconsistencies can be estimated."""
-        return self.overlaps["as declared"].real > 0.8 and 0.8 < self.speed_ratio < 1.25
+        is_declared = self.overlaps["as declared"].real > 0.8 and not self.is_better_undeclared
+        return is_declared and 0.8 < self.speed_ratio < 1.25
 
 
 def compare_frames(log: LogStatistics) -> FrameAgreement | None:
@@ -228,8 +248,7 @@ def check_frames(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     speed_ratio = agreement_.speed_ratio
     declared_coherence = overlaps["as declared"].real
     heading_offset_deg = math.degrees(np.angle(overlaps["as declared"]))
-    # on a straight course all conventions agree equally: the declared one is preferred
-    best_name = max(overlaps, key=lambda name: abs(overlaps[name]) + 1e-3 * (name == "as declared"))
+    best_name = agreement_.best_name
     best_coherence = abs(overlaps[best_name])
     best_offset_deg = math.degrees(np.angle(overlaps[best_name]))
     text = (
@@ -238,14 +257,8 @@ def check_frames(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     )
     level: Level = "will mislead"
     fix = None
-    is_better = (
-        best_name != "as declared"
-        and best_coherence > 0.8
-        and 1.0 - best_coherence < 0.5 * (1.0 - declared_coherence)
-    )
-    if (declared_coherence < 0.8 and best_coherence > declared_coherence + 0.1) or (
-        is_better and best_coherence > declared_coherence + 0.02
-    ):
+    is_much_better = declared_coherence < 0.8 and best_coherence > declared_coherence + 0.1
+    if is_much_better or agreement_.is_better_undeclared:
         convention_text = f"{best_name}, {best_offset_deg:+.1f} deg added to psi"
         for (name, nominal_angle), description in _CONVENTION_TEXTS.items():
             if (
@@ -348,7 +361,10 @@ def _report_jumps(
 def check_course_as_heading(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report a heading that equals the course over ground although the vessel drifts."""
     averaged_rates = log.cached(compute_averaged_rates)
-    if not {"u", "v"} <= averaged_rates.averaged_velocities.keys():
+    agreement = log.cached(compare_frames)
+    # velocities in earth axes have no drift angle
+    is_earth_fixed = agreement is not None and agreement.best_name == "earth axes"
+    if not {"u", "v"} <= averaged_rates.averaged_velocities.keys() or is_earth_fixed:
         return
     drift_angles = np.angle(
         averaged_rates.averaged_velocities["u"] + 1j * averaged_rates.averaged_velocities["v"]

@@ -717,3 +717,40 @@ def check_velocity_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Fi
                 sample_mask=np.append(False, is_jump) | np.append(is_jump, False),
                 channels=(name,),
             )
+
+
+_MAX_SPEED = 75.0
+"""Largest speed of a vessel in m/s, about 150 kn."""
+_MAX_TURN_RATE = 2.0 * math.pi
+"""Largest yaw rate of a vessel in rad/s, one turn per second."""
+_RATE_INTERVAL = 1.0
+"""Shortest time in s over which rates are implied, so that noise of dense samples counts less."""
+
+
+@check("values", "impossible_rate", fix="check units and times, or whether rows are of two vessels")
+def check_impossible_rates(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report speeds and turns beyond what a vessel can do, measured or implied by the pose."""
+    stride = max(math.ceil(_RATE_INTERVAL / log.sampling_interval), 1)
+    dt = np.maximum(log.t[stride:] - log.t[:-stride], 1e-9)
+    rates = {}
+    if "x" in log and "y" in log:
+        track = log["x"] + 1j * log["y"]
+        rates["the speed from x, y"] = (np.abs(track[stride:] - track[:-stride]) / dt, _MAX_SPEED)
+    if "psi" in log:
+        rates["the rate of psi"] = (
+            np.abs(log["psi"][stride:] - log["psi"][:-stride]) / dt,
+            _MAX_TURN_RATE,
+        )
+    rates |= {name: (np.abs(log[name]), _MAX_SPEED) for name in ("u", "v") if name in log}
+    rates |= {"r": (np.abs(log["r"]), _MAX_TURN_RATE)} if "r" in log else {}
+    for name, (values, limit) in rates.items():
+        is_impossible = np.nan_to_num(values) > limit
+        # single samples are outliers, which other checks report
+        if is_impossible.sum() > max(0.01 * values.size, 2):
+            unit = "rad/s" if limit == _MAX_TURN_RATE else "m/s"
+            text = (
+                f"{name} reaches {format_quantity(float(np.nanmax(values)), unit)}, more than a"
+                f" vessel can ({format_quantity(limit, unit)}), in"
+                f" {format_share(float(is_impossible.mean()))} of the samples"
+            )
+            yield make_finding(text, {"share": float(is_impossible.mean())})

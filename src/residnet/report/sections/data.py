@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Sequence
 from typing import Any
 
@@ -76,6 +77,8 @@ def fit_data_section(run: RunFiles) -> Section | None:
                 "Data quality", [summary_table, Section("Log by log", [log_table], is_folded=True)]
             )
         ]
+    if compatibility := run.read_json("compatibility.json"):
+        blocks.append(Section("Instrument errors", compatibility_tables(compatibility)))
     if currents := run.read_json("currents.json"):
         blocks.append(Section("Currents", [_currents_table(run, currents)], is_folded=True))
     return Section("What was fitted on what", blocks) if blocks else None
@@ -101,6 +104,73 @@ def _currents_table(run: RunFiles, currents: Any) -> Table:
         " standard error: as far as the two halves of a log agree. Errors of this page are those of"
         " the motion through the water.",
     )
+
+
+def compatibility_tables(rows: Sequence[JsonObject]) -> list[Block]:
+    """Return the instrument errors over all logs, and the meaning of the velocities of each log.
+
+    Args:
+        rows: content of compatibility.json.
+    """
+    errors: dict[str, list[JsonObject]] = {}
+    for row in rows:
+        for error in row["errors"]:
+            errors.setdefault(error["name"], []).append(error)
+
+    def median(members: Sequence[JsonObject], key: str) -> float:
+        return statistics.median(float(error[key]) for error in members)
+
+    def scale_text(members: Sequence[JsonObject], key: str) -> str:
+        unit = members[0]["unit"]
+        factor = DEGREES_PER_RADIAN if unit.startswith("rad") else 1.0
+        text = format_number(factor * median(members, key), 2)
+        return text if unit == "-" else f"{text} {unit.replace('rad', 'deg')}"
+
+    def source(members: Sequence[JsonObject]) -> str:
+        n_determined = sum(bool(error["is_determined"]) for error in members)
+        return "sensors" if 2 * n_determined > len(members) else "smoothness only"
+
+    def count_significant(members: Sequence[JsonObject]) -> str:
+        return f"{sum(bool(e['is_significant']) for e in members)} of {len(members)}"
+
+    error_table = build_table(
+        errors.values(),
+        [
+            ("instrument error", lambda members: members[0]["name"]),
+            ("median estimate", lambda members: scale_text(members, "value")),
+            ("median standard error", lambda members: scale_text(members, "standard_error")),
+            ("determined by", source),
+            ("logs where significant", count_significant),
+        ],
+        caption="Errors of the instruments, estimated from the kinematics alone. A clock is the"
+        " time to add to that of the sensor. An error that only the smoothness of the motion"
+        " determines is no finding.",
+    )
+
+    def current_text(row: JsonObject) -> str:
+        current = row.get("current")
+        if not current:
+            return DASH
+        size = math.hypot(current["north"], current["east"])
+        verdict = "significant" if current["is_significant"] else "not significant"
+        error = format_number(current["standard_error"], 2)
+        p_value = format_number(current["p_value"], 1)
+        return f"{format_number(size, 2)} ± {error} m/s, p = {p_value}, {verdict}"
+
+    log_table = build_table(
+        rows,
+        [
+            ("log", lambda row: row["log"]),
+            ("velocities", lambda row: row["meaning"] or row["reason"] or "not measured"),
+            ("runner-up", lambda row: row["runner_up"] or DASH),
+            (
+                "margin (BIC)",
+                lambda row: format_number(row["margin"], 3) if row["meaning"] else DASH,
+            ),
+            ("current (likelihood-ratio test)", current_text),
+        ],
+    )
+    return [*([error_table] if errors else []), log_table]
 
 
 def _data_text(run: RunFiles) -> str:

@@ -33,6 +33,8 @@ from residnet.runs.task import ExportWriters, SummaryMetric, TaskOutcome
 if TYPE_CHECKING:
     from residnet.tasks.fit.config import FitConfig
 
+_MAX_ANALYSED_LOGS = 6
+"""Largest number of logs with a table of instrument errors, about a second each."""
 EXTERNAL_SPLIT = "external"
 """Name of the split of logs that no fit has seen."""
 
@@ -48,6 +50,7 @@ def write_inspection(
         inspect_log_set,
         summarize_inspection,
     )
+    from residnet.quality.compatibility import analyse_compatibility
 
     begin_stage("examining logs")
     inputs = config.signals.regressor_columns
@@ -59,6 +62,10 @@ def write_inspection(
     for report in reports:
         for finding in report.find_by_code("fill_values"):
             log_message(f"  {report.name}: {finding.text}")
+    if not isinstance(config.data, SimulatedTrials):
+        # instruments of simulated logs have the declared noise and no errors
+        rows = [analyse_compatibility(log).model_dump() for log in logs[:_MAX_ANALYSED_LOGS]]
+        folder.write_json(folder.path / "compatibility.json", rows)
     inspection_json = build_inspection(reports, joint_report)
     folder.write_json(folder.path / "doctor.json", inspection_json)
     # a correctable error is reported before the fit takes its time; the verdict counts all findings

@@ -1,0 +1,51 @@
+"""A log with another manoeuvre is accused of nothing where the check's model lacks terms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from residnet.core.log import Log
+from residnet.quality import inspect_log_set
+
+
+def sail(seed: int, speed: float, rudder: float, *, rudder_scale: float = 1.0) -> Log:
+    """Return a run of a boat with cubic damping and yaw damping that grows with the speed."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 120.0, 0.1)
+    n = speed * rng.uniform(0.6, 1.0, 40)[(t / 4.0).astype(int)]
+    delta = rudder * rng.uniform(-1.0, 1.0, 60)[(t / 3.0).astype(int)]
+    u, v, r = np.zeros((3, t.size))
+    u[0] = 0.7 * speed
+    for k in range(t.size - 1):
+        surge = 0.5 * n[k] ** 2 - 0.2 * u[k] - 0.12 * u[k] ** 3 - 1.5 * r[k] ** 2 * u[k]
+        sway = -0.8 * v[k] - 2.0 * v[k] ** 3 - 0.5 * u[k] * r[k]
+        yaw = 0.9 * u[k] ** 2 * np.sin(2.0 * delta[k]) - (1.0 + 0.5 * u[k] ** 2) * r[k]
+        yaw -= 6.0 * r[k] ** 3 + 0.8 * np.abs(v[k]) * r[k]
+        for values, rate in ((u, surge), (v, sway), (r, yaw)):
+            values[k + 1] = values[k] + 0.1 * rate
+    psi = np.cumsum(r) * 0.1
+    velocity = (u + 1j * v) * np.exp(1j * psi)
+    position = np.cumsum(velocity) * 0.1
+    noise = {name: rng.normal(0.0, 0.005, t.size) for name in "uvr"}
+    channels = {"x": position.real, "y": position.imag, "psi": psi}
+    channels |= {"u": u + noise["u"], "v": v + noise["v"], "r": r + noise["r"]}
+    return Log(f"run{seed}", t, {**channels, "n": n, "delta": rudder_scale * delta})
+
+
+@pytest.mark.parametrize("seed", [0, 10, 20])
+def test_other_manoeuvres_are_no_contradiction(seed: int) -> None:
+    gentle = [sail(seed + k, 1.5 + 0.1 * k, 0.2) for k in range(6)]
+    fast = [sail(seed + 7, 2.6, 0.6), sail(seed + 8, 2.4, 0.1)]
+    report = inspect_log_set([*gentle, *fast], ["n", "delta"])
+    accusing = [f for f in report.findings if f.code.startswith("contradicts")]
+    assert [finding.to_line for finding in accusing] == []
+
+
+def test_a_scaled_rudder_is_still_a_contradiction() -> None:
+    logs = [sail(30 + k, 1.5 + 0.1 * k, 0.3) for k in range(7)]
+    logs.append(sail(40, 1.8, 0.3, rudder_scale=2.0))
+    report = inspect_log_set(logs, ["n", "delta"])
+    accusing = [f for f in report.findings if f.code.startswith("contradicts")]
+    assert [finding.code for finding in accusing] == ["contradicts_scale"]
+    assert accusing[0].text.startswith("run40")
