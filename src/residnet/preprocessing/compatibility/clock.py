@@ -174,14 +174,9 @@ def _refine_offset(
     max_interval = 3.5 * float(np.median(intervals)) + 1e-9
     in_overlap &= intervals[next_sample - 1] < max_interval
     t = heading_times[in_overlap]
-    # the integral of the gyro's noise is a random walk: a piecewise linear function absorbs it
-    n_knots = int(np.clip((stop - start) / _KNOT_SECONDS, 2, _MAX_KNOTS))
-    knots = np.linspace(start, stop, n_knots)
-    walk = np.maximum(1.0 - np.abs(t[:, None] - knots) / (knots[1] - knots[0]), 0.0)
-    # the integral over a gap is unknown: one step at each of the longest gaps
-    longest_gaps = np.argsort(intervals)[-_MAX_GAPS:]
-    gap_times = rate_times[longest_gaps[intervals[longest_gaps] >= max_interval]] + coarse.seconds
-    nuisance = np.column_stack((walk, (t[:, None] > gap_times).astype(np.float64)))
+    nuisance = _make_nuisance_columns(
+        t, (float(start), float(stop)), rate_times + coarse.seconds, max_interval
+    )
     response = heading[in_overlap]
     if t.size < 30:
         return coarse
@@ -213,12 +208,28 @@ def _refine_offset(
             break
     if abs(seconds - coarse.seconds) > 5.0 * max(coarse.standard_error, 0.2):
         return coarse
+    standard_error = _compute_standard_error(columns, residual, weights)
+    return coarse._replace(
+        seconds=seconds, standard_error=standard_error, drift=drift, middle=middle
+    )
+
+
+def _compute_standard_error(
+    columns: np.ndarray, residual: np.ndarray, weights: np.ndarray
+) -> float:
+    """Return the standard error of the first coefficient of a weighted regression.
+
+    Args:
+        columns: design matrix [N, k].
+        residual: [N].
+        weights: [N].
+    """
     scales = np.abs(columns).max(axis=0)
     scales[scales == 0.0] = 1.0
     scaled = columns / scales
     bread = np.linalg.pinv(scaled.T @ (scaled * weights[:, None]))
     scores = scaled * (weights * residual)[:, None]
-    sections = (np.arange(t.size) * _N_SECTIONS) // t.size
+    sections = (np.arange(residual.size) * _N_SECTIONS) // residual.size
     section_scores = np.stack([scores[sections == k].sum(axis=0) for k in range(_N_SECTIONS)])
     covariance = bread @ section_scores.T @ section_scores @ bread
     covariance *= _N_SECTIONS / (_N_SECTIONS - 1.0)
@@ -226,10 +237,30 @@ def _refine_offset(
     centred = residual - residual.mean()
     energy = max(float(centred @ centred), 1e-300)
     autocorrelation = min(max(float(centred[1:] @ centred[:-1]) / energy, 0.0), 0.98)
-    degrees_of_freedom = max(t.size - columns.shape[1], 1)
+    degrees_of_freedom = max(residual.size - columns.shape[1], 1)
     variance = float((weights * residual**2).sum()) / degrees_of_freedom
     variance *= (1.0 + autocorrelation) / (1.0 - autocorrelation)
-    standard_error = float(np.sqrt(max(covariance[0, 0], variance * bread[0, 0])) / scales[0])
-    return coarse._replace(
-        seconds=seconds, standard_error=standard_error, drift=drift, middle=middle
-    )
+    return float(np.sqrt(max(covariance[0, 0], variance * bread[0, 0])) / scales[0])
+
+
+def _make_nuisance_columns(
+    t: np.ndarray, overlap: tuple[float, float], rate_times: np.ndarray, max_interval: float
+) -> np.ndarray:
+    """Return columns [N, k] for the difference between a heading and the integral of a yaw rate.
+
+    Args:
+        t: times of the heading [N] in s.
+        overlap: start and stop of both recordings in s.
+        rate_times: times of the yaw rate in s on the same clock.
+        max_interval: longest interval of the yaw rate that is no gap, in s.
+    """
+    # the integral of the gyro's noise is a random walk: a piecewise linear function absorbs it
+    start, stop = overlap
+    n_knots = int(np.clip((stop - start) / _KNOT_SECONDS, 2, _MAX_KNOTS))
+    knots = np.linspace(start, stop, n_knots)
+    walk = np.maximum(1.0 - np.abs(t[:, None] - knots) / (knots[1] - knots[0]), 0.0)
+    # the integral over a gap is unknown: one step at each of the longest gaps
+    intervals = np.diff(rate_times)
+    longest_gaps = np.argsort(intervals)[-_MAX_GAPS:]
+    gap_times = rate_times[longest_gaps[intervals[longest_gaps] >= max_interval]]
+    return np.column_stack((walk, (t[:, None] > gap_times).astype(np.float64)))

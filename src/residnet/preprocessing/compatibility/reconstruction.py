@@ -176,6 +176,9 @@ class _Residuals:
         by_state: state (those of the next node follow after the ninth) -> derivative [N].
         by_error: index of an error -> derivative [N].
         sensor: sensor of a measurement; None for a dynamic equation.
+        squares: squared norm [N] over all columns of the sensor, so that the weights of a position
+            do not depend on its axes; None for a dynamic equation.
+        dimension: number of columns of the sensor.
     """
 
     group: str
@@ -184,20 +187,23 @@ class _Residuals:
     by_state: dict[int, np.ndarray]
     by_error: dict[int, np.ndarray] = field(default_factory=dict)
     sensor: Sensor | None = None
+    squares: np.ndarray | None = None
+    dimension: int = 1
 
     @property
     def weights(self) -> np.ndarray | float:
         """Weights [N] of the Student distribution."""
-        if self.sensor is None:
+        if self.squares is None:
             return 1.0
-        return np.asarray((_STUDENT_DOF + 1.0) / (_STUDENT_DOF + self.values**2))
+        return np.asarray((_STUDENT_DOF + self.dimension) / (_STUDENT_DOF + self.squares))
 
     @property
     def cost(self) -> float:
-        """Minus twice the log-density without constants."""
-        if self.sensor is None:
+        """Minus twice the log-density without constants; the share of one column."""
+        if self.squares is None:
             return float(self.values @ self.values)
-        return float((_STUDENT_DOF + 1.0) * np.log1p(self.values**2 / _STUDENT_DOF).sum())
+        exponent = (_STUDENT_DOF + self.dimension) / self.dimension
+        return float(exponent * np.log1p(self.squares / _STUDENT_DOF).sum())
 
 
 @dataclass
@@ -302,55 +308,17 @@ class _Problem:
         for sensor in self.sensors:
             by_kind.setdefault(sensor.kind, sensor)
         states = np.zeros((self.n_nodes, N_STATES))
-
-        def resample(sensor: Sensor, values: np.ndarray) -> np.ndarray:
-            return np.interp(self.t, sensor.t, values)
-
-        def smooth(values: np.ndarray, seconds: float, derivative: int = 0) -> np.ndarray:
-            window = max(5, int(seconds / self.step) // 2 * 2 + 1)
-            window = max(min(window, (self.n_nodes - 1) // 2 * 2 - 1), 3)
-            return np.asarray(savgol_filter(values, window, 2, deriv=derivative, delta=self.step))
-
         width = _VELOCITY_WINDOW
-        position = by_kind.get("position")
-        if position is not None:
+        if "position" in by_kind:
+            position = by_kind["position"]
             width = max(width, 5.0 * float(np.median(np.diff(position.t))))
             for state in (X, Y):
-                states[:, state] = smooth(resample(position, position.values[:, state]), width)
-        north_rate, east_rate = (smooth(states[:, state], width, 1) for state in (X, Y))
-        if "heading" in by_kind:
-            heading = by_kind["heading"]
-            unwrapped = unwrap_angle(heading.values[:, 0] / heading.factor)
-            states[:, PSI] = smooth(resample(heading, unwrapped), _HEADING_WINDOW)
-        elif position is not None:
-            states[:, PSI] = smooth(np.unwrap(np.arctan2(east_rate, north_rate)), width)
-        if "yaw_rate" in by_kind and "heading" not in by_kind:
-            rate = by_kind["yaw_rate"]
-            states[:, R] = resample(rate, rate.values[:, 0] / rate.factor)
-            if position is None:
-                states[:, PSI] = np.cumsum(states[:, R]) * self.step
-        else:
-            states[:, R] = smooth(states[:, PSI], _HEADING_WINDOW, 1)
-        current = [
-            float(self.prior_means[self.names.index(name)]) if name in self.names else 0.0
-            for name in CURRENT_NAMES
-        ]
-        cosine = np.cos(states[:, PSI])
-        sine = np.sin(states[:, PSI])
-        if position is not None:
-            north_rate = north_rate - current[0]
-            east_rate = east_rate - current[1]
-            states[:, U] = north_rate * cosine + east_rate * sine
-            states[:, V] = east_rate * cosine - north_rate * sine
-        else:
-            for kind, state in (("surge", U), ("sway", V), ("speed", U)):
-                if kind in by_kind and not states[:, state].any():
-                    sensor = by_kind[kind]
-                    states[:, state] = resample(sensor, sensor.values[:, 0] / sensor.factor)
-            states[:, X] = np.cumsum(states[:, U] * cosine - states[:, V] * sine) * self.step
-            states[:, Y] = np.cumsum(states[:, U] * sine + states[:, V] * cosine) * self.step
+                resampled = np.interp(self.t, position.t, position.values[:, state])
+                states[:, state] = self._smooth(resampled, width)
+        self._guess_heading(states, by_kind, width)
+        self._guess_velocities(states, by_kind, width)
         for state, rate, seconds in ((U, U_DOT, width), (V, V_DOT, width), (R, R_DOT, 1.0)):
-            states[:, rate] = smooth(states[:, state], seconds, 1)
+            states[:, rate] = self._smooth(states[:, state], seconds, 1)
         self.jerk_intensity = np.array(
             [
                 3.0 * self.step * np.mean(np.gradient(states[:, rate], self.step) ** 2) + 1e-10
@@ -359,6 +327,54 @@ class _Problem:
         )
         self.sensors = [_guess_noise(sensor) for sensor in self.sensors]
         return states
+
+    def _smooth(self, values: np.ndarray, seconds: float, derivative: int = 0) -> np.ndarray:
+        """Smooth values at the nodes [K], or differentiate them, by local parabolas."""
+        window = max(5, int(seconds / self.step) // 2 * 2 + 1)
+        window = max(min(window, (self.n_nodes - 1) // 2 * 2 - 1), 3)
+        return np.asarray(savgol_filter(values, window, 2, deriv=derivative, delta=self.step))
+
+    def _guess_heading(
+        self, states: np.ndarray, by_kind: Mapping[str, Sensor], width: float
+    ) -> None:
+        """Set heading and yaw rate from the compass, else from the course or from the gyro."""
+        if "heading" in by_kind:
+            heading = by_kind["heading"]
+            unwrapped = unwrap_angle(heading.values[:, 0] / heading.factor)
+            resampled = np.interp(self.t, heading.t, unwrapped)
+            states[:, PSI] = self._smooth(resampled, _HEADING_WINDOW)
+        elif "position" in by_kind:
+            rates = [self._smooth(states[:, state], width, 1) for state in (X, Y)]
+            states[:, PSI] = self._smooth(np.unwrap(np.arctan2(rates[1], rates[0])), width)
+        if "yaw_rate" not in by_kind or "heading" in by_kind:
+            states[:, R] = self._smooth(states[:, PSI], _HEADING_WINDOW, 1)
+            return
+        rate = by_kind["yaw_rate"]
+        states[:, R] = np.interp(self.t, rate.t, rate.values[:, 0] / rate.factor)
+        if "position" not in by_kind:
+            states[:, PSI] = np.cumsum(states[:, R]) * self.step
+
+    def _guess_velocities(
+        self, states: np.ndarray, by_kind: Mapping[str, Sensor], width: float
+    ) -> None:
+        """Set velocities from positions, else from their sensors, and positions by integration."""
+        cosine = np.cos(states[:, PSI])
+        sine = np.sin(states[:, PSI])
+        if "position" in by_kind:
+            north, east = (
+                self._smooth(states[:, state], width, 1)
+                - (self.prior_means[self.names.index(name)] if name in self.names else 0.0)
+                for state, name in zip((X, Y), CURRENT_NAMES, strict=True)
+            )
+            states[:, U] = north * cosine + east * sine
+            states[:, V] = east * cosine - north * sine
+            return
+        for kind, state in (("speed", U), ("surge", U), ("sway", V)):
+            if kind in by_kind:
+                sensor = by_kind[kind]
+                states[:, state] = np.interp(self.t, sensor.t, sensor.values[:, 0] / sensor.factor)
+        states[:, X] = np.cumsum(states[:, U] * cosine - states[:, V] * sine) * self.step
+        states[:, Y] = np.cumsum(states[:, U] * sine + states[:, V] * cosine) * self.step
 
     # --- linearisation -----------------------------------------------------------------------
 
@@ -473,65 +489,77 @@ class _Problem:
             1.0 / float(np.sqrt(max(q[0], q[1]) * share + _POSE_TOLERANCES[1] ** 2)),
         )
 
-    def _linearize_sensor(
-        self, index: int, sensor: Sensor, states: np.ndarray, parameters: dict[str, float]
-    ) -> list[_Residuals]:
-        """Return the residuals of a sensor by complex-step differentiation."""
+    def _locate(
+        self, sensor: Sensor, parameters: Mapping[str, float]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Return which samples are between nodes, their first nodes, and fractions of the step.
+
+        The fractions are None if all samples are on nodes.
+        """
         times = sensor.t + parameters.get(sensor.clock, 0.0)
         location = (times - self.t[0]) / self.step
         is_inside = (location > -1e-6) & (location < self.n_nodes - 1 + 1e-6)
         location = np.clip(location[is_inside], 0.0, self.n_nodes - 1 - 1e-9)
-        values = sensor.values[is_inside]
         is_on_nodes = not sensor.clock and bool(np.abs(location - np.round(location)).max() < 1e-4)
         nodes = (np.round(location) if is_on_nodes else np.floor(location)).astype(int)
         nodes = np.clip(nodes, 0, self.n_nodes - (1 if is_on_nodes else 2))
         fraction = None if is_on_nodes else location - nodes
+        return is_inside, nodes, fraction
+
+    def _linearize_sensor(
+        self, index: int, sensor: Sensor, states: np.ndarray, parameters: dict[str, float]
+    ) -> list[_Residuals]:
+        """Return the residuals of a sensor by complex-step differentiation."""
+        is_inside, nodes, fraction = self._locate(sensor, parameters)
+        values = sensor.values[is_inside]
+        is_on_nodes = fraction is None
         before = {key: states[nodes, key] for key in range(N_STATES)}
         next_nodes = np.minimum(nodes + 1, self.n_nodes - 1)
         after = {key: states[next_nodes, key] for key in range(N_STATES)}
         predicted = sensor.predict(parameters, before, after, self.step, fraction)
         by_state: list[dict[int, np.ndarray]] = [{} for _ in predicted]
         by_error: list[dict[int, np.ndarray]] = [{} for _ in predicted]
-        scale = 1.0 / (sensor.noise_std * _COMPLEX_STEP)
+
+        def store(
+            columns: Sequence[np.ndarray], targets: list[dict[int, np.ndarray]], key: int
+        ) -> None:
+            """Store the derivatives of the columns that a complex step has changed."""
+            for column, target in zip(columns, targets, strict=True):
+                if np.iscomplexobj(column):
+                    target[key] = np.imag(column) / (sensor.noise_std * _COMPLEX_STEP)
+
         for side in (0,) if is_on_nodes else (0, 1):
             for state in sensor.select_states(is_on_nodes=is_on_nodes):
                 moved = [dict(before), dict(after)]
                 moved[side][state] = moved[side][state] + 1j * _COMPLEX_STEP
-                for k, column in enumerate(
-                    sensor.predict(parameters, moved[0], moved[1], self.step, fraction)
-                ):
-                    if np.iscomplexobj(column):
-                        by_state[k][side * N_STATES + state] = np.imag(column) * scale
+                columns = sensor.predict(parameters, moved[0], moved[1], self.step, fraction)
+                store(columns, by_state, side * N_STATES + state)
         for name in {*sensor.error_names, *CURRENT_NAMES} & {*self.names}:
             moved_parameters = {**parameters, name: parameters[name] + 1j * _COMPLEX_STEP}
-            for k, column in enumerate(
-                sensor.predict(moved_parameters, before, after, self.step, fraction)
-            ):
-                if np.iscomplexobj(column):
-                    by_error[k][self.names.index(name)] = np.imag(column) * scale
+            columns = sensor.predict(moved_parameters, before, after, self.step, fraction)
+            store(columns, by_error, self.names.index(name))
         if sensor.clock in self.names and fraction is not None:
             moved_fraction = fraction + 1j * _COMPLEX_STEP / self.step
-            for k, column in enumerate(
-                sensor.predict(parameters, before, after, self.step, moved_fraction)
-            ):
-                by_error[k][self.names.index(sensor.clock)] = np.imag(column) * scale
-        groups = []
-        for k, column in enumerate(predicted):
-            difference = column - values[:, k]
-            if sensor.is_angular:
-                angle = difference / sensor.factor
-                difference = (angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))) * sensor.factor
-            groups.append(
-                _Residuals(
-                    f"sensor {index}",
-                    nodes,
-                    difference / sensor.noise_std,
-                    by_state[k],
-                    by_error[k],
-                    sensor,
-                )
+            columns = sensor.predict(parameters, before, after, self.step, moved_fraction)
+            store(columns, by_error, self.names.index(sensor.clock))
+        differences = [
+            sensor.subtract(column, values[:, k]) / sensor.noise_std
+            for k, column in enumerate(predicted)
+        ]
+        squares = np.sum(np.square(differences), axis=0)
+        return [
+            _Residuals(
+                f"sensor {index}",
+                nodes,
+                differences[k],
+                by_state[k],
+                by_error[k],
+                sensor,
+                squares,
+                len(differences),
             )
-        return groups
+            for k in range(len(differences))
+        ]
 
     def _compute_cost(self, residuals: Sequence[_Residuals], errors: np.ndarray) -> float:
         """Return minus twice the log-density, with the linearised curvature of the states."""
@@ -765,10 +793,6 @@ class _Problem:
 
         Powers of the step are left out: they are equal for all hypotheses with one grid.
         """
-        half = 0.5 * _STUDENT_DOF
-        student_constant = -2.0 * float(
-            gammaln(half + 0.5) - gammaln(half) - 0.5 * np.log(_STUDENT_DOF * np.pi)
-        )
         deviance = 2.0 * float(np.log(solver.banded_factor[0]).sum())
         deviance -= self.n_nodes * N_STATES * float(np.log(2.0 * np.pi))
         deviance += self._compute_cost(residuals, errors)
@@ -776,7 +800,8 @@ class _Problem:
         for group in residuals:
             n = group.values.size
             if group.sensor is not None:
-                deviance += n * (2.0 * float(np.log(group.sensor.noise_std)) + student_constant)
+                constant = _compute_student_constant(group.dimension)
+                deviance += n * (2.0 * float(np.log(group.sensor.noise_std)) + constant)
                 continue
             deviance += n * float(np.log(2.0 * np.pi))
             if group.group.startswith("jerk"):
@@ -785,6 +810,13 @@ class _Problem:
         return deviance - 2.0 * (self.n_nodes - 1) * float(
             np.log(heading_weight) + 2.0 * np.log(position_weight)
         )
+
+
+def _compute_student_constant(dimension: int) -> float:
+    """Return minus twice the logarithm of the Student density's constant, per dimension."""
+    half = 0.5 * _STUDENT_DOF
+    constant = gammaln(half + 0.5 * dimension) - gammaln(half)
+    return -2.0 * float(constant) / dimension + float(np.log(_STUDENT_DOF * np.pi))
 
 
 def _guess_noise(sensor: Sensor) -> Sensor:

@@ -82,6 +82,14 @@ class Sensor:
             self, t=self.t[is_finite], values=values[is_finite], name=self.name or self.kind
         )
 
+    def subtract(self, predicted: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return predicted minus measured values [N], angles modulo a full circle."""
+        difference = predicted - values
+        if not self.is_angular:
+            return difference
+        angle = difference / self.factor
+        return np.asarray((angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))) * self.factor)
+
     def select_states(self, *, is_on_nodes: bool) -> tuple[int, ...]:
         """Return the states of a node on which a measurement depends."""
         if self.kind == "position":
