@@ -300,7 +300,10 @@ def _find_named_table(
     if unused_fields:
         draft_notes.add_note(CHANNELS_KEY, f"{UNMAPPED_FIELDS}: {', '.join(unused_fields[:20])}")
     settings = _convert_entries(entries, sources, base_topic)
-    for name, setting_name in (("x", "position"), ("y", "position"), ("psi", "heading")):
+    setting_names = {"x": "position", "y": "position", "psi": "heading"}
+    if "velocity" in settings:
+        setting_names |= {"u": "velocity", "v": "velocity"}
+    for name, setting_name in setting_names.items():
         draft_notes.move_key((*CHANNELS_KEY, name), (*READER_KEY, setting_name))
     base_series = recordings[0].series[base_topic]
     return _MotionSources(settings, {*sources.values()}, _median_series_step(base_series))
@@ -373,10 +376,10 @@ def _convert_entries(
             }
     if entries.get("u", {}).get("frame") == "ned":
         north, east = (entries.pop(name) for name in ("u", "v"))
+        topic, north_field = sources[north["column"]]
         velocity = {"kind": "earth_fixed", "topic": topic, "unit": north["unit"]}
-        settings["velocity"] = velocity | {"north": north["column"], "east": east["column"]}
-        draft_notes.move_key((*CHANNELS_KEY, "u"), (*READER_KEY, "velocity"))
-        draft_notes.move_key((*CHANNELS_KEY, "v"), (*READER_KEY, "velocity"))
+        velocity |= {"north": north_field, "east": sources[east["column"]][1]}
+        settings["velocity"] = velocity
     heading = entries.pop("psi")
     topic, heading_field = sources[heading["column"]]
     settings["heading"] = {"kind": "angle", "topic": topic, "field": heading_field}
