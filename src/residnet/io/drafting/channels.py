@@ -954,7 +954,7 @@ class ChannelMapper:
                 is_finite = np.isfinite(values) & np.isfinite(t)
                 if is_finite.sum() < 2:
                     return np.full(grid.size, np.nan)
-                return np.interp(grid, t[is_finite], values[is_finite])
+                return np.asarray(np.interp(grid, t[is_finite], values[is_finite]))
 
             position = [resample(table.columns[n], table.t, motion.t) for n in (north, east)]
             measured.append(

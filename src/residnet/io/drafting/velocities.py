@@ -273,7 +273,7 @@ class HeadingOffset(NamedTuple):
     @property
     def is_determined(self) -> bool:
         """Whether the offset differs from zero by 3.5 standard errors and more than 2 deg."""
-        return abs(self.angle) > max(3.5 * self.standard_error, _MIN_HEADING_OFFSET)
+        return bool(abs(self.angle) > max(3.5 * self.standard_error, _MIN_HEADING_OFFSET))
 
 
 class Contradiction(NamedTuple):

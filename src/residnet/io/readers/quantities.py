@@ -99,7 +99,7 @@ class Conversion(Config):
                 " opposite direction"
             )
 
-    def is_frame_defined(self, frame: Frame, name: str) -> bool:
+    def is_frame_defined(self, frame: str, name: str) -> bool:
         """Return whether a frame defines the direction of a channel."""
         return name in _FRAME_CONVERSIONS[frame]
 
@@ -211,7 +211,7 @@ class ChannelMap(Conversion):
     letter_o: LetterO | None = None
     hold: bool = False
 
-    def is_frame_defined(self, frame: Frame, name: str) -> bool:
+    def is_frame_defined(self, frame: str, name: str) -> bool:
         """Return whether a frame defines a channel; u and v in `ned` are velocities to N and E."""
         is_earth_velocity = frame == "ned" and name in EARTH_VELOCITIES
         return is_earth_velocity or super().is_frame_defined(frame, name)

@@ -84,7 +84,7 @@ class Sensor:
 
     def subtract(self, predicted: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return predicted minus measured values [N], angles modulo a full circle."""
-        difference = predicted - values
+        difference: np.ndarray = predicted - values
         if not self.is_angular:
             return difference
         angle = difference / self.factor
@@ -182,7 +182,7 @@ class Sensor:
         east = u * np.sin(heading) + v * np.cos(heading)
         if self.kind == "course":
             return compute_angle(north, east)
-        return north if self.kind == "north" else east
+        return np.asarray(north if self.kind == "north" else east)
 
 
 def compute_angle(x: np.ndarray, y: np.ndarray) -> np.ndarray:
