@@ -83,7 +83,8 @@ def test_earth_fixed_velocities_are_rotated(tmp_path: Path, columns: dict[str, s
         for name in ("u", "v"):
             errors = log[name] - motion.sample(name, TIMES)
             assert float(np.sqrt(np.mean(errors**2))) < 0.03
-    reasons = [text for _, text in result.draft_notes.guessed_values]
+    notes = (*result.draft_notes.guessed_values, *result.draft_notes.notes)
+    reasons = [text for _, text in notes]
     assert any("earth axes" in text and "BIC +" in text for text in reasons)
 
 
@@ -96,6 +97,8 @@ def test_body_velocities_stay(tmp_path: Path) -> None:
 
 def test_speed_beside_a_drift_angle_is_no_sway(tmp_path: Path) -> None:
     result = draft(tmp_path / "speed", {"V [m/s]": "speed", "Drift angle [deg]": "drift"})
+    assert "v" not in result.reader["channels"]
+    result = draft(tmp_path / "alone", {"v [m/s]": "speed"})
     assert "v" not in result.reader["channels"]
     assert any("v is the speed" in text for _, text in result.draft_notes.notes)
     named = draft(tmp_path / "sway", {"v [m/s]": "v"})

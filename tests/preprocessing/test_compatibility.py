@@ -37,6 +37,8 @@ ERROR_STDS = dict(
     zip(PRIORS, (1.0, 1.0, 0.03, 0.01, 0.03, 0.2, 0.03, 0.1), strict=True),
 )
 N_DRAWS = 12
+STEPS = {"dinghy": 0.2, "catamaran": 0.4, "tanker": 0.5}
+"""Time between nodes in s, which resolves the yaw response of each boat."""
 
 
 def measure(motion: TrueMotion, rng: np.random.Generator, errors: dict[str, float]) -> list[Sensor]:
@@ -85,7 +87,7 @@ def draw(boat: str, seed: int) -> tuple[Reconstruction, dict[str, float]]:
     rng = np.random.default_rng(seed)
     motion = simulate_motion(BOATS[boat], rng, duration=100.0)
     errors = {name: float(rng.normal(0.0, std)) for name, std in ERROR_STDS.items()}
-    return reconstruct(measure(motion, rng, errors), PRIORS, 0.5), errors
+    return reconstruct(measure(motion, rng, errors), PRIORS, STEPS[boat]), errors
 
 
 @pytest.mark.parametrize("boat", BOATS)

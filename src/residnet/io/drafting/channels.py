@@ -919,7 +919,10 @@ class ChannelMapper:
             return
         if meaning == EXCHANGED_EARTH_AXES:
             self._names["u"], self._names["v"] = self._names["v"], self._names["u"]
-        self._draft_notes.add_guess((*CHANNELS_KEY, "u"), choice.text)
+        # names such as vx say nothing about axes; u and v say something else
+        is_named_by_axes = all(match_axis_velocity(parse_name(self._names[n])) for n in names)
+        add = self._draft_notes.add_note if is_named_by_axes else self._draft_notes.add_guess
+        add((*CHANNELS_KEY, "u"), choice.text)
         self._is_earth_fixed = True
         self._logs = [
             reference._rotate_to_body(table, meaning == EXCHANGED_EARTH_AXES)
