@@ -53,7 +53,7 @@ _WEAKENED_SMOOTHNESS = 100.0
 """Factor on the jerk intensities that shows which errors the sensors determine."""
 _MAX_GROWTH = 3.0
 """Largest growth of a standard error that is determined by the sensors."""
-_STANDARD_ERROR_FACTOR = 1.25
+_STANDARD_ERROR_FACTOR = 1.4
 """Factor on standard errors for coverage of 95 % in simulated draws (tests/preprocessing)."""
 _MAX_NODES = 20_000
 _MIN_SAMPLES = 20
