@@ -553,11 +553,10 @@ def check_contradicting_logs(logs: LogSet, make_finding: Check) -> Iterator[Find
     adequate = consensus.adequate if consensus.outliers else None
     if adequate is None:
         return
-    consensus = adequate
     fleet = consensus.fleet
     n_inliers = len(consensus.inliers)
     for i in consensus.outliers:
-        if not consensus.is_outlier(i):
+        if adequate is not consensus and not adequate.is_outlier(i):
             continue
         log = fleet.logs[i]
         hypothesis = rank_hypotheses(consensus, i)[0]
