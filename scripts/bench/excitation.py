@@ -79,24 +79,27 @@ def judge(
         name: float(np.interp(steps, spec.band.steps, getattr(spec.band, name)))
         for name in ("heading", "position")
     }
-    failures = []
-    for start in range(past, len(table) - steps, steps):
-        x = y[start : start + 1].clone()
-        # one noisy sample is a worse initial state than a local line
-        fit = np.polyfit(np.arange(-5, 6), table[start - 5 : start + 6, 1:7], 1)
-        x[0] = torch.from_numpy(fit[1])
-        s = guarded.warmup(y[None, start - past : start], w[None, start - past : start])
-        n_outside = 0
-        with torch.no_grad():
-            for k in range(start, start + steps):
-                x, s, outside = guarded.flagged_step(x, w[k : k + 1], s)
-                n_outside += int(outside.any())
-        if n_outside > 0.1 * steps:
-            continue
-        end = table[start + steps]
-        position_error = float(np.hypot(x[0, 0] - end[1], x[0, 1] - end[2]))
-        heading_error = abs((float(x[0, 2]) - end[3] + np.pi) % (2 * np.pi) - np.pi)
-        failures.append(position_error > widths["position"] or heading_error > widths["heading"])
+    starts = np.arange(past, len(table) - steps - 5, steps)
+    # one noisy sample is a worse initial state than a local line
+    lags = np.arange(-5, 6)
+    x = torch.from_numpy(
+        np.stack([np.polyfit(lags, table[start + lags, 1:7], 1)[1] for start in starts])
+    )
+    n_outside = torch.zeros(len(starts))
+    with torch.no_grad():
+        s = guarded.warmup(
+            torch.stack([y[start - past : start] for start in starts]),
+            torch.stack([w[start - past : start] for start in starts]),
+        )
+        for k in range(steps):
+            x, s, outside = guarded.flagged_step(x, w[starts + k], s)
+            n_outside += outside
+    error = x.numpy() - table[starts + steps, 1:7]
+    position_error = np.hypot(error[:, 0], error[:, 1])
+    heading_error = np.abs((error[:, 2] + np.pi) % (2 * np.pi) - np.pi)
+    has_failed = (position_error > widths["position"]) | (heading_error > widths["heading"])
+    is_inside = n_outside.numpy() <= 0.1 * steps
+    failures = has_failed[is_inside].tolist()
     return flags.numpy(), failures
 
 
