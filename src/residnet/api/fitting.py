@@ -332,7 +332,7 @@ class Models(dict[str, Model]):
 
     @cached_property
     def excitation(self) -> ExcitationFile:
-        """What the training logs excite, and feedback in training and test logs."""
+        """Excitation by the training logs, and feedback in training and test logs."""
         splits = {"train": self.identified.training_logs, "test": self.data.splits.get("test", ())}
         return assess_excitation(
             splits,

@@ -64,7 +64,7 @@ class DomainCheck(nn.Module):
         self.centre = nn.Buffer(torch.tensor(domain.centre, dtype=dtype))
         self.inverse_scale = nn.Buffer(1.0 / torch.tensor(domain.scale, dtype=dtype))
         factor = torch.tensor(domain.factor, dtype=dtype).reshape(n_features, n_features)
-        # the limit is one
+        # scaled by the limit, so that `forward` compares q with 1
         self.factor = nn.Buffer(factor / math.sqrt(domain.limit))
         self.relations = domain.relations
         gains = torch.zeros(len(domain.relations), len(names), dtype=dtype)
@@ -84,6 +84,7 @@ class DomainCheck(nn.Module):
             _column(
                 dtype,
                 [
+                    # no cosine is below -2, so that a relation without heading is always fulfilled
                     -2.0 if one.heading is None else math.cos(min(one.max_heading, math.pi))
                     for one in domain.relations
                 ],
@@ -93,8 +94,10 @@ class DomainCheck(nn.Module):
     def forward(self, x: Tensor, w: Tensor) -> Tensor:
         """Return which rows [B] of states [B, nx] and inputs [B, m] lie in the domain."""
         values = torch.cat((x, w), dim=-1)
+        # true unless the first state is NaN
         is_inside = values[..., 0] == values[..., 0]
         if self.is_closed_loop_only:
+            # false for every row, with the shape of the batch
             return ~is_inside & is_inside
         if self.degree > 0:
             columns = [values[..., k : k + 1] for k in self.density_columns]

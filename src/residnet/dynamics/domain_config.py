@@ -24,7 +24,7 @@ class InputRelation(Config):
         offset: constant term, SI.
         channels: velocities and inputs that it follows.
         gains: gain of each channel, SI.
-        heading: reference of the heading in rad; None where the input does not follow the heading.
+        heading: reference of the heading in rad; None if the input does not follow the heading.
         heading_gain: gain of the sine of the heading relative to the reference.
         max_heading: largest deviation of the heading from the reference in rad.
         tolerance: largest deviation of the input from the relation, SI.

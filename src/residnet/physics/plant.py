@@ -60,7 +60,7 @@ class Plant(nn.Module, ABC):
     def derivative_prepared(self, x: Tensor, p: Tensor) -> Tensor:
         """Compute x_dot [B, nx] within a time step, with p = prepare(x, w).
 
-        The result equals that of `derivative` with the same inputs.
+        The result equals the result of `derivative` with the same inputs.
         """
         return self.derivative(x, p)
 

@@ -42,7 +42,7 @@ class SignalsConfig(Config):
             velocity of the air relative to the vessel in body axes.
         unexcited: inputs that the logs held at one value, or in proportion to another input. Their
             effect cannot be identified, so they are no regressors; they remain inputs of the model,
-            which flags values other than those of the logs (`residnet.dynamics.domain`).
+            which flags values that the logs do not contain (`residnet.dynamics.domain`).
         forces: a vessel (by name or file) whose thrusters convert the two inputs to tau_x, tau_y,
             tau_n; or a configuration of thrusters.
         pairs: inputs to port and starboard that are exchanged by mirroring, such as

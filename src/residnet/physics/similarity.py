@@ -272,7 +272,7 @@ def estimate_added_mass(particulars: Particulars) -> AddedMass | None:
 def estimate_linear_derivatives(particulars: Particulars) -> dict[str, float] | None:
     """Estimate Y_v, Y_r, N_v and N_r in the prime I system; None if particulars are missing.
 
-    The regressions are those of Clarke, Gedling and Hine (1983), for the hull without m U terms.
+    Source: the regressions of Clarke, Gedling and Hine (1983), for the hull without m U terms.
     """
     if particulars.beam is None or particulars.draught is None or particulars.mass is None:
         return None

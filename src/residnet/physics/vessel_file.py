@@ -65,7 +65,7 @@ class VesselFile(Config, ABC):
 
 
 def merge_with_base(data: Any, folder: Path | None) -> Any:
-    """Merge the content of a vessel file with that of its `base`.
+    """Merge the content of a vessel file with the content of its `base`.
 
     Sections are merged key by key; a section of another `kind` replaces that of the base. `base` is
     the name of a file in `configs/vessels`, or the path of a YAML file, which is first searched

@@ -724,7 +724,7 @@ def find_unexcited_inputs(logs: Sequence[Log], inputs: Sequence[str]) -> dict[st
         inputs: selected inputs.
 
     Returns:
-        Name of each such input -> what the logs hold, in words.
+        Name of each such input -> its values in the logs, as text.
     """
     unexcited: dict[str, str] = {}
     for name in logs[0].channels if inputs else ():

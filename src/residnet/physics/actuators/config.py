@@ -221,7 +221,7 @@ class ServoSpec:
         )
 
     def require_step(self, dt: float) -> None:
-        """Check that a time step in s is that of the delay line.
+        """Check that a time step in s equals the step of the delay line.
 
         Raises:
             ConfigError: if it is not.

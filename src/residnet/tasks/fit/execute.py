@@ -59,7 +59,7 @@ _MODEL_ALIASES = ("predictor", "selected")
 
 
 def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
-    """Fit all models, judge them in free run, and write what was found.
+    """Fit all models, evaluate them in free runs, and write the results.
 
     Logs that ran in currents are taken through the water.
 

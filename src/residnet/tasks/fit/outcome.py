@@ -187,7 +187,7 @@ def build_fit_outcome(
 def read_external_logs(
     config: FitConfig, paths: Sequence[Path]
 ) -> tuple[list[Path], list[Log], list[PreparedLog]]:
-    """Read other logs like those of a fit; returns their files, the logs, and prepared logs.
+    """Read other logs as a fit reads its own; returns their files, the logs, and prepared logs.
 
     The reader of the fit is used. Canonical files are recognised by their metadata.
 

@@ -544,7 +544,7 @@ class NextTrials:
         )
 
     def to_text(self) -> str:
-        """Return the table, the recommendation and what no trial has excited as text."""
+        """Return the table, the recommendation and the missing excitation as text."""
         return "\n".join((self.table.to_text(), self.recommendation, *self.missing_excitation))
 
     def write_files(self, folder: Path) -> list[Path]:

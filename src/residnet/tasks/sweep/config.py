@@ -197,7 +197,7 @@ class PruningConfig(Config):
 class FreeRunObjective(Config):
     """Mean NRMSE of a fit in free run over its validation data, to be minimised.
 
-    The protocol is that of the model selection. Test data are not used.
+    The protocol of the model selection is used. Test data are not used.
 
     Attributes:
         kind: kind of the objective.
