@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.signal import savgol_filter
 from scipy.special import gammaln
 
 from residnet.core.errors import DataError
@@ -330,6 +329,9 @@ class _Problem:
 
     def _smooth(self, values: np.ndarray, seconds: float, derivative: int = 0) -> np.ndarray:
         """Smooth values at the nodes [K], or differentiate them, by local parabolas."""
+        # this import takes half a second, and most drafts compare no hypotheses
+        from scipy.signal import savgol_filter
+
         window = max(5, int(seconds / self.step) // 2 * 2 + 1)
         window = max(min(window, (self.n_nodes - 1) // 2 * 2 - 1), 3)
         return np.asarray(savgol_filter(values, window, 2, deriv=derivative, delta=self.step))
