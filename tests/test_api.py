@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from tiny import TINY, read_json
+from tiny import TINY
 
 import residnet
 from residnet.core.config import validate_config
 from residnet.core.errors import ResidnetError
 from residnet.evaluation.metrics import build_metrics_table
 from residnet.evaluation.protocol import EvaluationConfig
+from residnet.evaluation.records import MetricsFile
 from residnet.export import vessel
 from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.prepare import PrepareConfig
@@ -196,8 +197,8 @@ def test_save_load_export(
 @pytest.mark.long
 def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> None:
     config = copy.deepcopy(TINY)
-    metrics = read_json(tiny_run / "metrics.json")
-    table = build_metrics_table(metrics["rows"])
+    metrics = MetricsFile.read(tiny_run / "metrics.json")
+    table = build_metrics_table(metrics.rows)
     result = residnet.run(config, report=False)
     pd.testing.assert_frame_equal(result.metrics, table, rtol=1e-12)
     prepared = config["prepare"]

@@ -84,7 +84,7 @@ def stored(folder: Path, model: str | None) -> Found:
     limit = divergence_limit(fitted[-1].spec, config)
     step = config.prepare.grid.step
     judged = evaluate_splits(make_candidates(fitted), logs, config.evaluation, step, limit)["test"]
-    add(found, judged, [model or str(run.read_metrics()["selected"])])
+    add(found, judged, [model or run.read_metrics().selected])
     return found
 
 

@@ -11,6 +11,7 @@ Then the shares over all vessels.
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -31,17 +32,16 @@ def judged(models: residnet.Models, new: Any) -> tuple[list[int], str]:
     until = longest_good_horizon(evidence)
     found = residnet.free_run(models, residnet.prepare(new, settings_from=models.data), "external")
     seen = {
-        entry["seconds"]: entry
-        for entry in found.evaluation.limits_by_protocol[evidence.protocol]["horizons"]
+        row.seconds: row for row in found.evaluation.limits_by_protocol[evidence.protocol].horizons
     }
     places = []
     texts = []
-    for entry in known_horizons(evidence):
-        if entry["seconds"] > until:
+    for _, row in known_horizons(evidence):
+        if row.seconds > until:
             continue
-        fresh = seen[entry["seconds"]]["models"][own]
+        fresh = seen[row.seconds].models[own].by_name
         for of in ("position", "heading"):
-            low, high = entry["models"][own]["intervals"][of]
+            low, high = row.models[own].intervals[of] or (0.0, math.inf)
             places.append(int(fresh[of] > high) - int(fresh[of] < low))
             texts.append(f"{of} {fresh[of]:.3g} of {low:.3g} to {high:.3g}")
     return places, f"{rate_model(evidence):12s} {until:6.4g} s  {'; '.join(texts)}"

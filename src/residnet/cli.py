@@ -386,7 +386,8 @@ def run(
             "folder": str(finished_run.folder.path),
             "report": str(finished_run.folder.report),
         }
-        print(json.dumps({**finished_run.folder.read_summary(), **folder_fields}, indent=1))
+        summary = finished_run.folder.read_summary().to_content()
+        print(json.dumps({**summary, **folder_fields}, indent=1))
     else:
         print_result(finished_run)
 
@@ -515,7 +516,7 @@ def inspect(
         require_replaceable(out)
     with show_progress(quiet=quiet or as_json):
         findings = inspect_logs(logs, config)
-    print(json.dumps(findings.content, indent=1) if as_json else findings.text)
+    print(json.dumps(findings.inspection.to_content(), indent=1) if as_json else findings.text)
     if out is not None:
         findings.write(out)
     if findings.has_problems:
@@ -617,12 +618,14 @@ def monitor(
         log_paths = _collect_log_paths(folder, log_arguments, log_options)
         with name_damaged_key(folder):
             monitored_logs, refit_result = task.monitor(run, log_paths, model, settings, refit)
-    content: list[dict[str, Any]] = [log.to_json() for log in monitored_logs]
+    from residnet.report.records import MonitoredLogRow, MonitorFile, RefitRow
+
+    rows: list[MonitoredLogRow | RefitRow] = [log.to_record() for log in monitored_logs]
     lines = [line for log in monitored_logs for line in log.to_lines()]
     if refit_result is not None:
         lines += refit_result.to_lines()
-        content.append({"refit": refit_result.to_json()})
-    document = json.dumps(content, indent=1)
+        rows.append(refit_result.to_record())
+    document = json.dumps(MonitorFile(tuple(rows)).to_content(), indent=1)
     if output_folder is not None:
         from residnet.tasks.fit.service import write_monitoring_page
 
@@ -878,8 +881,9 @@ def runs(
     """List the runs below a folder with task, state, best figure and age."""
     from residnet.tasks.registry import format_runs, list_runs
 
-    entries = list_runs(folder)
-    print(json.dumps(entries, indent=1) if as_json else format_runs(folder, entries))
+    rows = list_runs(folder)
+    content = [row.model_dump(mode="json") for row in rows]
+    print(json.dumps(content, indent=1) if as_json else format_runs(folder, rows))
 
 
 @app.command(name="list")

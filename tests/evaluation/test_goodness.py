@@ -12,6 +12,7 @@ from scipy import stats
 from sklearn.metrics import r2_score
 
 from residnet.evaluation.goodness import (
+    FitMeasures,
     OneStepResiduals,
     assess_repeatability,
     block_bootstrap_interval,
@@ -39,14 +40,14 @@ def test_measures_are_the_corrected_equations() -> None:
     assert variance == pytest.approx(rss / 45)
     r2 = r2_score(target, target - residual)
     assert goodness_of_fit_measures(residual, target, d, variance) == pytest.approx(
-        {
-            "rmse": math.sqrt(rss / m),
-            "r2": r2,
-            "r2_adjusted": 1 - (1 - r2) * 49 / 45,
-            "cp": (rss + 2 * d * variance) / m,
-            "aic": (rss + 2 * d * variance) / (m * variance),
-            "bic": (rss + math.log(m) * d * variance) / (m * variance),
-        }
+        FitMeasures(
+            rmse=math.sqrt(rss / m),
+            r2=r2,
+            r2_adjusted=1 - (1 - r2) * 49 / 45,
+            cp=(rss + 2 * d * variance) / m,
+            aic=(rss + 2 * d * variance) / (m * variance),
+            bic=(rss + math.log(m) * d * variance) / (m * variance),
+        )
     )
 
 
@@ -54,10 +55,10 @@ def test_without_enough_samples_or_noise_there_is_no_measure() -> None:
     short = goodness_of_fit_measures(
         np.ones(5), np.arange(5.0), 5, estimate_noise_variance(np.ones(5), 2)
     )
-    assert short["r2_adjusted"] is None
+    assert short.r2_adjusted is None
     assert estimate_noise_variance(np.ones(5), 5) == math.inf
     exact = goodness_of_fit_measures(np.zeros(5), np.ones(5), 1, 0.0)
-    assert (exact["r2"], exact["aic"], exact["bic"]) == (None, None, None)
+    assert (exact.r2, exact.aic, exact.bic) == (None, None, None)
 
 
 def test_pairs_tell_correlated_models_apart_that_their_own_intervals_do_not() -> None:
@@ -65,26 +66,26 @@ def test_pairs_tell_correlated_models_apart_that_their_own_intervals_do_not() ->
     better = 0.97 * shared
     worse = shared
     found = paired_mae_difference([better], [worse], "worse")
-    assert found["mae"] == pytest.approx(-0.03 * np.abs(shared).mean())
-    assert found["ratio"] == pytest.approx(0.97)
-    assert found["excludes_zero"]
+    assert found.mae == pytest.approx(-0.03 * np.abs(shared).mean())
+    assert found.ratio == pytest.approx(0.97)
+    assert found.excludes_zero
     models = [
         OneStepResiduals(name, "head", [size] * 3, [np.repeat(one[:, None], 3, axis=1)], "worse")
         for name, one, size in (("better", better, 0), ("worse", worse, 9))
     ]
     rows = build_goodness_table(models, [shared[:, None].repeat(3, 1)], 0.1)
-    low, high = rows[0]["mae_ci95"]
-    assert low < rows[1]["mae"] < high
-    assert low < rows[0]["mae_ci95_independent"][0]
-    assert rows[0]["effective"] < 0.2 * rows[0]["samples"]
-    assert rows[0]["white_p"] < 1e-3
+    low, high = rows[0].mae_ci95
+    assert low < rows[1].mae < high
+    assert low < rows[0].mae_ci95_independent[0]
+    assert rows[0].effective < 0.2 * rows[0].samples
+    assert rows[0].white_p < 1e-3
     # the noise is that of the model which leaves the least
-    aic = goodness_of_fit_measures(worse, shared, 9, estimate_noise_variance(better, 0))["aic"]
-    assert rows[1]["aic"] == pytest.approx(aic)
+    aic = goodness_of_fit_measures(worse, shared, 9, estimate_noise_variance(better, 0)).aic
+    assert rows[1].aic == pytest.approx(aic)
     same = paired_mae_difference(
         [shared], [np.roll(autoregressive(0.9, 1, 3000, seed=8)[0], 1)], "other"
     )
-    assert not same["excludes_zero"]
+    assert not same.excludes_zero
 
 
 def test_autocovariance_is_its_definition_and_does_not_cross_pieces() -> None:
@@ -166,8 +167,7 @@ SCALES = {"u": 0.1, "v": 0.05, "r": 0.02}
 
 def pairs_of(*logs: PreparedLog) -> int:
     """How many stretches repeat a window under two commanded inputs."""
-    found: int = assess_repeatability(PROTOCOL, logs, 2, SCALES, STEP)["pairs"]
-    return found
+    return assess_repeatability(PROTOCOL, logs, 2, SCALES, STEP).pairs
 
 
 def commands(seed: int, count: int) -> np.ndarray:
@@ -214,14 +214,14 @@ def test_a_repeated_run_is_found_and_its_difference_measured() -> None:
     assert pair.mismatch == pytest.approx(0, abs=1e-6)
     found = assess_repeatability(PROTOCOL, logs, 2, SCALES, STEP)
     share = np.sqrt(51 / 101)
-    assert (found["pairs"], found["logs"]) == (1, 2)
-    assert [found[name] for name in "uvr"] == pytest.approx(
+    assert (found.pairs, found.logs) == (1, 2)
+    assert [found.by_channel[name] for name in "uvr"] == pytest.approx(
         [0.02 * share, 0.01 * share, 0.004 * share]
     )
-    assert found["nrmse"] == pytest.approx(0.2 * share)
+    assert found.nrmse == pytest.approx(0.2 * share)
     # both run 10 m ahead, whatever their heading
-    assert found["position"] == pytest.approx(0, abs=1e-9)
-    assert found["manoeuvres"]["turning"]["pairs"] == 1
+    assert found.position == pytest.approx(0, abs=1e-9)
+    assert found.manoeuvres["turning"].pairs == 1
 
 
 def test_other_commands_another_start_or_a_break_are_no_repeat() -> None:
@@ -242,8 +242,8 @@ def test_other_commands_another_start_or_a_break_are_no_repeat() -> None:
     assert pairs_of(made(states(160), STEP, w=calm), made(states(160), STEP, w=windy)) == 1
     broken = made(states(160), STEP, w=w, piece=np.repeat([0, 1], [100, 60]))
     found = assess_repeatability(PROTOCOL, [first, broken], 2, SCALES, STEP)
-    assert found["pairs"] == found["logs"] == 0
-    assert "u" not in found
+    assert found.pairs == found.logs == 0
+    assert found.by_channel == {}
 
 
 def test_a_log_repeats_itself_only_after_the_window() -> None:

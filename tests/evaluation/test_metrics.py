@@ -26,6 +26,7 @@ from residnet.evaluation.metrics import (
     prediction_intervals,
 )
 from residnet.evaluation.protocol import Window, WindowProtocol
+from residnet.evaluation.records import BlockCount, OutsideRange, PairedDifference
 from residnet.evaluation.selection import block_error_shares, make_selection_blocks
 from residnet.heads.base import ZeroHead
 from residnet.physics.signals_config import SignalsConfig
@@ -66,10 +67,10 @@ def test_rows_equal_a_loop_over_windows() -> None:
         {"manoeuvring": ["zigzag", "turning"], "absent": ["3211"]}
     )
     shown = {"all", "zigzag", "constant", "turning", "manoeuvring"}
-    assert {row["manoeuvre"] for row in table} == shown
+    assert {row.manoeuvre for row in table} == shown
     members = {"all": {"zigzag", "constant", "turning"}, "manoeuvring": {"zigzag", "turning"}}
     for row in table:
-        wanted = members.get(row["manoeuvre"], {row["manoeuvre"]})
+        wanted = members.get(row.manoeuvre, {row.manoeuvre})
         chosen = [i for i, w in enumerate(run.windows) if logs[w.log_index].log.manoeuvre in wanted]
         rmse = []
         mae = []
@@ -77,7 +78,7 @@ def test_rows_equal_a_loop_over_windows() -> None:
         heading = []
         count = 0
         for i in chosen:
-            w, p = run.windows[i], run.predictions[row["model"]][i]
+            w, p = run.windows[i], run.predictions[row.model][i]
             error = p.states - logs[w.log_index].y[w.start : w.stop]
             good = logs[w.log_index].usable[w.start : w.stop]
             parts = (error[good, 3], error[good, 4], error[:, 5])
@@ -87,14 +88,14 @@ def test_rows_equal_a_loop_over_windows() -> None:
             heading.append(abs(np.remainder(error[-1, 2] + np.pi, 2.0 * np.pi) - np.pi))
             count += int(good.sum())
         mean = np.mean(rmse, axis=0)
-        assert [row["rmse"][c] for c in "uvr"] == pytest.approx(mean.tolist())
-        assert [row["mae"][c] for c in "uvr"] == pytest.approx(np.mean(mae, axis=0).tolist())
-        assert [row[key] for key in ("kind", "split", "protocol")] == ["head", "test", "T3"]
-        assert row["nrmse"]["mean"] == pytest.approx(float((mean / [0.5, 0.25, 0.1]).mean()))
-        assert row["position_error_end"] == pytest.approx(np.mean(position))
-        assert row["heading_error_end"] == pytest.approx(np.mean(heading))
-        assert (row["windows"], row["n"]) == (len(chosen), count)
-        assert row["diverged"] == sum(run.predictions[row["model"]][i].has_diverged for i in chosen)
+        assert [row.rmse[c] for c in "uvr"] == pytest.approx(mean.tolist())
+        assert [row.mae[c] for c in "uvr"] == pytest.approx(np.mean(mae, axis=0).tolist())
+        assert (row.kind, row.split, row.protocol) == ("head", "test", "T3")
+        assert row.nrmse["mean"] == pytest.approx(float((mean / [0.5, 0.25, 0.1]).mean()))
+        assert row.position_error_end == pytest.approx(np.mean(position))
+        assert row.heading_error_end == pytest.approx(np.mean(heading))
+        assert (row.windows, row.n) == (len(chosen), count)
+        assert row.diverged == sum(run.predictions[row.model][i].has_diverged for i in chosen)
 
 
 def test_intervals_hold_the_mean_and_say_what_was_drawn() -> None:
@@ -103,16 +104,16 @@ def test_intervals_hold_the_mean_and_say_what_was_drawn() -> None:
         ProtocolEvaluation(run, [candidate("a")], logs, SCALES).build_rows({}), model="a"
     )
     # four logs of three windows: whole logs are too few, runs of two and one make eight
-    assert row["ci95_blocks"] == {"of": "windows", "count": 8}
-    spans = [(row["rmse_ci95"][c], row["rmse"][c]) for c in "uvr"]
-    for (low, high), mean in (*spans, (row["nrmse_mean_ci95"], row["nrmse"]["mean"])):
+    assert row.ci95_blocks == BlockCount(of="windows", count=8)
+    spans = [(row.rmse_ci95[c], row.rmse[c]) for c in "uvr"]
+    for (low, high), mean in (*spans, (row.nrmse_mean_ci95, row.nrmse["mean"])):
         assert low < mean < high
     alone = FreeRun("T3", "test", run.windows[:1], {"a": run.predictions["a"][:1]})
     single = find_row(
         ProtocolEvaluation(alone, [candidate("a")], logs, SCALES).build_rows({}), model="a"
     )
-    assert single["rmse_ci95"] == {"u": None, "v": None, "r": None}
-    assert single["nrmse_mean_ci95"] is single["ci95_blocks"] is None
+    assert single.rmse_ci95 == {"u": None, "v": None, "r": None}
+    assert single.nrmse_mean_ci95 is single.ci95_blocks is None
 
 
 def test_differences_are_paired_by_window_and_kind() -> None:
@@ -126,46 +127,44 @@ def test_differences_are_paired_by_window_and_kind() -> None:
     }
     compared = candidate("a", "b")
     for row in ProtocolEvaluation(run, [compared, candidate("b")], logs, SCALES).build_rows({}):
-        chosen = [row["manoeuvre"] in ("all", logs[w.log_index].log.manoeuvre) for w in run.windows]
-        if row["model"] == "b":
-            assert row["difference"] is None
+        chosen = [row.manoeuvre in ("all", logs[w.log_index].log.manoeuvre) for w in run.windows]
+        if row.model == "b":
+            assert row.difference is None
             continue
-        found = row["difference"]
+        found = row.difference
         one = errors["a"][chosen]
         other = errors["b"][chosen]
-        assert found["to"] == "b"
-        assert found["nrmse_mean"] == pytest.approx(float((one - other).mean()))
-        assert found["ratio"] == pytest.approx(one.mean() / other.mean())
+        assert found.to == "b"
+        assert found.nrmse_mean == pytest.approx(float((one - other).mean()))
+        assert found.ratio == pytest.approx(one.mean() / other.mean())
         # only all kinds together make blocks enough
-        assert (found["ci95"] is None) == (row["manoeuvre"] != "all")
+        assert (found.ci95 is None) == (row.manoeuvre != "all")
     lost = ProtocolEvaluation(
         run, [replace(compared, reference="absent")], logs, SCALES
     ).build_rows({})
-    assert {row["difference"] for row in lost} == {None}
+    assert {row.difference for row in lost} == {None}
 
 
 def test_a_table_has_one_column_per_number_and_the_file_marks_the_selected_model() -> None:
     run, logs = made_run()
     rows = ProtocolEvaluation(run, [candidate("a"), candidate("b")], logs, SCALES).build_rows({})
     table = build_metrics_table(rows)
-    assert table["model"].tolist() == [row["model"] for row in rows]
-    assert table["rmse_r"].tolist() == [row["rmse"]["r"] for row in rows]
-    assert table["nrmse_mean"].tolist() == [row["nrmse"]["mean"] for row in rows]
-    assert table["note"][0] == f"{rows[0]['diverged']}/12 diverged"
+    assert table["model"].tolist() == [row.model for row in rows]
+    assert table["rmse_r"].tolist() == [row.rmse["r"] for row in rows]
+    assert table["nrmse_mean"].tolist() == [row.nrmse["mean"] for row in rows]
+    assert table["note"][0] == f"{rows[0].diverged}/12 diverged"
     assert "selected" not in table
     assert table.notna().to_numpy().all()
-    assert (
-        find_row(rows, model="b", split="test", protocol="T3", manoeuvre="zigzag")["windows"] == 6
-    )
-    for wanted, told in (({"model": "c"}, "0 rows"), ({"split": "test"}, "2 rows")):
+    assert find_row(rows, model="b", split="test", protocol="T3", manoeuvre="zigzag").windows == 6
+    for candidates, model, told in ((rows, "c", "0 rows"), ([*rows, *rows], "b", "2 rows")):
         with pytest.raises(KeyError, match=told):
-            find_row(rows, **wanted)
-    content = build_metrics_file("run", {"u": "m/s"}, {"u": 1.0}, "b", "c", "c", rows).to_content()
-    assert content["schema"] == "residnet.metrics/1"
-    assert (content["selected"], content["selected_ensemble"]) == ("b", "c")
-    marked = build_metrics_table(content["rows"])["selected"].tolist()
-    assert marked == [row["model"] == "b" for row in rows]
-    assert "selected" not in rows[0]
+            find_row(candidates, model=model)
+    metrics = build_metrics_file("run", {"u": "m/s"}, {"u": 1.0}, "b", "c", "c", rows)
+    assert metrics.schema_name == "residnet.metrics/1"
+    assert (metrics.selected, metrics.selected_ensemble) == ("b", "c")
+    marked = build_metrics_table(metrics.rows)["selected"].tolist()
+    assert marked == [row.model == "b" for row in rows]
+    assert rows[0].selected is None
 
 
 def straight(
@@ -185,11 +184,11 @@ def test_consistency_by_hand() -> None:
         FreeRun("T2", "test", windows), [], logs, SCALES
     ).evaluate_kinematics(0.1)
     # after 2 s the position is off by 0.6 m and 0.8 m, the heading by 0.02 rad and nothing
-    assert found["windows"] == 2
-    assert found["position_mean"] == pytest.approx(0.7)
-    assert found["position_rms"] == pytest.approx(np.sqrt((0.36 + 0.64) / 2))
-    assert found["heading_mean"] == pytest.approx(0.01)
-    assert found["heading_rms"] == pytest.approx(0.02 / np.sqrt(2))
+    assert found.windows == 2
+    assert found.position_mean == pytest.approx(0.7)
+    assert found.position_rms == pytest.approx(np.sqrt((0.36 + 0.64) / 2))
+    assert found.heading_mean == pytest.approx(0.01)
+    assert found.heading_rms == pytest.approx(0.02 / np.sqrt(2))
 
 
 def nine(wind: list[float] | None = None) -> tuple[FreeRun, list[PreparedLog]]:
@@ -217,7 +216,7 @@ def test_bands_are_thirds_of_the_windows() -> None:
     ).evaluate_by_class()
     speeds = ((1, 3), (4, 6), (7, 9))
     winds = ((1, 1), (2, 2), (3, 3))
-    assert [(band["by"], band["low"], band["high"], band["windows"]) for band in found] == [
+    assert [(band.by, band.low, band.high, band.windows) for band in found] == [
         (by, low, high, 3)
         for by, ends in (("speed", speeds), ("wind", winds))
         for low, high in ends
@@ -227,13 +226,13 @@ def test_bands_are_thirds_of_the_windows() -> None:
         np.mean(ks) * 0.01 / 0.5 / 3
         for ks in ((1, 2, 3), (4, 5, 6), (7, 8, 9), (2, 5, 8), (3, 6, 9), (1, 4, 7))
     ]
-    assert [band["models"]["a"]["nrmse_mean"] for band in found] == pytest.approx(levels)
+    assert [band.models["a"].nrmse_mean for band in found] == pytest.approx(levels)
     for band, level in zip(found, levels, strict=True):
-        paired = band["models"]["a"]["difference"]
-        assert paired["to"] == "b"
-        assert paired["nrmse_mean"] == pytest.approx(-level)
-        assert paired["ratio"] == pytest.approx(0.5)
-        assert band["models"]["b"]["difference"] is None
+        paired = band.models["a"].difference
+        assert paired.to == "b"
+        assert paired.nrmse_mean == pytest.approx(-level)
+        assert paired.ratio == pytest.approx(0.5)
+        assert band.models["b"].difference is None
 
 
 def test_bands_without_windows_enough_or_without_wind_are_left_out() -> None:
@@ -241,7 +240,7 @@ def test_bands_without_windows_enough_or_without_wind_are_left_out() -> None:
     few = FreeRun("T2", "test", run.windows[:8], {"a": run.predictions["a"][:8]})
     # 8 windows: thirds of 3, 2 and 3
     found = ProtocolEvaluation(few, [candidate("a")], logs, SCALES).evaluate_by_class()
-    assert [(band["by"], band["low"]) for band in found] == [("speed", 1.0), ("speed", 6.0)]
+    assert [(band.by, band.low) for band in found] == [("speed", 1.0), ("speed", 6.0)]
     # one speed: no breakdown at all
     still = [made(straight(1.0), 0.1) for _ in range(9)]
     assert ProtocolEvaluation(run, [candidate("a")], still, SCALES).evaluate_by_class() == []
@@ -249,14 +248,14 @@ def test_bands_without_windows_enough_or_without_wind_are_left_out() -> None:
 
 def test_worst_windows_are_named() -> None:
     run, logs = nine()
-    found = ProtocolEvaluation(run, [candidate("a")], logs, SCALES).build_limits(0.1)["worst"]["a"]
-    assert [entry["log"] for entry in found] == ["log8", "log7", "log6"]
+    found = ProtocolEvaluation(run, [candidate("a")], logs, SCALES).build_limits(0.1).worst["a"]
+    assert [entry.log for entry in found] == ["log8", "log7", "log6"]
     # u alone is off, by 0.09, 0.08 and 0.07 m/s
     worst = [0.01 * k / 0.5 / 3 for k in (9, 8, 7)]
-    assert [entry["nrmse"] for entry in found] == pytest.approx(worst)
-    assert found[0]["t"] == pytest.approx(3.0)
-    assert found[0]["rmse"]["u"] == pytest.approx(0.09)
-    assert found[0]["manoeuvre"] == "zigzag"
+    assert [entry.nrmse for entry in found] == pytest.approx(worst)
+    assert found[0].t == pytest.approx(3.0)
+    assert found[0].rmse["u"] == pytest.approx(0.09)
+    assert found[0].manoeuvre == "zigzag"
 
 
 STEP = 0.5
@@ -309,27 +308,27 @@ def test_errors_of_the_pose_are_told_after_the_times_that_matter(
         prediction.states[20, :2] += np.array([3.0, 4.0])
         prediction.states[20, 2] += np.radians(200.0)
     entries = ProtocolEvaluation(run, CANDIDATES, logs, SCALES).evaluate_horizons(STEP)
-    assert [entry["seconds"] for entry in entries] == [10.0, 20.0]
+    assert [entry.seconds for entry in entries] == [10.0, 20.0]
     first = entries[0]
-    assert (first["windows"], first["logs"]) == (12, 6)
-    assert first["slowest"] == pytest.approx(0.6)
-    assert first["sailed"] == pytest.approx(1.35 * 10.5)
-    own = first["models"]["mlp"]
-    assert own["position"] == pytest.approx(5.0)
+    assert (first.windows, first.logs) == (12, 6)
+    assert first.slowest == pytest.approx(0.6)
+    assert first.sailed == pytest.approx(1.35 * 10.5)
+    own = first.models["mlp"]
+    assert own.position == pytest.approx(5.0)
     # a turn too many is no error
-    assert np.degrees(own["heading"]) == pytest.approx(160.0)
-    low, high = own["intervals"]["position"]
+    assert np.degrees(own.heading) == pytest.approx(160.0)
+    low, high = own.intervals["position"]
     assert low <= 5.0 <= high
     # velocities were made from the positions
-    assert first["floor"]["position"] == pytest.approx(0.0, abs=1e-9)
-    assert first["models"]["constant_velocity"]["position"] == pytest.approx(0.0, abs=1e-9)
+    assert first.floor.position == pytest.approx(0.0, abs=1e-9)
+    assert first.models["constant_velocity"].position == pytest.approx(0.0, abs=1e-9)
 
 
 def test_no_interval_of_a_heading_passes_half_a_turn(run: FreeRun, logs: list[PreparedLog]) -> None:
     for window, prediction in zip(run.windows, run.predictions["mlp"], strict=True):
         prediction.states[20, 2] += 0.5 * (window.log_index + 1)
     entries = ProtocolEvaluation(run, CANDIDATES, logs, SCALES).evaluate_horizons(STEP)
-    assert entries[0]["models"]["mlp"]["intervals"]["heading"][1] == pytest.approx(np.pi)
+    assert entries[0].models["mlp"].intervals["heading"][1] == pytest.approx(np.pi)
 
 
 def test_every_model_is_compared_with_zero_and_the_first_baseline(
@@ -339,7 +338,7 @@ def test_every_model_is_compared_with_zero_and_the_first_baseline(
     found = judged.compare_with_references()
     assert set(found["mlp"]) == {"constant_velocity", "baseline"}
     assert set(found["baseline"]) == {"constant_velocity"}
-    apart = found["baseline"]["constant_velocity"]["nrmse_mean"]
+    apart = found["baseline"]["constant_velocity"].nrmse_mean
     # u alone is off, by 0.09 and 0.1 m/s, and the more the later the log
     expected = np.array([(1.0 + 0.01 * w.log_index) * -0.01 / 0.5 / 3 for w in run.windows])
     assert judged.nrmse_by_window["constant_velocity"][0] == pytest.approx(0.1 / 0.5 / 3)
@@ -351,14 +350,13 @@ def test_samples_outside_the_training_range_are_counted(
 ) -> None:
     # one of six logs is faster than 2 m/s
     found = ProtocolEvaluation(run, CANDIDATES, logs, SCALES).share_outside_training_range()
-    assert found["share"] == pytest.approx(1 / 6)
-    assert found["channels"] == {"u": pytest.approx(1 / 6)}
+    assert found.share == pytest.approx(1 / 6)
+    assert found.channels == {"u": pytest.approx(1 / 6)}
     # nor does a channel that drives nothing, as the depth
     monkeypatch.setattr(DegreesOfFreedom, "unmodelled_states", property(lambda _: ("u",)))
-    assert ProtocolEvaluation(run, CANDIDATES, logs, SCALES).share_outside_training_range() == {
-        "share": 0.0,
-        "channels": {},
-    }
+    assert ProtocolEvaluation(run, CANDIDATES, logs, SCALES).share_outside_training_range() == (
+        OutsideRange(share=0.0, channels={})
+    )
 
 
 @pytest.mark.parametrize(("count", "of", "blocks"), [(6, "logs", 6), (2, "stretches", 8)])
@@ -403,9 +401,9 @@ def test_too_little_gives_no_interval(logs: list[int]) -> None:
     assert make_resampling_blocks(logs) is None
     assert bootstrap_intervals(np.ones((len(logs), 2)), None) == [None, None]
     found = paired_difference(np.arange(len(logs)) + 2.0, np.ones(len(logs)), "base", None)
-    assert found["ci95"] is None
-    assert found["excludes_zero"] is False
-    assert found["nrmse_mean"] == pytest.approx(np.mean(np.arange(len(logs)) + 1.0))
+    assert found.ci95 is None
+    assert found.excludes_zero is False
+    assert found.nrmse_mean == pytest.approx(np.mean(np.arange(len(logs)) + 1.0))
 
 
 def test_equals_the_enumeration_of_all_resamples() -> None:
@@ -420,7 +418,9 @@ def test_equals_the_enumeration_of_all_resamples() -> None:
     expected = np.quantile(
         means, [bootstrap_tail_probability(6), 1 - bootstrap_tail_probability(6)]
     )
-    assert interval == pytest.approx(expected.tolist(), abs=0.06 * (expected[1] - expected[0]))
+    assert interval == pytest.approx(
+        tuple(expected.tolist()), abs=0.06 * (expected[1] - expected[0])
+    )
 
 
 def test_levels_widen_as_student_s_t() -> None:
@@ -439,26 +439,27 @@ def test_pairing_finds_what_the_errors_of_each_model_hide() -> None:
     found, other = (
         paired_difference(*two, "base", drawn) for two in ((hard - 0.01, hard), (hard, hard))
     )
-    assert found["excludes_zero"] is True
-    assert found["ci95"] == pytest.approx([-0.01, -0.01])
-    assert found["ratio"] == pytest.approx(1.0 - 0.01 / hard.mean())
+    assert found.excludes_zero is True
+    assert found.ci95 == pytest.approx((-0.01, -0.01))
+    assert found.ratio == pytest.approx(1.0 - 0.01 / hard.mean())
     first, second = bootstrap_intervals(np.stack((hard - 0.01, hard), axis=1), drawn)
     assert first is not None
     assert second is not None
     assert first[1] > second[0]
-    itself = {"ci95": [0.0, 0.0], "excludes_zero": False, "ratio": 1.0, "worse": False}
-    assert other == {"to": "base", "nrmse_mean": 0.0} | itself
+    assert other == PairedDifference(
+        to="base", nrmse_mean=0.0, ci95=(0.0, 0.0), excludes_zero=False, ratio=1.0, worse=False
+    )
     above = paired_difference(hard + 0.01, hard, "base", drawn)
-    assert above["excludes_zero"] is True
+    assert above.excludes_zero is True
 
 
 @pytest.mark.parametrize(("factor", "worse"), [(1.04, False), (1.06, True), (0.5, False)])
 def test_worse_is_more_than_five_percent(factor: float, worse: bool) -> None:
     base = np.array([0.1, 0.2, 0.4])
     found = paired_difference(factor * base, base, "base", None)
-    assert found["ratio"] == pytest.approx(factor)
-    assert found["worse"] is worse
-    assert paired_difference(base, 0 * base, "base", None)["ratio"] is None
+    assert found.ratio == pytest.approx(factor)
+    assert found.worse is worse
+    assert paired_difference(base, 0 * base, "base", None).ratio is None
 
 
 @pytest.mark.parametrize("logs", [3, 6])
@@ -488,7 +489,7 @@ def test_what_ran_away_or_is_exact_leaves_the_intervals_of_others() -> None:
     values[:, 2], values[5, 3] = 0.0, np.inf
     spans = prediction_intervals(values, numbers)
     assert spans[:2] == plain
-    assert spans[2] == [0.0, 0.0]
+    assert spans[2] == (0.0, 0.0)
     assert prediction_intervals(values[:6], numbers[:6]) == [None] * 4
 
 

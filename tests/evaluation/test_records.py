@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from residnet.core.errors import ResidnetError
 from residnet.evaluation.metrics import build_metrics_file
-from residnet.evaluation.records import MetricsFile
+from residnet.evaluation.records import MetricsFile, MetricsRow
 
 
 def row(**change: Any) -> dict[str, Any]:
@@ -39,7 +39,8 @@ def row(**change: Any) -> dict[str, Any]:
 
 
 def metrics(**change: Any) -> MetricsFile:
-    return build_metrics_file("run", {"u": "m/s"}, {"u": 0.5}, "mlp", None, "mlp", [row(**change)])
+    rows = [MetricsRow.model_validate(row(**change))]
+    return build_metrics_file("run", {"u": "m/s"}, {"u": 0.5}, "mlp", None, "mlp", rows)
 
 
 def test_metrics_file_keeps_the_keys_of_its_rows(tmp_path: Path) -> None:

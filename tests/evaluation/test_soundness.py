@@ -20,13 +20,12 @@ from residnet.core.log import Log
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
+from residnet.evaluation.records import SANITY_CHECKS, SanityFile, SanityRow
 from residnet.evaluation.soundness import (
     BOUNDEDNESS,
-    CHECKS,
     DAMPING,
     STABILITY,
     SYMMETRY,
-    SanityFinding,
     TrainingPoints,
     build_sanity_file,
     check_model,
@@ -35,7 +34,6 @@ from residnet.evaluation.soundness import (
     find_operating_points,
     find_steady_runs,
     mirror_inputs,
-    read_sanity_findings,
     settled_acceleration,
 )
 from residnet.heads.base import ResidualHead
@@ -100,7 +98,7 @@ def recorded(spec: ModelSpec, count: int = 300) -> TrainingPoints:
     return TrainingPoints(torch.from_numpy(x), torch.from_numpy(drawn[:, 3:]), 100.0, ())
 
 
-def findings(spec: ModelSpec, model: HybridDynamics) -> dict[str, SanityFinding]:
+def findings(spec: ModelSpec, model: HybridDynamics) -> dict[str, SanityRow]:
     return {finding.check: finding for finding in check_model(spec, model, recorded(spec))}
 
 
@@ -114,7 +112,7 @@ def twin(**change: tuple[float, float, float]) -> tuple[ModelSpec, HybridDynamic
 def test_a_vessel_that_behaves_passes(vessel: tuple[ModelSpec, HybridDynamics]) -> None:
     threads = torch.get_num_threads()
     found = findings(*vessel)
-    assert list(found) == list(CHECKS)
+    assert list(found) == list(SANITY_CHECKS)
     assert all(finding.ok and not finding.fault for finding in found.values())
     assert torch.get_num_threads() == threads
     # one without inputs is checked from rest
@@ -158,7 +156,7 @@ def test_running_away_at_inputs_that_no_log_holds_is_no_fault() -> None:
     spec, model = made({**RUDDER, "u n": (0.02, 0, 0)})
     seen = recorded(spec)
     seen.w[:, 0] *= 0.2
-    found = check_model(spec, model, seen)[CHECKS.index(BOUNDEDNESS)]
+    found = check_model(spec, model, seen)[SANITY_CHECKS.index(BOUNDEDNESS)]
     assert found.ok is False
     assert found.fault == ""
     assert "held from rest" in found.text
@@ -372,10 +370,10 @@ def test_a_small_swing_in_a_turn_is_no_fault_where_the_vessel_swings_as_much() -
 def test_findings_go_through_the_file_of_a_run(tmp_path: Path) -> None:
     spec, model = made({**RUDDER, "u": (0.02, 0, 0)})
     found = check_model(spec, model, recorded(spec))
-    assert read_sanity_findings(tmp_path) == []
+    assert SanityFile.read_optional(tmp_path, "sanity.json") is None
     content = build_sanity_file({"made": found})
     (tmp_path / "sanity.json").write_text(content.to_json_text(), encoding="utf-8")
-    assert read_sanity_findings(tmp_path) == found
+    assert SanityFile.read(tmp_path / "sanity.json").findings == tuple(found)
     (tmp_path / "sanity.json").write_text("{", encoding="utf-8")
     with pytest.raises(UsageError, match=r"sanity\.json: not readable as JSON"):
-        read_sanity_findings(tmp_path)
+        SanityFile.read(tmp_path / "sanity.json")

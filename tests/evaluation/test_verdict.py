@@ -7,6 +7,19 @@ from typing import Any
 
 import pytest
 
+from residnet.evaluation.records import (
+    BlockCount,
+    HorizonRow,
+    KinematicErrors,
+    MetricsRow,
+    ModelKind,
+    OutsideRange,
+    PairedDifference,
+    PoseErrors,
+    ProtocolLimits,
+    SelectionFile,
+    SelectionRow,
+)
 from residnet.evaluation.verdict import (
     VerdictEvidence,
     describe_divergence,
@@ -17,44 +30,111 @@ from residnet.evaluation.verdict import (
 )
 
 
-def row(error: float, diverged: int = 0) -> dict[str, Any]:
-    return {"nrmse": {"mean": error}, "diverged": diverged, "windows": 12}
+def row(
+    error: float,
+    diverged: int = 0,
+    kind: ModelKind = "head",
+    split: str = "test",
+    protocol: str = "T30",
+) -> MetricsRow:
+    return MetricsRow(
+        model="mlp",
+        kind=kind,
+        split=split,
+        protocol=protocol,
+        manoeuvre="all",
+        windows=12,
+        n=120,
+        diverged=diverged,
+        rmse={},
+        mae={},
+        nrmse={"mean": error},
+        rmse_ci95={},
+        nrmse_mean_ci95=None,
+        ci95_blocks=None,
+    )
 
 
-def difference(value: float, half: float | None) -> dict[str, Any]:
-    interval = None if half is None else [value - half, value + half]
+def difference(value: float, half: float | None) -> PairedDifference:
+    interval = None if half is None else (value - half, value + half)
     excludes = interval is not None and (interval[0] > 0 or interval[1] < 0)
-    return {"nrmse_mean": value, "ci95": interval, "excludes_zero": excludes}
+    return PairedDifference(
+        to="", nrmse_mean=value, ci95=interval, excludes_zero=excludes, ratio=None, worse=False
+    )
 
 
-def errors(position: float, degrees: float, half: float | None = 0.1) -> dict[str, Any]:
+def errors(position: float, degrees: float, half: float | None = 0.1) -> PoseErrors:
     """Errors of one model; `half` is the half width of the intervals as a share."""
     heading = math.radians(degrees)
     ends = {"position": position, "heading": heading}
-    return ends | {
-        "intervals": {
-            of: None if half is None else [value * (1.0 - half), value * (1.0 + half)]
-            for of, value in ends.items()
-        }
+    intervals = {
+        of: None if half is None else (value * (1.0 - half), value * (1.0 + half))
+        for of, value in ends.items()
     }
+    return PoseErrors(position=position, heading=heading, intervals=intervals)
 
 
 def horizon(
-    seconds: float, mlp: dict[str, Any], windows: int = 12, best: dict[str, Any] | None = None
-) -> dict[str, Any]:
+    seconds: float, mlp: PoseErrors, windows: int = 12, best: PoseErrors | None = None
+) -> HorizonRow:
     """One entry of limits.json: 2 m/s are sailed, zero is far off."""
     models = {
         "mlp": mlp,
         "constant_velocity": errors(seconds, 40.0),
         "baseline": best or errors(seconds, 30.0),
     }
-    about = {"seconds": seconds, "windows": windows, "logs": 4, "slowest": 1.5, "fastest": 2.5}
-    return {**about, "sailed": 2.0 * seconds, "floor": errors(0.1, 0.2), "models": models}
+    return HorizonRow(
+        seconds=seconds,
+        windows=windows,
+        logs=4,
+        slowest=1.5,
+        fastest=2.5,
+        sailed=2.0 * seconds,
+        floor=errors(0.1, 0.2),
+        models=models,
+    )
 
 
-def under(content: dict[str, Any]) -> dict[str, Any]:
+def protocol_limits(**content: Any) -> ProtocolLimits:
+    """Contents of limits.json for one protocol."""
+    empty: dict[str, Any] = {
+        "kinematics": KinematicErrors(),
+        "bands": (),
+        "worst": {},
+        "compared": {},
+        "outside": OutsideRange(),
+        "horizons": (),
+    }
+    return ProtocolLimits(**{**empty, **content})
+
+
+def under(**content: Any) -> dict[str, ProtocolLimits]:
     """Contents of limits.json for the protocol that decides."""
-    return {"T30": content}
+    return {"T30": protocol_limits(**content)}
+
+
+def selection(reason: str = "", *faults: str) -> SelectionFile:
+    """Contents of selection.json with one model."""
+    chosen = SelectionRow(
+        model="mlp",
+        family="network",
+        parameters=1,
+        nrmse_mean=0.2,
+        ratio=1.0,
+        standard_error=0.0,
+        diverged=0,
+        sound=not faults,
+        faults=faults,
+    )
+    return SelectionFile(
+        schema="residnet.selection/2",
+        selected="mlp",
+        selected_ensemble=None,
+        predictor="mlp",
+        reason=reason,
+        blocks=BlockCount(of="logs", count=5),
+        models=(chosen,),
+    )
 
 
 def evidence(error: float = 0.2, **change: Any) -> VerdictEvidence:
@@ -63,17 +143,12 @@ def evidence(error: float = 0.2, **change: Any) -> VerdictEvidence:
         "split": "test",
         "rows_by_model": {"constant_velocity": row(0.5), "baseline": row(0.25), "mlp": row(error)},
         "baseline": "baseline",
-        "selection": {
-            "reason": "mlp has the least validation error.",
-            "models": [{"model": "mlp", "faults": []}],
-        },
+        "selection": selection("mlp has the least validation error."),
         "limits_by_protocol": under(
-            {
-                "compared": {
-                    "mlp": {
-                        "constant_velocity": difference(-0.3, 0.1),
-                        "baseline": difference(-0.05, 0.1),
-                    }
+            compared={
+                "mlp": {
+                    "constant_velocity": difference(-0.3, 0.1),
+                    "baseline": difference(-0.05, 0.1),
                 }
             }
         ),
@@ -117,7 +192,7 @@ def test_what_is_worse_than_zero_or_the_baseline_is_objected_to() -> None:
 
 
 def test_unsound_models_and_divergences_are_named() -> None:
-    fault = {"models": [{"model": "mlp", "faults": ["its damping has the wrong sign"]}]}
+    fault = selection("", "its damping has the wrong sign")
     rows = {"constant_velocity": row(0.5), "mlp": row(0.2, diverged=7)}
     said = write_verdict(evidence(selection=fault, rows_by_model=rows))
     assert "7/12 diverged, which count with the constant-velocity error" in said[0]
@@ -161,16 +236,16 @@ def test_unsound_models_and_divergences_are_named() -> None:
     ],
 )
 def test_a_model_is_good_in_metres_and_degrees(
-    entries: list[dict[str, Any]], expected: str, said: str
+    entries: list[HorizonRow], expected: str, said: str
 ) -> None:
-    given = evidence(limits_by_protocol=under({"horizons": entries}))
+    given = evidence(limits_by_protocol=under(horizons=entries))
     assert rate_model(given) == expected
     assert any(said in sentence for sentence in write_verdict(given)[:3])
 
 
 def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
     entries = [horizon(10, errors(0.5, 2.0)), horizon(30, errors(3.0, 5.0))]
-    said = write_verdict(evidence(limits_by_protocol=under({"horizons": entries})))
+    said = write_verdict(evidence(limits_by_protocol=under(horizons=entries)))
     assert said[0].endswith(
         "is off by 3.0 m (2.7 to 3.3, 5.0 % of the 60 m sailed) and 5.0 deg (4.5 to 5.5)."
     )
@@ -181,7 +256,7 @@ def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
     assert said[2] == "At other times of these free runs: 0.50 m and 2.0 deg after 10 s."
     assert said[3] == "It holds for 12 free runs (T30) of 4 logs at mean speeds of 1.5 to 2.5 m/s."
     # no number has an exponent that a reader must work out
-    limits = under({"horizons": [horizon(100, errors(1234.0, 113.0))]})
+    limits = under(horizons=[horizon(100, errors(1234.0, 113.0))])
     lost = " ".join(write_verdict(evidence(limits_by_protocol=limits)))
     assert "off by 1234 m (1111 to 1357, 617 % of the 200 m sailed) and 113 deg" in lost
 
@@ -189,17 +264,18 @@ def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
 def test_a_model_as_near_as_the_plant_itself_is_good() -> None:
     """Another model is nearer, but within twice what the plant leaves all are alike."""
     entry = horizon(10, errors(0.5, 1.0), best=errors(0.2, 1.0))
-    assert rate_model(evidence(limits_by_protocol=under({"horizons": [entry]}))) == "limited"
-    entry["models"]["plant"] = errors(0.4, 0.9)
-    rows = {"constant_velocity": row(0.5), "mlp": row(0.2), "plant": row(0.1) | {"kind": "plant"}}
+    assert rate_model(evidence(limits_by_protocol=under(horizons=[entry]))) == "limited"
+    models = {**entry.models, "plant": errors(0.4, 0.9)}
+    entry = entry.model_copy(update={"models": models})
+    rows = {"constant_velocity": row(0.5), "mlp": row(0.2), "plant": row(0.1, kind="plant")}
     assert (
-        rate_model(evidence(limits_by_protocol=under({"horizons": [entry]}), rows_by_model=rows))
+        rate_model(evidence(limits_by_protocol=under(horizons=[entry]), rows_by_model=rows))
         == "good"
     )
 
 
 def test_what_diverges_or_is_no_better_than_zero_is_never_good() -> None:
-    limits = under({"horizons": [horizon(30, errors(1.0, 1.0))]})
+    limits = under(horizons=[horizon(30, errors(1.0, 1.0))])
     rows = {"constant_velocity": row(0.5), "baseline": row(0.25), "mlp": row(0.2, diverged=1)}
     assert rate_model(evidence(limits_by_protocol=limits, rows_by_model=rows)) == "limited"
     assert rate_model(evidence(error=0.6, limits_by_protocol=limits)) == "do not use"
@@ -211,8 +287,10 @@ def test_what_diverges_or_is_no_better_than_zero_is_never_good() -> None:
 
 
 def test_a_horizon_is_judged_by_the_protocol_of_most_windows() -> None:
-    few = {"horizons": [horizon(10, errors(0.5, 2.0), windows=4)]}
-    many = {"horizons": [horizon(10, errors(0.6, 2.0), windows=20), horizon(20, errors(1, 3))]}
+    few = protocol_limits(horizons=[horizon(10, errors(0.5, 2.0), windows=4)])
+    many = protocol_limits(
+        horizons=[horizon(10, errors(0.6, 2.0), windows=20), horizon(20, errors(1, 3))]
+    )
     given = evidence(limits_by_protocol={"T10": many, "T30": few})
     assert rate_model(given) == "good"
     said = write_verdict(given)
@@ -225,17 +303,17 @@ def test_a_horizon_is_judged_by_the_protocol_of_most_windows() -> None:
 def test_a_model_that_the_data_cannot_tell_from_zero_is_not_to_be_used() -> None:
     compared = {"mlp": {"constant_velocity": difference(-0.01, 0.1)}}
     given = evidence(
-        limits_by_protocol=under({"compared": compared, "horizons": [horizon(30, errors(1, 1))]})
+        limits_by_protocol=under(compared=compared, horizons=[horizon(30, errors(1, 1))])
     )
     assert rate_model(given) == "do not use"
     assert write_verdict(given)[0].startswith("NO BETTER THAN CONSTANT VELOCITY")
     # too few logs for an interval tell neither
-    unknown = under({"compared": {"mlp": {"constant_velocity": difference(-0.01, None)}}})
+    unknown = under(compared={"mlp": {"constant_velocity": difference(-0.01, None)}})
     assert rate_model(evidence(limits_by_protocol=unknown)) == "limited"
 
 
 def test_data_outside_the_training_range_and_the_doctor_are_told() -> None:
-    limits = under({"outside": {"share": 0.123, "channels": {"u": 0.1, "delta": 0.03}}})
+    limits = under(outside=OutsideRange(share=0.123, channels={"u": 0.1, "delta": 0.03}))
     said = write_verdict(
         evidence(
             limits_by_protocol=limits, data_quality_text="Data doctor: nothing would mislead a fit."
@@ -247,7 +325,7 @@ def test_data_outside_the_training_range_and_the_doctor_are_told() -> None:
 
 
 def test_an_old_run_without_these_files_still_has_a_verdict() -> None:
-    said = write_verdict(evidence(selection={}, limits_by_protocol={}))
+    said = write_verdict(evidence(selection=None, limits_by_protocol={}))
     assert said == [
         "On test data model mlp is 60 % better than constant velocity and 20 % better than the"
         " baseline; its"
@@ -256,13 +334,10 @@ def test_an_old_run_without_these_files_still_has_a_verdict() -> None:
 
 
 def test_a_split_that_is_too_short_is_judged_by_a_shorter_protocol() -> None:
-    rows = [{"split": "validation", "protocol": name} for name in ("T30", "T100", "T10")]
-    short = [*rows, {"split": "test", "protocol": "T30"}, {"split": "test", "protocol": "T10"}]
+    rows = [row(0.1, split="validation", protocol=name) for name in ("T30", "T100", "T10")]
+    short = [*rows, row(0.1, protocol="T30"), row(0.1, protocol="T10")]
     assert order_protocols(short, "test", "T100") == ["T30", "T10", "T100"]
-    assert (
-        order_protocols([*short, {"split": "test", "protocol": "T100"}], "test", "T100")[0]
-        == "T100"
-    )
+    assert order_protocols([*short, row(0.1, protocol="T100")], "test", "T100")[0] == "T100"
     assert order_protocols(short, "validation", "T100")[0] == "T100"
 
 

@@ -20,7 +20,7 @@ from residnet.core.progress import Progress, on_progress
 from residnet.core.version import __version__
 from residnet.engine import c_code
 from residnet.engine.c_code import find_compiler
-from residnet.evaluation.assessment import Assessment
+from residnet.evaluation.assessment import Assessment, CardFinding, name_splits
 from residnet.export import c, get_exporter
 from residnet.export.c import STRICT_FLAGS, measure_footprint, to_c_identifier
 from residnet.export.vessel import ExportedVessel
@@ -212,9 +212,16 @@ KNOWN = Assessment(
     level="limited",
     verdict=("After a 40 s free run the position error is 8.6 m.", "Two logs were checked."),
     findings=(
-        {"log": "zigzag_1", "level": "will mislead", "code": "lag", "text": "r lags", "action": ""},
+        CardFinding(log="zigzag_1", level="will mislead", code="lag", text="r lags", action=""),
     ),
-    split={"train": ["zigzag_1", "zigzag_2"], "validation": ["turn_1"], "test": ["turn_2"]},
+    split=name_splits(
+        [
+            ("train", "zigzag_1"),
+            ("train", "zigzag_2"),
+            ("validation", "turn_1"),
+            ("test", "turn_2"),
+        ]
+    ),
 )
 
 

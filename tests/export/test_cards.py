@@ -111,7 +111,7 @@ def test_the_card_holds_level_verdict_findings_and_split(
     run = tmp_path / "run"
     shutil.copytree(tiny_run, run)
     finding = {
-        "level": "suspicious",
+        "level": "will mislead",
         "code": "lag",
         "text": "r lags",
         "action": "shift it",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,7 @@ from residnet.quality import (
 from residnet.quality.actuators import estimate_delay
 from residnet.quality.findings import run_checks
 from residnet.quality.kinematics import estimate_position_causes
+from residnet.quality.records import InspectionFile
 from residnet.quality.statistics import LogStatistics
 
 LOG = wavy()
@@ -524,19 +524,19 @@ def test_inspect_log_set_reports_planted_faults(
 def test_summarize_inspection_counts_and_ranks_findings() -> None:
     sick = changed(psi=-PSI).replace(name="sick")
     reports = [inspect_log(LOG), inspect_log(sick)]
-    content = json.loads(json.dumps(build_inspection(reports, inspect_log_set([LOG]))))
-    assert content["schema"] == "residnet.inspection/1"
-    assert [entry["misled"] for entry in content["logs"]] == [False, True]
-    for entry, report in zip(content["logs"], reports, strict=True):
-        texts = [(finding["text"], finding["level"]) for finding in entry["findings"]]
+    inspection = build_inspection(reports, inspect_log_set([LOG]))
+    inspection = InspectionFile.model_validate_json(inspection.to_json_text())
+    assert [entry.misled for entry in inspection.logs] == [False, True]
+    for entry, report in zip(inspection.logs, reports, strict=True):
+        texts = [(finding.text, finding.level) for finding in entry.findings]
         assert texts == [(finding.text, finding.level) for finding in report.findings]
     clean = summarize_inspection(build_inspection(reports[:1], InspectionReport("together", ())))
     assert clean.sentences == ["Data doctor: nothing in the log would mislead a fit."]
-    counted = summarize_inspection(content)
+    counted = summarize_inspection(inspection)
     assert (counted.n_logs, counted.n_logs_with_problems) == (2, 1)
     assert counted.tally.startswith("Data doctor: 1 of 2 logs hold something")
     assert counted.first_action.startswith("First fix this: sick: ")
-    assert [content["tally"], content["first"]] == counted.sentences
+    assert [inspection.tally, inspection.first] == counted.sentences
 
 
 @pytest.mark.parametrize("slow", [0.5, 3.0])

@@ -6,7 +6,6 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -41,6 +40,7 @@ from residnet.report.figure import (
 from residnet.report.figure_files import read_figures, unpack_column, write_figures
 from residnet.report.fit import write_fit_figures
 from residnet.report.page import write_page
+from residnet.report.records import SweepFile, SweepTrial
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections import runs
 from residnet.report.sections.models import evolution_figures
@@ -257,7 +257,7 @@ def test_metrics_alone_give_no_figure_and_many_heads_distinct_looks(tmp_path: Pa
     assert write_fit_figures(RunFiles(tmp_path)) == []
     content = metrics(("test",), ("plsr",))
     first = content["rows"][0] | {"selected": False}
-    content |= {"selected": None, "rows": [first | {"model": f"head{i}"} for i in range(12)]}
+    content |= {"rows": [first | {"model": f"head{i}"} for i in range(12)]}
     write_json(tmp_path / "metrics.json", content)
     looks = runs.model_styles(RunFiles(tmp_path)).values()
     assert len({(look.color, look.dash) for look in looks}) == 12
@@ -278,12 +278,30 @@ def test_a_bred_equation_shows_its_generations(tmp_path: Path) -> None:
 
 def test_trials_of_a_sweep_over_their_keys() -> None:
     trials = [
-        {"number": i, "value": 0.1 * i, "values": {"heads.size": i, "kind": "ab"[i % 2]}}
+        SweepTrial(
+            number=i,
+            state="finished",
+            value=0.1 * i,
+            seconds=1.0,
+            fault="",
+            values={"heads.size": i, "kind": "ab"[i % 2]},
+        )
         for i in range(20)
     ]
-    content: dict[str, Any] = {"keys": ["heads.size", "kind"], "log": [], "objective": "score [-]"}
-    content |= {"trials": [*trials, {"number": 20, "value": None, "values": {}}]}
-    figure = parallel_coordinates({**content, "minimized": False})
+    failed = SweepTrial(number=20, state="failed", value=None, seconds=1.0, fault="x", values={})
+    sweep = SweepFile(
+        schema="residnet.sweep/1",
+        run="made",
+        objective="score [-]",
+        minimized=False,
+        search="random",
+        keys=("heads.size", "kind"),
+        log=(),
+        best=19,
+        importance={},
+        trials=(*trials, failed),
+    )
+    figure = parallel_coordinates(sweep)
     names = ("heads.size\n0 to 19", 'kind\n"a" to "b"', "score\n0 to 1.9")
     assert figure.panels[0].x_names == {str(place): name for place, name in enumerate(names)}
     curves = figure.cases[0].curves[0]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_run import provenance
 from PIL import Image
 from read_page import Page
 
@@ -91,7 +92,7 @@ def test_every_block_is_drawn_and_nothing_is_loaded_or_run(tmp_path: Path) -> No
 
 
 def test_provenance_and_configuration_come_last_and_folded(tmp_path: Path) -> None:
-    record = {"residnet": "9.8.7", "started": "2026-01-02T03:04:05Z", "inputs": {"a.csv": "f00d"}}
+    record = provenance(inputs={"a.csv": "f00d"})
     (tmp_path / "provenance.json").write_text(json.dumps(record))
     (tmp_path / "resolved.yaml").write_text("name: made\n")
     text = write_page(tmp_path, "made", "", ["Done."], [Section("Table", [table()])]).read_text()

@@ -13,7 +13,19 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import browser, layout
-from made_run import DEG, LEVEL, made_run, metrics, row, write_fit_page, write_json
+from made_run import (
+    DEG,
+    LEVEL,
+    finding,
+    inspection,
+    limits,
+    made_run,
+    metrics,
+    protocol_limits,
+    row,
+    write_fit_page,
+    write_json,
+)
 from made_series import autoregressive
 from read_page import Page, plain
 
@@ -25,7 +37,8 @@ from residnet.evaluation.goodness import (
     build_goodness_file,
     build_goodness_table,
 )
-from residnet.evaluation.soundness import CHECKS, SanityFinding, build_sanity_file
+from residnet.evaluation.records import SANITY_CHECKS, SanityRow
+from residnet.evaluation.soundness import build_sanity_file
 from residnet.evaluation.verdict import LEVEL_TEXTS
 from residnet.quality import build_inspection, inspect_log, inspect_log_set
 from residnet.report.blocks import Section, Table, Text
@@ -137,12 +150,12 @@ def judged(run: Path, level: str) -> Path:
         "slowest": 0.9,
         "fastest": 1.1,
     }
-    horizon |= {"sailed": 30.0, "floor": ends, "models": {"plsr": {**ends, "intervals": spans}}}
+    floor = {**ends, "intervals": dict.fromkeys(ends)}
+    horizon |= {"sailed": 30.0, "floor": floor, "models": {"plsr": {**ends, "intervals": spans}}}
     path = made_run(run)
-    write_json(path / "limits.json", {"splits": {"test": {"whole": {"horizons": [horizon]}}}})
-    late = {"code": "gaps", "level": "will mislead", "text": "a gap", "action": "", "effect": 0.2}
-    logs = [{"name": "zigzag_01", "findings": [late]}, {"name": "zigzag_02", "findings": []}]
-    write_json(path / "doctor.json", {"logs": logs, "together": []})
+    write_json(path / "limits.json", limits({"whole": protocol_limits(horizons=[horizon])}, {}))
+    late = finding("gaps", "will mislead", "a gap", effect=0.2)
+    write_json(path / "doctor.json", inspection({"zigzag_01": [late], "zigzag_02": []}, []))
     if level == "do not use":
         content = metrics()
         for line in content["rows"]:
@@ -170,12 +183,13 @@ def test_five_questions_are_answered_before_the_first_section(level: str, tmp_pa
 def test_free_runs_of_logs_that_turn_to_one_side_make_no_good_model(tmp_path: Path) -> None:
     run = judged(tmp_path / "run", "good")
     doctor = json.loads((run / "doctor.json").read_text())
-    said = {"code": "one_side", "text": "all of 9 logs turn to port", "action": "", "effect": None}
+    text = "all of 9 logs turn to port"
     for known, found in (("good", "note"), ("limited", "will mislead")):
-        write_json(run / "doctor.json", doctor | {"together": [{**said, "level": found}]})
-        text = html.unescape(shown(run)).partition('id="at-a-glance"')[0]
-        assert LEVEL_TEXTS[known] in text
-        assert (said["text"] in text) == (known == "limited")
+        together = [finding("one_side", found, text)]
+        write_json(run / "doctor.json", doctor | {"together": together})
+        opening = html.unescape(shown(run)).partition('id="at-a-glance"')[0]
+        assert LEVEL_TEXTS[known] in opening
+        assert (text in opening) == (known == "limited")
 
 
 @pytest.mark.long
@@ -208,12 +222,8 @@ def limits_file() -> dict[str, Any]:
     motion = {"u": 0.04, "v": 0.02, "r": 1 / DEG, "position": 2.0, "heading": 5 / DEG, "nrmse": 0.2}
     repeats = {"tolerance": tolerance, "pairs": 3, "logs": 2, **motion}
     repeats["manoeuvres"] = {"zigzag": {"pairs": 3, **motion}}
-    return {
-        "schema": "residnet.limits/1",
-        "run": "made",
-        "splits": {"test": {"whole": {"bands": bands, "worst": {"plsr": [worst]}}}},
-        "repeatability": {"whole": repeats},
-    }
+    whole = protocol_limits(bands=bands, worst={"plsr": [worst]})
+    return limits({"whole": whole}, {"whole": repeats})
 
 
 def compared(change: dict[str, float]) -> dict[str, Any]:
@@ -286,9 +296,10 @@ def test_what_doctor_sanity_refit_and_currents_found_is_shown(run: Path) -> None
     clock[500:] += 7.0
     logs[1] = logs[1].replace(t=clock)
     reports = [inspect_log(log) for log in logs]
-    write_json(run / "doctor.json", build_inspection(reports, inspect_log_set(logs)))
+    write_json(run / "doctor.json", build_inspection(reports, inspect_log_set(logs)).to_content())
     checks = [
-        SanityFinding("plsr", check, check != "damping", f"words on {check}") for check in CHECKS
+        SanityRow(model="plsr", check=check, ok=check != "damping", text=f"words on {check}")
+        for check in SANITY_CHECKS
     ]
     write_json(run / "sanity.json", build_sanity_file({"plsr": checks}).to_content())
     fit = run / "models" / "baseline" / "fit.json"
@@ -334,10 +345,10 @@ def test_goodness_of_fit_is_as_the_file_says(run: Path) -> None:
     assert isinstance(residuals, Table)
     assert isinstance(sentences, Text)
     yaw = {line.label: line.cells for line in residuals.rows}
-    line = next(line for line in rows if (line["model"], line["axis"]) == ("plsr", "r_dot"))
+    line = next(line for line in rows if (line.model, line.axis) == ("plsr", "r_dot"))
     texts = [cell.text for cell in fits.rows[1].cells]
-    assert texts[:3] == ["9.00", format_number(DEG * line["rmse"]), format_number(line["r2"])]
-    assert yaw["plsr"][1].text == format_interval(line["mae_ci95"], DEG)
+    assert texts[:3] == ["9.00", format_number(DEG * line.rmse), format_number(line.r2)]
+    assert yaw["plsr"][1].text == format_interval(line.mae_ci95, DEG)
     assert (yaw["plsr"][-1].note, yaw["plsr"][-1].mark) == ("to baseline", "best")
     assert yaw["baseline"][-1].text == "–"
     assert "times too narrow" in sentences.nonempty_paragraphs[0]
@@ -362,15 +373,15 @@ def test_metrics_alone_make_a_report_and_folders_without_are_refused(tmp_path: P
     for text, error, said in (
         (None, UsageError, r"no metrics\.json"),
         ("{", UsageError, "not readable as JSON"),
-        ("{}", DataError, "holds no rows"),
+        ("{}", UsageError, r"metrics\.json: key 'schema': field required"),
+        (json.dumps(metrics() | {"rows": []}), DataError, "holds no rows"),
     ):
         if text is not None:
             file.write_text(text)
         with pytest.raises(error, match=said):
             write_fit_page(RunFiles(tmp_path))
     content = metrics(("validation",), ("plsr",))
-    rows = [line for line in content["rows"] if line["manoeuvre"] == "all"]
-    content["rows"] = [{key: line[key] for key in line if key != "manoeuvre"} for line in rows]
+    content["rows"] = [line for line in content["rows"] if line["manoeuvre"] == "all"]
     write_json(file, content)
     text = shown(tmp_path)
     Page(text)

@@ -154,7 +154,8 @@ def made_simulate(run: Path, logs: int = 2) -> Path:
     rows.append({**steady, "craft": "ship", "fault": "timed out after 60 s", "timed_out": True})
     units = {"first_overshoot": "rad", "initial_turning_distance": "m"}
     units |= {"initial_turning_distance_lengths": "-"}
-    write_json(run / "indices.json", {"run": "made", "length": 4.0, "units": units, "rows": rows})
+    about = {"schema": "residnet.indices/1", "run": "made", "length": 4.0}
+    write_json(run / "indices.json", {**about, "units": units, "rows": rows})
     return run
 
 

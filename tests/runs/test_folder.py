@@ -20,6 +20,7 @@ from made_models import nomoto_model
 from residnet.core.errors import UsageError
 from residnet.core.files import sha256
 from residnet.core.run_loader import accept_run
+from residnet.core.run_records import MainFigure
 from residnet.core.version import __version__
 from residnet.runs import folder as folders
 from residnet.runs.folder import (
@@ -95,7 +96,7 @@ def test_only_a_finished_run_whose_files_are_whole_is_opened(tmp_path: Path) -> 
     closed("no such folder")
     folder = RunFolder.create(path, "a: 1\n", resume=False)
     closed(r"is not finished .* --resume")
-    given = ("fit", ["Good."], {"error": {"value": 1.0, "unit": "m"}})
+    given = ("fit", ["Good."], {"error": MainFigure(value=1.0, unit="m")})
     folder.write_summary(*given, is_finished=False)
     closed("is not finished")
     folder.write_summary(*given, is_finished=True)
@@ -103,9 +104,11 @@ def test_only_a_finished_run_whose_files_are_whole_is_opened(tmp_path: Path) -> 
         folder.read_metrics()
     folder.write_json(folder.metrics, {"rows": [{"a": 1}]})
     run = RunFolder.open(path)
-    assert run.read_metrics() == {"rows": [{"a": 1}]}
-    about = dict(zip(("task", "verdict", "figures"), given, strict=True))
-    assert run.read_summary() == {"schema": "residnet.summary/1", "finished": True, **about}
+    with pytest.raises(UsageError, match=r"metrics\.json: key 'schema': field required"):
+        run.read_metrics()
+    summary = run.read_summary()
+    assert (summary.task, list(summary.verdict), summary.figures) == given
+    assert summary.finished
     folder.summary.write_text('{"finished": tr')
     closed(r"summary.json: not readable as JSON")
     folder.summary.write_text("[]")

@@ -67,7 +67,7 @@ def test_a_run_leaves_report_summary_and_mark(tmp_path: Path) -> None:
     assert json.loads((folder.path / "found.json").read_text())["threads"] == before + 1
     assert finished.folder.path == folder.path
     assert [file.read_text() for file in finished.exports] == ["exported"]
-    assert folder.read_summary() == {
+    assert json.loads(folder.summary.read_text()) == {
         "schema": "residnet.summary/1",
         "task": "sample",
         "finished": True,
@@ -116,7 +116,7 @@ def test_a_run_that_withholds_or_cannot_export_a_model_is_complete_and_says_so(
     finished = SampleTask(name="wild", fault="is withheld").run(output_folder=run)
     assert [file.name for file in finished.exports] == ["model.txt"]
     said = "Not exported: model wild is withheld: worse than constant_velocity."
-    assert finished.folder.read_summary()["verdict"] == ["It works.", said]
+    assert finished.folder.read_summary().verdict == ("It works.", said)
     assert "model wild is withheld" in finished.folder.report.read_text()
     with pytest.raises(ExportError, match=r"model wild: diverges; the run itself is complete"):
         SampleTask(name="wild", fault="is not exported").run(output_folder=run, overwrite=True)
@@ -125,7 +125,7 @@ def test_a_run_that_withholds_or_cannot_export_a_model_is_complete_and_says_so(
     page = plain(folder.report)
     assert "Not exported: model wild: diverges." in page
     assert "exports/model.txt" in page.replace("<wbr>", "")
-    assert folder.read_summary()["verdict"] == ["It works.", "Not exported: model wild: diverges."]
+    assert folder.read_summary().verdict == ("It works.", "Not exported: model wild: diverges.")
     # what an earlier run exported is not shown as this one's
     SampleTask(name="wild").run(output_folder=run, overwrite=True)
     assert "wild: diverges" not in plain(folder.report)

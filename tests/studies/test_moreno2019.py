@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from kinds import of_kind
-from made_run import stored
+from made_run import complete_row, metrics_file, stored
 
 from residnet.report.blocks import Cell, Table, Text
 from residnet.report.figure import Figure
@@ -57,9 +57,11 @@ def write(run: Path, split: str, models: tuple[str, ...]) -> None:
 def made(run: Path, models: tuple[str, ...] = MODELS) -> Path:
     kinds = {"constant_velocity": "constant_velocity", "baseline": "baseline"}
     rmse = dict.fromkeys("uvr", 1.0)
-    about = {"split": "test", "protocol": "record", "rmse": rmse}
-    rows = [{"model": model, "kind": kinds.get(model, "head"), **about} for model in models]
-    (run / "metrics.json").write_text(json.dumps({"rows": rows, "run": "made"}))
+    about = {"split": "test", "protocol": "record"}
+    rows = [
+        complete_row(rmse, model=model, kind=kinds.get(model, "head"), **about) for model in models
+    ]
+    (run / "metrics.json").write_text(json.dumps(metrics_file(rows, "rbf_joint")))
     (run / "figures").mkdir()
     for split in ("train", "validation", "test"):
         write(run, split, models)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from made_run import stored
+from made_run import complete_row, data_quality, metrics_file, stored, write_json
 
 from residnet.core.errors import UsageError
 from residnet.report.blocks import Table
@@ -42,19 +42,16 @@ COLUMNS = ("u", "v", "r", "psi", "x", "y")
 def row(model: str, split: str, manoeuvre: str) -> dict[str, Any]:
     level = 0.01 * (len(MODELS) - MODELS.index(model)) * (0.8 if split == "train" else 1.0)
     rmse = {"u": 2 * level, "v": level, "r": 0.5 * level}
-    return {
-        "model": model,
-        "kind": "constant_velocity"
-        if model == "constant_velocity"
-        else "head"
-        if "lstm" in model
-        else "baseline",
-        "split": split,
-        "protocol": "manoeuvre",
-        "manoeuvre": manoeuvre,
-        "rmse": rmse,
-        "rmse_ci95": {name: [0.9 * value, 1.1 * value] for name, value in rmse.items()},
-    }
+    kind = "head" if "lstm" in model else "baseline"
+    return complete_row(
+        rmse,
+        model=model,
+        kind=model if model == "constant_velocity" else kind,
+        split=split,
+        protocol="manoeuvre",
+        manoeuvre=manoeuvre,
+        rmse_ci95={name: [0.9 * value, 1.1 * value] for name, value in rmse.items()},
+    )
 
 
 def rollouts(folder: Path, log: str, size: float) -> None:
@@ -81,14 +78,14 @@ def made_study(run: Path, kinds: tuple[str, ...] = KINDS) -> Path:
     fit = run / "models" / "baseline" / "fit.json"
     fit.parent.mkdir(parents=True)
     fit.write_text(json.dumps(STEADY))
-    (run / "metrics.json").write_text(json.dumps({"run": "made", "selected": "lstm", "rows": rows}))
-    quality = []
+    (run / "metrics.json").write_text(json.dumps(metrics_file(rows, "lstm")))
+    manoeuvre_of_log = {}
     for kind in kinds:
         for number, size in enumerate((3.0, 1.0, 2.0)):
             log = f"{kind}_{number + 1:02d}"
             rollouts(run / "rollouts" / "test", log, size)
-            quality.append({"log": log, "manoeuvre": kind})
-    (run / "data_quality.json").write_text(json.dumps(quality))
+            manoeuvre_of_log[log] = kind
+    write_json(run / "data_quality.json", data_quality(manoeuvre_of_log, "test"))
     return run
 
 

@@ -65,8 +65,26 @@ def row(
     found |= {"manoeuvre": manoeuvre, "windows": 6, "n": 600, "diverged": 0}
     found |= {"rmse": rmse, "mae": rmse, "nrmse": nrmse | {"mean": mean}}
     found |= {"rmse_ci95": {name: [0.9 * value, 1.1 * value] for name, value in rmse.items()}}
-    found |= {"nrmse_mean_ci95": [0.9 * mean, 1.1 * mean], "heading_error_end": rmse["r"]}
-    return found | {"position_error_end": 10 * rmse["u"], "selected": model == "plsr"}
+    found |= {"nrmse_mean_ci95": [0.9 * mean, 1.1 * mean], "ci95_blocks": None}
+    found |= {"heading_error_end": rmse["r"]}
+    return found | {"position_error_end": 10 * rmse["u"]}
+
+
+def complete_row(rmse: dict[str, float], **labels: Any) -> dict[str, Any]:
+    """A row of metrics.json with errors of the velocities and no intervals."""
+    found: dict[str, Any] = {"manoeuvre": "all", "windows": 6, "n": 600, "diverged": 0}
+    found |= {"rmse": rmse, "mae": rmse, "nrmse": {**rmse, "mean": 1.0}}
+    found |= {"rmse_ci95": dict.fromkeys(rmse), "nrmse_mean_ci95": None, "ci95_blocks": None}
+    return {**found, **labels}
+
+
+def metrics_file(rows: list[dict[str, Any]], selected: str) -> dict[str, Any]:
+    """Contents of metrics.json."""
+    units = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
+    about = {"schema": "residnet.metrics/1", "run": "made", "channels": units, "scales": SCALES}
+    chosen = {"selected": selected, "selected_ensemble": None, "predictor": selected}
+    marked = [{**line, "selected": line["model"] == selected} for line in rows]
+    return {**about, **chosen, "rows": marked}
 
 
 def metrics(
@@ -81,9 +99,55 @@ def metrics(
                 rows.append(row(model, split, protocol, factor=0.8 if split == "train" else 1.0))
                 for number, kind in enumerate(("turning", "zigzag")):
                     rows.append(row(model, split, protocol, kind, factor=1.1 + 0.1 * number))
-    units = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
-    about = {"schema": "residnet.metrics/1", "run": "made", "channels": units, "scales": SCALES}
-    return {**about, "selected": "plsr", "rows": rows}
+    return metrics_file(rows, "plsr")
+
+
+def provenance(**change: Any) -> dict[str, Any]:
+    """Contents of provenance.json."""
+    about: dict[str, Any] = {"residnet": "9.8.7", "command": ["residnet"], "config": None}
+    about |= {"overrides": [], "seed": 5, "git": "abc123", "python": "3.12.1", "machine": "Linux"}
+    about |= {"packages": {"torch": "2.13.0"}, "started": "2026-01-02T03:04:05Z", "seconds": 12.3}
+    return {**about, "inputs": {"logs/a.csv": "f00d"}, **change}
+
+
+def data_quality(kinds: dict[str, str], split: str) -> list[dict[str, Any]]:
+    """Contents of data_quality.json; `kinds` has the manoeuvre of each log."""
+    entry: dict[str, Any] = {"split": split, "seconds": 60.0, "samples": 600, "usable": 0.975}
+    entry |= {"learned_from": 0.95, "masked": {"frozen": 0.025}}
+    entry |= {"largest": {"u": 1.5, "v": 0.2, "r": 0.1}}
+    return [{"log": log, "manoeuvre": kind} | entry for log, kind in kinds.items()]
+
+
+def finding(code: str, level: str, text: str, **change: Any) -> dict[str, Any]:
+    """A finding in doctor.json."""
+    about = {"level": level, "code": code, "text": text, "action": "", "effect": None}
+    return {**about, "figures": {}, **change}
+
+
+def inspection(
+    logs: dict[str, list[dict[str, Any]]], together: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """Contents of doctor.json."""
+    entries = [
+        {"name": name, "source": "", "misled": bool(found), "findings": found}
+        for name, found in logs.items()
+    ]
+    about = {"schema": "residnet.inspection/1", "misled": True, "logs": entries}
+    return {**about, "together": together, "tally": "", "first": ""}
+
+
+def protocol_limits(**change: Any) -> dict[str, Any]:
+    """Contents of limits.json for one protocol of one split."""
+    empty: dict[str, Any] = {"kinematics": {}, "bands": [], "worst": {}, "compared": {}}
+    return {**empty, "outside": {}, "horizons": [], **change}
+
+
+def limits(
+    protocols: dict[str, dict[str, Any]], repeatability: dict[str, dict[str, Any]]
+) -> dict[str, Any]:
+    """Contents of limits.json for test data."""
+    about = {"schema": "residnet.limits/1", "run": "made", "splits": {"test": protocols}}
+    return {**about, "repeatability": repeatability}
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -143,14 +207,8 @@ def made_run(run: Path, *, split: str = "test") -> Path:
     """The whole folder, but for models that can be loaded."""
     write_json(run / "metrics.json", metrics())
     (run / "resolved.yaml").write_text(RESOLVED)
-    provenance = {"residnet": "9.8.7", "git": "abc123", "seed": 5, "seconds": 12.3}
-    provenance |= {"inputs": {"logs/a.csv": "f00d"}, "packages": {"torch": "2.13.0"}}
-    write_json(run / "provenance.json", provenance)
-    entry = {"split": split, "seconds": 60.0, "samples": 600, "usable": 0.975}
-    entry |= {"learned_from": 0.95, "masked": {"frozen": 0.025}}
-    entry |= {"largest": {"u": 1.5, "v": 0.2, "r": 0.1}}
-    quality = [{"log": log, "manoeuvre": kind} | entry for log, kind in KINDS.items()]
-    write_json(run / "data_quality.json", quality)
+    write_json(run / "provenance.json", provenance())
+    write_json(run / "data_quality.json", data_quality(KINDS, split))
     for number, log in enumerate(KINDS):
         write_rollout(run / "rollouts" / split, log, tuple(MODELS), 0.5 + 0.5 * number)
     coefficients = [
@@ -184,7 +242,7 @@ def made_run(run: Path, *, split: str = "test") -> Path:
 
 def write_fit_page(run: RunFiles) -> Path:
     """Write `report.html` of a fit or an evaluation with the figures that stand in its folder."""
-    title = str(run.metrics.get("run") or run.path.name)
+    title = run.metrics.run
     said = verdict.verdict_sentences(run)
     level = verdict.verdict_level(run)
     sections = fit_sections(run)

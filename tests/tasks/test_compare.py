@@ -47,8 +47,8 @@ def two(tmp_path: Path) -> list[Path]:
 def test_two_runs_side_by_side(two: list[Path], tmp_path: Path) -> None:
     text, page = compare_runs(two, tmp_path / "out")
     entry = compare_paired(open_fit_runs(two))["whole"]["second"]
-    assert (entry["mean"], entry["nrmse_mean"]) == pytest.approx((0.04, -0.04))
-    assert entry["ci95"] == pytest.approx([-0.04, -0.04])
+    assert (entry.nrmse, entry.difference.nrmse_mean) == pytest.approx((0.04, -0.04))
+    assert entry.difference.ci95 == pytest.approx((-0.04, -0.04))
     assert "second (plsr) has the lowest error: -0.040 against first (significant)." in text
     assert "seed" in text
     assert "same" not in text
@@ -73,7 +73,7 @@ def test_runs_of_other_velocities_are_compared_by_what_both_move(
     accept_run(two[1])
     entry = compare_paired(open_fit_runs(two))["whole"]["second"]
     # of u alone
-    assert entry["nrmse_mean"] == pytest.approx(-0.04)
+    assert entry.difference.nrmse_mean == pytest.approx(-0.04)
     assert "mean over u." in plain(compare_runs(two, tmp_path / "out")[1])
 
 
@@ -94,7 +94,7 @@ def test_the_list_of_runs_tells_how_each_ended(tmp_path: Path) -> None:
     (judged(tmp_path / "deep" / "cut", 0.2) / "summary.json").write_text("{")
     (judged(tmp_path / "open", 0.1) / "summary.json").unlink()
     entries = list_runs(tmp_path)
-    states = {Path(entry["run"]).name: entry["state"] for entry in entries}
+    states = {Path(entry.run).name: entry.state for entry in entries}
     assert states == {"good": "finished", "cut": "damaged", "open": "unfinished"}
     assert "nrmse 0.3" in format_runs(tmp_path, entries)
     assert format_runs(tmp_path / "none", []).endswith("no runs")

@@ -118,7 +118,7 @@ def test_currents_come_back() -> None:
     error = found - truth
     assert np.abs(error).max() < 0.03
     assert np.sqrt((error**2).mean()) < 0.01 < 0.05 < np.sqrt((truth**2).mean())
-    claimed = np.array([row["standard_error"] for row in table])
+    claimed = np.array([row.standard_error for row in table])
     assert 0.5 < np.sqrt((error**2).mean() / (claimed**2).mean()) < 2.0
 
 
@@ -165,7 +165,7 @@ def test_standard_errors_hold_where_the_regressors_are_not_the_true_ones() -> No
     signals = SIGNALS.build()
     linear = LINEAR.build(signals.names)
     found, table = estimate_currents(linear, signals, logs[3:], CurrentConfig(), logs[:3])
-    claimed = np.array([row["standard_error"] for row in table])
+    claimed = np.array([row.standard_error for row in table])
     off = ((found - np.concatenate((truth[3:], truth[:3]))) / claimed) ** 2
     assert 0.3 < np.sqrt(off.mean()) < 2.0
     problem = module._CurrentProblem(linear, signals, logs[3:], 4.0)
@@ -173,7 +173,7 @@ def test_standard_errors_hold_where_the_regressors_are_not_the_true_ones() -> No
         torch.from_numpy(found[:-3]), problem.solve(torch.from_numpy(found[:-3]))[1]
     )
     assert (claimed[:-3].ravel() > 2.0 * alone[1].diagonal().sqrt().numpy()).all()
-    assert [row["fitted"] for row in table] == [True] * len(logs[3:]) + [False] * 3
+    assert [row.fitted for row in table] == [True] * len(logs[3:]) + [False] * 3
 
 
 def test_logs_kept_apart_change_nothing_and_a_narrow_prior_holds_currents_at_zero() -> None:
@@ -187,6 +187,6 @@ def test_logs_kept_apart_change_nothing_and_a_narrow_prior_holds_currents_at_zer
     np.testing.assert_array_equal(beside[:3], alone)
     held, table = estimate_currents(linear, signals, logs[3:5], CurrentConfig(spread=1e-6))
     assert np.abs(held).max() < 1e-4 < np.abs(alone).max()
-    told = [[row["current_north"], row["current_east"]] for row in table]
+    told = [[row.current_north, row.current_east] for row in table]
     np.testing.assert_array_equal(held, told)
-    assert [row["log"] for row in table] == [log.log.name for log in logs[3:5]]
+    assert [row.log for row in table] == [log.log.name for log in logs[3:5]]

@@ -29,8 +29,8 @@ from residnet.core.names import suggest_name
 from residnet.core.processes import worker_limit
 from residnet.core.progress import ProgressCallback
 from residnet.core.trust import trusting
-from residnet.evaluation.metrics import build_metrics_table, iterate_rollout_columns
-from residnet.evaluation.records import ExcitationFile
+from residnet.evaluation.metrics import build_metrics_table, iterate_rollout_columns, mark_selected
+from residnet.evaluation.records import ExcitationFile, MetricsRow
 from residnet.evaluation.selection import Selection
 from residnet.evaluation.verdict import VerdictEvidence, order_protocols, write_verdict
 from residnet.heads import HeadConfig
@@ -74,7 +74,7 @@ class FreeRuns:
 
     def __init__(self, evaluation: SplitEvaluation) -> None:
         self.evaluation = evaluation
-        self.rows: list[dict[str, Any]] = evaluation.rows
+        self.rows: Sequence[MetricsRow] = evaluation.rows
         self.logs = [log.log.name for log in evaluation.logs]
         self.protocols = [run.protocol for run in evaluation.free_runs]
 
@@ -315,16 +315,16 @@ class Models(dict[str, Model]):
         evaluation = self.runs[split].evaluation
         protocol = order_protocols(evaluation.rows, split, self.settings.evaluation.selection)[0]
         rows_by_model = {
-            row["model"]: row
+            row.model: row
             for row in evaluation.rows
-            if (row["protocol"], row["manoeuvre"]) == (protocol, "all")
+            if (row.protocol, row.manoeuvre) == (protocol, "all")
         }
         return VerdictEvidence(
             self.predictor_name,
             split,
             rows_by_model,
             "baseline",
-            self.selection.to_record().to_content(),
+            self.selection.to_record(),
             evaluation.limits_by_protocol,
             protocol=protocol,
             excitation=self.excitation.to_content(),
@@ -347,10 +347,8 @@ class Models(dict[str, Model]):
         """Free-run errors of all models over all splits, see `residnet.metrics`."""
         return self._table([row for runs in self.runs.values() for row in runs.rows])
 
-    def _table(self, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-        return build_metrics_table(
-            [{**r, "selected": r["model"] == self.selected_name} for r in rows]
-        )
+    def _table(self, rows: Sequence[MetricsRow]) -> pd.DataFrame:
+        return build_metrics_table(mark_selected(rows, self.selected_name))
 
     def __missing__(self, name: str) -> Model:
         return self[_require_known(name, self, "model")]

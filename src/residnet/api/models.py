@@ -18,6 +18,7 @@ from residnet.baselines import BaselineConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json, stage_files
+from residnet.core.model_names import BASELINE
 from residnet.core.ownership import Manifest, record_folder
 from residnet.core.registry import register_kind
 from residnet.core.run_loader import accept_run, name_damaged_key
@@ -32,6 +33,7 @@ from residnet.evaluation.derivatives import (
     compute_derivatives,
     read_covariance,
 )
+from residnet.evaluation.records import MetricsRow
 from residnet.evaluation.verdict import UNSEEN_SPLITS, VerdictEvidence, list_model_objections
 from residnet.export import get_exporter
 from residnet.export.base import require_releasable
@@ -347,15 +349,12 @@ def load(
         spec, module = load_model(model_folder)
         # a model saved outside of a run has neither notes nor bands
         notes = model_folder / "fit.json"
-        bands = model_folder.parent.parent / "bands.json"
         return Model(
             FittedModel(
                 spec,
                 module,
                 read_json(notes) if notes.is_file() else {},
-                bands=read_bands(read_json(bands)).get(model_folder.name, {})
-                if bands.is_file()
-                else {},
+                bands=read_bands(model_folder.parent.parent, model_folder.name),
             )
         )
 
@@ -387,7 +386,7 @@ def export_model(
     file: PathLikeArg,
     format: str = "torchscript",
     *,
-    metrics: Sequence[Mapping[str, Any]] = (),
+    metrics: Sequence[MetricsRow] = (),
     allows_objections: bool = False,
 ) -> Mapping[str, Any]:
     """Export a model for controllers after a parity check; returns the model card.
@@ -396,7 +395,7 @@ def export_model(
         model: the model.
         file: file to write.
         format: one of `list_available("formats")`.
-        metrics: rows of metrics.json. The rows of this model are copied to the card; the rows of
+        metrics: rows of `FreeRuns.rows`. The rows of this model are copied to the card; the rows of
             `constant_velocity` and of a baseline under the same protocol are its reference.
         allows_objections: export the model even if it is worse than its reference; the card
             states this.
@@ -414,7 +413,7 @@ def export_model(
     require_instance(model, Model, "export_model: expected a model")
     name = model.spec.name
     chosen_format = get_exporter(format)
-    model_rows = [row for row in metrics if row.get("model", name) == name]
+    model_rows = [row for row in metrics if row.model == name]
     exported = ExportedVessel(model.spec, model.module, model_rows)
     require_releasable(
         exported, _find_objections(name, metrics), allows_objections=allows_objections
@@ -424,19 +423,19 @@ def export_model(
         return chosen_format.export(exported, staged)
 
 
-def _find_objections(name: str, metrics: Sequence[Mapping[str, Any]]) -> list[str]:
+def _find_objections(name: str, metrics: Sequence[MetricsRow]) -> list[str]:
     """Return the objections against a model from rows of metrics.json, on unseen data if any."""
-    all_manoeuvre_rows = [row for row in metrics if row.get("manoeuvre") == "all"]
-    splits = [row["split"] for row in all_manoeuvre_rows if row["model"] == name]
+    all_manoeuvre_rows = [row for row in metrics if row.manoeuvre == "all"]
+    splits = [row.split for row in all_manoeuvre_rows if row.model == name]
     if not splits:
         return []
     split = next(
         (candidate_split for candidate_split in UNSEEN_SPLITS if candidate_split in splits),
         splits[0],
     )
-    split_rows = [row for row in all_manoeuvre_rows if row["split"] == split]
-    rows = {row["model"]: row for row in split_rows if row["protocol"] == split_rows[0]["protocol"]}
-    baseline = next((row["model"] for row in split_rows if row["kind"] == "baseline"), "")
+    split_rows = [row for row in all_manoeuvre_rows if row.split == split]
+    rows = {row.model: row for row in split_rows if row.protocol == split_rows[0].protocol}
+    baseline = next((row.model for row in split_rows if row.kind == BASELINE), "")
     return list_model_objections(VerdictEvidence(name, split, rows, baseline))
 
 

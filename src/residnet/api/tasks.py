@@ -23,12 +23,13 @@ from residnet.baselines import BaselineConfig
 from residnet.baselines.config import IdentifiedConfig
 from residnet.core.config import load_config, validate_config
 from residnet.core.errors import UsageError
-from residnet.core.files import read_table
+from residnet.core.files import read_json, read_table
 from residnet.core.log import Log
 from residnet.core.names import suggest_name
 from residnet.core.ownership import read_regular_file, require_inside, resolve_name
 from residnet.core.progress import ProgressCallback
 from residnet.core.run_loader import SIZE_LIMITS
+from residnet.core.run_records import SummaryFile
 from residnet.core.trust import trusting
 from residnet.evaluation.booklet import build_index_rows
 from residnet.evaluation.metrics import build_metrics_table
@@ -220,8 +221,16 @@ def simulate(
             craft_flights = simulate_all(programme, craft, sea)
             flights += craft_flights
             rows += build_index_rows(craft, craft_flights, programme.hull_length)
-    identity_columns = ("log", "manoeuvre", "craft", "fault")
-    flat_rows = [{name: row[name] for name in identity_columns} | row["indices"] for row in rows]
+    flat_rows = [
+        {
+            "log": row.log,
+            "manoeuvre": row.manoeuvre,
+            "craft": row.craft,
+            "fault": row.fault,
+            **row.indices,
+        }
+        for row in rows
+    ]
     return SimulationResult(flights, pd.DataFrame(flat_rows))
 
 
@@ -242,14 +251,14 @@ class RunResult:
         self._temporary_folder = temporary_folder
 
     @cached_property
-    def summary(self) -> dict[str, Any]:
-        """Task, verdict, and main figures with their units."""
-        return dict(RunFolder(self.folder).read_summary())
+    def summary(self) -> SummaryFile:
+        """Task, verdict, and main figures with their units (summary.json)."""
+        return RunFolder(self.folder).read_summary()
 
     @property
     def verdict(self) -> list[str]:
         """The verdict in complete sentences."""
-        return list(self.summary["verdict"])
+        return list(self.summary.verdict)
 
     @cached_property
     def metrics(self) -> pd.DataFrame:
@@ -260,9 +269,11 @@ class RunResult:
         """
         import pandas as pd
 
-        rows = list(RunFolder(self.folder).read_metrics()["rows"])
-        # rows of a fit contain errors of velocities; other tasks have other columns
-        return build_metrics_table(rows) if "rmse" in rows[0] else pd.json_normalize(rows)
+        run = RunFolder(self.folder)
+        if self.summary.task == "fit":
+            return build_metrics_table(run.read_metrics().rows)
+        # the rows of other tasks have other columns
+        return pd.json_normalize(read_json(run.metrics)["rows"])
 
     @property
     def file_names(self) -> list[str]:
@@ -311,7 +322,7 @@ class RunResult:
         return load(self.folder, name, trust=trust)
 
     def __repr__(self) -> str:
-        return f"RunResult({self.summary['task']}, {self.folder})"
+        return f"RunResult({self.summary.task}, {self.folder})"
 
 
 def run(

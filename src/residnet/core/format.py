@@ -96,11 +96,11 @@ def format_signed(value: float, decimals: int = 4) -> str:
     return f"{value:+.{decimals}f}".replace("-", "−")
 
 
-def format_interval(bounds: list[float] | None, factor: float = 1.0, digits: int = 3) -> str:
+def format_interval(bounds: Sequence[float] | None, factor: float = 1.0, digits: int = 3) -> str:
     """Format the bounds of an interval; a missing interval is a dash."""
     if not bounds:
         return DASH
-    lower, upper = (format_number(factor * bound, digits) for bound in bounds[:2])
+    lower, upper = (format_number(factor * bound, digits) for bound in bounds)
     return f"{lower} to {upper}"
 
 

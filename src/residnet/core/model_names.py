@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-CONSTANT_VELOCITY = "constant_velocity"
+from typing import Final
+
+CONSTANT_VELOCITY: Final = "constant_velocity"
 """The model that holds the initial velocities of a free run."""
-BASELINE = "baseline"
+BASELINE: Final = "baseline"
 """The first known part of a fit."""
-ENSEMBLE = "ensemble"
+ENSEMBLE: Final = "ensemble"
 """The ensemble of the standard recipe: the mean of the trajectories of unlike models."""
-PLANT = "plant"
+PLANT: Final = "plant"
 """The simulator that made the logs."""
 
 FORMER_NAMES = {"zero": CONSTANT_VELOCITY, "truth": PLANT}

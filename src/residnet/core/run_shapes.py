@@ -1,6 +1,8 @@
-"""Types of the values in the JSON files of a run that commands read.
+"""Types of the values in the JSON files of a run that are read without a typed record.
 
-Other keys are not checked. A value of a wrong type raises an error that names the file and the key.
+These are metrics.json, where a model is looked up by its alias, and fit.json, whose notes depend on
+the head. Other keys are not checked. A value of a wrong type raises an error that names the file
+and the key.
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictStr, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, StrictStr, TypeAdapter
 from pydantic import ValidationError as ShapeError
 
 from residnet.core.errors import UsageError
@@ -17,7 +19,6 @@ from residnet.core.model_names import FORMER_NAMES
 
 Number = Annotated[float, Field(strict=True)] | None
 """A number; None represents a non-finite number."""
-Texts = list[StrictStr]
 
 
 class _Shape(BaseModel):
@@ -69,53 +70,8 @@ class _FitNotes(_Shape):
     validation: Number | list[Any] | dict[str, Any] = None
 
 
-class _Figure(_Shape):
-    """A main figure in summary.json."""
-
-    value: Number = None
-    unit: StrictStr = ""
-
-
-class _Summary(_Shape):
-    """The contents of summary.json."""
-
-    task: StrictStr = ""
-    finished: StrictBool = False
-    level: StrictStr = ""
-    verdict: Texts = []
-    figures: dict[str, _Figure] = {}
-
-
-class _Provenance(_Shape):
-    """The contents of provenance.json."""
-
-    residnet: StrictStr | None = None
-    started: StrictStr | None = None
-    seconds: Number = None
-    overrides: Texts | None = None
-    packages: dict[str, StrictStr | None] | None = None
-    inputs: dict[str, StrictStr | None] | None = None
-
-
-class _Export(_Shape):
-    """A row of exports.json."""
-
-    model: StrictStr
-    file: StrictStr | None
-    fault: StrictStr | None
-
-
-class _Exports(_Shape):
-    """The contents of exports.json."""
-
-    exports: list[_Export] = []
-
-
 _SHAPES: dict[str, type[BaseModel]] = {
     "fit.json": _FitNotes,
-    "summary.json": _Summary,
-    "provenance.json": _Provenance,
-    "exports.json": _Exports,
 }
 
 

@@ -2,40 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+
+from residnet.core.records import Record
 
 SPLIT_NAMES = {"train": "identification"}
 """Names of splits in cards, where they differ from those in the run."""
 
 
-@dataclass(frozen=True)
-class Assessment:
+class CardFinding(Record):
+    """A finding of the data checks that is worse than a note.
+
+    Attributes:
+        log: name of the log; None for the set of logs.
+        level: severity.
+        code: kind of finding.
+        text: one line with figures.
+        action: recommended action; empty if there is none.
+    """
+
+    log: str | None
+    level: str
+    code: str
+    text: str
+    action: str
+
+
+class Assessment(Record):
     """Verdict on a model, findings on its data, and the logs of its run.
 
     Attributes:
-        level: key of `residnet.evaluation.verdict.LEVEL_TEXTS`; empty without a verdict.
+        level: key of `residnet.evaluation.verdict.LEVEL_TEXTS`; None without a verdict.
         verdict: sentences of the verdict.
-        findings: findings of the data checks above the level of a note, each with `log`, `level`,
-            `code`, `text` and `action`; None if the data were not checked.
-        split: names of the logs by split; None for a run without logs.
+        findings: findings of the data checks, except notes; None if no data were checked.
+        split: names of logs by split, under the names of `SPLIT_NAMES`; None without logs.
     """
 
-    level: str = ""
-    verdict: Sequence[str] = ()
-    findings: Sequence[Mapping[str, Any]] | None = None
-    split: Mapping[str, Sequence[str]] | None = None
+    level: str | None = None
+    verdict: tuple[str, ...] = ()
+    findings: tuple[CardFinding, ...] | None = None
+    split: dict[str, tuple[str, ...]] | None = None
 
-    def content(self) -> dict[str, Any]:
-        """Return the entries of the card; null means unknown."""
-        split: dict[str, list[str]] | None = None
-        if self.split is not None:
-            split = {"identification": [], "validation": [], "test": []}
-            split |= {SPLIT_NAMES.get(name, name): list(logs) for name, logs in self.split.items()}
-        return {
-            "level": self.level or None,
-            "verdict": list(self.verdict),
-            "findings": None if self.findings is None else [dict(row) for row in self.findings],
-            "split": split,
-        }
+
+def name_splits(logs: Sequence[tuple[str, str]]) -> dict[str, tuple[str, ...]] | None:
+    """Return the logs of each split under the names of cards; None without logs.
+
+    Args:
+        logs: split and name of each log.
+    """
+    if not logs:
+        return None
+    splits: dict[str, tuple[str, ...]] = {"identification": (), "validation": (), "test": ()}
+    for split, log in logs:
+        name = SPLIT_NAMES.get(split, split)
+        splits[name] = (*splits.get(name, ()), log)
+    return splits

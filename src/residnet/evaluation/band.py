@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.layout import DYNAMIC_STATES, EXTRA_STATES, HEADING, PLANAR_LAYOUT, VELOCITIES
+from residnet.evaluation.records import Activity, BandRow, BandsFile, ByChannel, CurveByChannel
 
 if TYPE_CHECKING:
     from residnet.dynamics.store import BandTable
-    from residnet.evaluation.records import BandsFile
 
 
 def band_channels(states: np.ndarray, position_radius: np.ndarray) -> np.ndarray:
@@ -288,65 +289,70 @@ class Band:
         metadata = {"level": self.level, "logs": self.n_logs, "cautions": self.cautions}
         return BandTable.model_validate({**metadata, "steps": self.steps.tolist(), **columns})
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the contents of the band for JSON."""
+    def to_record(self) -> BandRow:
+        """Return the entry of bands.json."""
 
-        def map_by_channel(by_channel: np.ndarray) -> dict[str, Any]:
-            return dict(zip(self.channels, by_channel.T.tolist(), strict=True))
+        def map_curves(by_channel: np.ndarray) -> CurveByChannel:
+            return {
+                name: tuple(values)
+                for name, values in zip(self.channels, by_channel.T.tolist(), strict=True)
+            }
+
+        def map_values(by_channel: np.ndarray) -> ByChannel:
+            return dict(zip(self.channels, by_channel.tolist(), strict=True))
 
         dynamic_states = [name for name in self.channels if name not in ("heading", "position")]
-        return {
-            "level": self.level,
-            "step": self.step,
-            "horizon": self.horizon,
-            "logs": self.n_logs,
-            "independent_scores": self.n_scores,
-            "cautions": list(self.cautions),
-            "steps": self.steps.tolist(),
-            "half_width": map_by_channel(self.half_width),
-            "half_width_of_any_run": map_by_channel(self.unconditional_width),
-            "whole_run_factor": map_by_channel(self.simultaneous_factor),
-            "constant_half_width": map_by_channel(self.constant_width),
-            "score_unit": map_by_channel(self.score_unit),
-            "activity": {
-                "measures": [*dynamic_states, *(f"{name}_dot" for name in dynamic_states)],
-                "floor": self.intensity.floor.tolist(),
-                "centre": self.intensity.log_mean.tolist(),
-                "spread": self.intensity.log_std.tolist(),
-                "slope": map_by_channel(self.slope),
-            },
-            "usual_spread": None
-            if self.typical_spread is None
-            else map_by_channel(self.typical_spread),
-        }
+        return BandRow(
+            level=self.level,
+            step=self.step,
+            horizon=self.horizon,
+            logs=self.n_logs,
+            independent_scores=self.n_scores,
+            cautions=self.cautions,
+            steps=tuple(self.steps.tolist()),
+            half_width=map_curves(self.half_width),
+            half_width_of_any_run=map_curves(self.unconditional_width),
+            whole_run_factor=map_values(self.simultaneous_factor),
+            constant_half_width=map_values(self.constant_width),
+            score_unit=map_values(self.score_unit),
+            activity=Activity(
+                measures=(*dynamic_states, *(f"{name}_dot" for name in dynamic_states)),
+                floor=tuple(self.intensity.floor.tolist()),
+                centre=tuple(self.intensity.log_mean.tolist()),
+                spread=tuple(self.intensity.log_std.tolist()),
+                slope=map_curves(self.slope),
+            ),
+            usual_spread=None if self.typical_spread is None else map_curves(self.typical_spread),
+        )
 
     @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> Band:
-        """Return the band from what `to_json` gave."""
-        channels = tuple(content["half_width"])
-        intensity = content["activity"]
+    def from_record(cls, row: BandRow) -> Band:
+        """Return the band from its entry of bands.json."""
+        channels = tuple(row.half_width)
 
-        def table(by_channel: Mapping[str, Any]) -> np.ndarray:
+        def table(by_channel: CurveByChannel | ByChannel) -> np.ndarray:
             return np.array([by_channel[channel] for channel in channels]).T
 
-        # files of earlier versions hold no usual spread
-        typical_spread = content.get("usual_spread")
         return cls(
-            float(content["level"]),
-            float(content["step"]),
-            np.array(content["steps"]),
-            table(content["half_width"]),
-            table(content["half_width_of_any_run"]),
-            table(content["whole_run_factor"]),
-            table(content["constant_half_width"]),
-            table(content["score_unit"]),
-            MotionIntensity(*(np.array(intensity[key]) for key in ("floor", "centre", "spread"))),
-            table(intensity["slope"]),
-            int(content["logs"]),
-            float(content["independent_scores"]),
-            tuple(content["cautions"]),
-            table(typical_spread) if typical_spread else None,
-            channels,
+            level=row.level,
+            step=row.step,
+            steps=np.array(row.steps),
+            half_width=table(row.half_width),
+            unconditional_width=table(row.half_width_of_any_run),
+            simultaneous_factor=table(row.whole_run_factor),
+            constant_width=table(row.constant_half_width),
+            score_unit=table(row.score_unit),
+            intensity=MotionIntensity(
+                np.array(row.activity.floor),
+                np.array(row.activity.centre),
+                np.array(row.activity.spread),
+            ),
+            slope=table(row.activity.slope),
+            n_logs=row.logs,
+            n_scores=row.independent_scores,
+            cautions=row.cautions,
+            typical_spread=None if row.usual_spread is None else table(row.usual_spread),
+            channels=channels,
         )
 
 
@@ -400,7 +406,7 @@ def largest_error_ratios(errors: Sequence[np.ndarray], widths: Sequence[np.ndarr
     return ratios
 
 
-SCHEMA = "residnet.bands/1"
+SCHEMA: Final = "residnet.bands/1"
 
 
 def build_bands_file(run: str, bands: BandsByModel) -> BandsFile:
@@ -410,19 +416,21 @@ def build_bands_file(run: str, bands: BandsByModel) -> BandsFile:
         run: name of the run.
         bands: bands by model and protocol; models without bands are omitted.
     """
-    from residnet.evaluation.records import BandsFile
 
     models = {
-        model: {protocol: band.to_json() for protocol, band in bands_by_protocol.items()}
+        model: {protocol: band.to_record() for protocol, band in bands_by_protocol.items()}
         for model, bands_by_protocol in bands.items()
         if bands_by_protocol
     }
-    return BandsFile.model_validate({"schema": SCHEMA, "run": run, "models": models})
+    return BandsFile(schema=SCHEMA, run=run, models=models)
 
 
-def read_bands(content: Mapping[str, Any]) -> dict[str, dict[str, Band]]:
-    """Return the bands by model and protocol from the contents of bands.json; may be empty."""
-    return {
-        model: {protocol: Band.from_json(band) for protocol, band in bands_by_protocol.items()}
-        for model, bands_by_protocol in content.get("models", {}).items()
-    }
+def read_bands(run: Path, model: str) -> dict[str, Band]:
+    """Read the bands of a model by protocol from bands.json; empty if the run has none.
+
+    Raises:
+        UsageError: if the file cannot be read.
+    """
+    file = BandsFile.read_optional(run, "bands.json")
+    rows = {} if file is None else file.models.get(model, {})
+    return {protocol: Band.from_record(row) for protocol, row in rows.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -114,6 +114,22 @@ def compute_run_errors(
 
 
 @dataclass(frozen=True)
+class BandCoverage:
+    """How prediction intervals fared over some windows.
+
+    Attributes:
+        share: share of the samples inside by channel, their `mean`, and `whole`: the share of
+            windows inside the interval of whole runs.
+        score: mean interval score in units of the constant-velocity error.
+        constant_width_score: the same of an interval of constant width.
+    """
+
+    share: dict[str, float]
+    score: float
+    constant_width_score: float
+
+
+@dataclass(frozen=True)
 class BandCounts:
     """Sums over the scored samples of each of W windows, by channel [W, c].
 
@@ -133,8 +149,8 @@ class BandCounts:
     interval_score_sum: np.ndarray
     constant_score_sum: np.ndarray
 
-    def to_row(self, window_mask: np.ndarray) -> dict[str, Any]:
-        """Return the coverage entries of a row of metrics.json for selected windows [W] bool."""
+    def summarize(self, window_mask: np.ndarray) -> BandCoverage:
+        """Return coverage and scores over selected windows [W] bool."""
         n_scored = self.n_scored[window_mask].sum(axis=0)
         is_scored = n_scored > 0
 
@@ -143,15 +159,15 @@ class BandCounts:
 
         coverage = compute_mean(self.n_inside)
         names = [name for name, scored in zip(self.channels, is_scored, strict=True) if scored]
-        return {
-            "band_coverage": {
+        return BandCoverage(
+            share={
                 **dict(zip(names, map(float, coverage), strict=True)),
                 "mean": float(coverage.mean()),
                 "whole": float(np.nanmean(self.is_run_inside[window_mask])),
             },
-            "band_score": float(compute_mean(self.interval_score_sum).mean()),
-            "band_score_constant": float(compute_mean(self.constant_score_sum).mean()),
-        }
+            score=float(compute_mean(self.interval_score_sum).mean()),
+            constant_width_score=float(compute_mean(self.constant_score_sum).mean()),
+        )
 
 
 def count_coverage(runs: Sequence[RunErrors], band: Band) -> BandCounts:

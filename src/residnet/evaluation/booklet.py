@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -13,16 +13,23 @@ from residnet.core.config import Config, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
+from residnet.evaluation.records import (
+    BookletFile,
+    BookletIndex,
+    BookletRow,
+    FlightIndices,
+    IndexLimit,
+    IndicesFile,
+)
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.manoeuvres.base import Manoeuvre
 from residnet.manoeuvres.indices import INDEX_UNITS, LENGTH_INDICES
 from residnet.manoeuvres.input_shares import InputShare
 
 if TYPE_CHECKING:
-    from residnet.evaluation.records import BookletFile
     from residnet.manoeuvres.trials import ManoeuvreRun, SimulatedVessel
 
-SCHEMA = "residnet.booklet/1"
+SCHEMA: Final = "residnet.booklet/1"
 # exponent of the length scale that converts a unit from model to ship by Froude's law
 _FROUDE_EXPONENTS = {"m": 1.0, "s": 0.5, "m/s": 0.5, "rad/s": -0.5, "rad": 0.0, "-": 0.0}
 
@@ -121,48 +128,44 @@ def build_booklet(
     Args:
         length: length of the hull in the scale of the logs, m.
     """
-    from residnet.evaluation.records import BookletFile
 
     rows = [_page_row(page, length, scale, level) for page in pages]
-    index_names = sorted({name for row in rows for name in row["indices"]})
-    metadata = {
-        "schema": SCHEMA,
-        "model": model,
-        "length": length,
-        "scale": scale,
-        "draws": draws,
-        "level": level,
-    }
-    units = {name: INDEX_UNITS[name] for name in index_names}
-    return BookletFile.model_validate({**metadata, "units": units, "pages": rows})
+    index_names = sorted({name for row in rows for name in row.indices})
+    return BookletFile(
+        schema=SCHEMA,
+        model=model,
+        length=length,
+        scale=scale,
+        draws=draws,
+        level=level,
+        units={name: INDEX_UNITS[name] for name in index_names},
+        pages=tuple(rows),
+    )
 
 
-def _page_row(page: BookletPage, length: float, scale: float, level: float) -> dict[str, Any]:
+def _page_row(page: BookletPage, length: float, scale: float, level: float) -> BookletRow:
     names = [
         name
         for name, value in page.indices[0].items()
         if name in INDEX_UNITS and not isinstance(value, list)
     ]
     indices = {name: _index_summary(page, name, length, scale, level) for name in names}
-    return {
-        "name": page.name,
-        "manoeuvre": page.manoeuvre.kind,
-        "demand": page.manoeuvre.model_dump(mode="json"),
-        "split": page.split,
+    return BookletRow(
+        name=page.name,
+        manoeuvre=page.manoeuvre.kind,
+        demand=page.manoeuvre.model_dump(mode="json"),
+        split=page.split,
         # runs without indices diverged or did not reach their end; they are no part of the
         # intervals
-        "faults": sum(not run_indices for run_indices in page.indices[1:]),
-        "indices": indices,
-    }
+        faults=sum(not run_indices for run_indices in page.indices[1:]),
+        indices=indices,
+    )
 
 
 def _index_summary(
     page: BookletPage, name: str, length: float, scale: float, level: float
-) -> dict[str, Any]:
-    """Return one index: `value`, `interval` over draws and, if available, the optional fields.
-
-    The optional fields are `lengths`, `measured`, `difference`, `limit` and `kept`.
-    """
+) -> BookletIndex:
+    """Return one index with its interval over draws and, where they are known, its references."""
     value = float(page.indices[0][name])
     draws = np.array(
         [float(run_indices[name]) for run_indices in page.indices[1:] if name in run_indices]
@@ -189,15 +192,15 @@ def _index_summary(
             "kept": froude_factor * value <= limit,
             "kept_share": float(np.mean(froude_factor * draws <= limit)) if draws.size else None,
         }
-    return summary
+    return BookletIndex.model_validate(summary)
 
 
-INDICES_SCHEMA = "residnet.indices/1"
+INDICES_SCHEMA: Final = "residnet.indices/1"
 
 
 def build_index_rows(
     vessel: SimulatedVessel, runs: Sequence[ManoeuvreRun], length: float | None
-) -> list[dict[str, Any]]:
+) -> list[FlightIndices]:
     """Return log, manoeuvre, vessel, fault, indices and limits of each simulated manoeuvre.
 
     Indices are in SI units and rad; each limit has a flag whether it is kept.
@@ -221,33 +224,32 @@ def build_index_rows(
             else {}
         )
         rows.append(
-            {
-                "log": run.true_log.name,
-                "manoeuvre": run.manoeuvre.kind,
-                "craft": vessel.name,
-                "fault": run.fault_text,
-                "timed_out": bool(run.measured_log.meta.get("timed_out", False)),
-                "indices": indices,
-                "limits": {
-                    name: {"limit": limit, "kept": indices[name] <= limit}
+            FlightIndices(
+                log=run.true_log.name,
+                manoeuvre=run.manoeuvre.kind,
+                craft=vessel.name,
+                fault=run.fault_text,
+                timed_out=bool(run.measured_log.meta.get("timed_out", False)),
+                indices=indices,
+                limits={
+                    name: IndexLimit(limit=limit, kept=bool(indices[name] <= limit))
                     for name, limit in limits.items()
                     if name in indices
                 },
-            }
+            )
         )
     return rows
 
 
-def build_index_table(
-    run: str, length: float | None, rows: Sequence[Mapping[str, Any]]
-) -> dict[str, Any]:
+def build_indices_file(
+    run: str, length: float | None, rows: Sequence[FlightIndices]
+) -> IndicesFile:
     """Return the contents of indices.json."""
-    index_names = {name for row in rows for name in row["indices"]}
-    units = {name: INDEX_UNITS.get(name, "-") for name in sorted(index_names)}
-    return {
-        "schema": INDICES_SCHEMA,
-        "run": run,
-        "length": length,
-        "units": units,
-        "rows": list(rows),
-    }
+    index_names = {name for row in rows for name in row.indices}
+    return IndicesFile(
+        schema=INDICES_SCHEMA,
+        run=run,
+        length=length,
+        units={name: INDEX_UNITS.get(name, "-") for name in sorted(index_names)},
+        rows=tuple(rows),
+    )

@@ -26,6 +26,7 @@ from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
 from residnet.evaluation.band import Band, band_channels
 from residnet.evaluation.protocol import Window
+from residnet.evaluation.records import ModelKind
 from residnet.preprocessing.prepare import PreparedLog
 
 _MAX_LENGTH_RATIO = 4
@@ -57,7 +58,7 @@ class Candidate:
     """
 
     name: str
-    model_kind: str
+    model_kind: ModelKind
     model: Dynamics
     state_names: tuple[str, ...] = ()
     input_names: tuple[str, ...] | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy
@@ -15,7 +15,16 @@ from residnet.core.layout import HEADING, POSE, POSITION
 from residnet.core.names import ACCELERATION_NAMES
 from residnet.evaluation.metrics import CONFIDENCE_LEVEL, bootstrap_tail_probability
 from residnet.evaluation.protocol import ProtocolConfig, Window
-from residnet.evaluation.records import GoodnessFile
+from residnet.evaluation.records import (
+    GoodnessFile,
+    GoodnessRow,
+    Interval,
+    MaeDifference,
+    ModelKind,
+    Repeatability,
+    RepeatDifferences,
+    RepeatTolerance,
+)
 from residnet.preprocessing.prepare import PreparedLog
 
 _COMMAND_TOLERANCE = 0.05
@@ -46,7 +55,7 @@ def assess_repeatability(
     n_commands: int,
     scales: Mapping[str, float],
     dt: float,
-) -> dict[str, Any]:
+) -> Repeatability:
     """Return the part of limits.json about repeated manoeuvres.
 
     Every window of the protocol is compared with every segment of equal length in later logs, and
@@ -60,43 +69,41 @@ def assess_repeatability(
         dt: time step in s.
 
     Returns:
-        Tolerances; pairs, logs (number of logs involved). With pairs also means over them: root
-        mean square differences of the velocities (SI), differences of position and heading at the
-        end (m, rad, relative to the start of each run), `nrmse` (mean of difference / scale), and
-        the same by kind of manoeuvre. Two independent runs differ by sqrt(2) times their standard
-        deviation.
+        Tolerances and, with pairs, their mean differences. Two independent runs differ by sqrt(2)
+        times their standard deviation.
     """
     dynamic_states = logs[0].dof.dynamic_states
     state_scales = np.array([scales.get(name, 1.0) for name in dynamic_states])
     scored_columns = [dynamic_states.index(name) for name in scales]
     pairs = list(find_pairs(protocol, logs, n_commands, state_scales, dt))
-    summary: dict[str, Any] = {
-        "tolerance": {
-            "command_share_of_range": _COMMAND_TOLERANCE,
-            "start": {name: _START_TOLERANCE * float(scales[name]) for name in scales},
-        },
-        "pairs": len(pairs),
-        "logs": len(
-            {pair.window.log_index for pair in pairs} | {pair.repeat_log for pair in pairs}
-        ),
-    }
-    if pairs:
-        differences = np.array([_pair_differences(pair, logs) for pair in pairs])
-        manoeuvre_kinds = np.array([logs[pair.window.log_index].log.manoeuvre for pair in pairs])
-        by_manoeuvre = {
-            str(manoeuvre_kind): {"pairs": int((manoeuvre_kinds == manoeuvre_kind).sum())}
-            | _mean_differences(
+    tolerance = RepeatTolerance(
+        command_share_of_range=_COMMAND_TOLERANCE,
+        start={name: _START_TOLERANCE * float(scales[name]) for name in scales},
+    )
+    paired_logs = {pair.window.log_index for pair in pairs} | {pair.repeat_log for pair in pairs}
+    if not pairs:
+        return Repeatability(tolerance=tolerance, pairs=0, logs=0)
+    differences = np.array([_pair_differences(pair, logs) for pair in pairs])
+    manoeuvre_kinds = np.array([logs[pair.window.log_index].log.manoeuvre for pair in pairs])
+    by_manoeuvre = {
+        str(manoeuvre_kind): RepeatDifferences.model_validate(
+            _mean_differences(
                 differences[manoeuvre_kinds == manoeuvre_kind],
                 dynamic_states,
                 state_scales,
                 scored_columns,
             )
-            for manoeuvre_kind in np.unique(manoeuvre_kinds)
+        )
+        for manoeuvre_kind in np.unique(manoeuvre_kinds)
+    }
+    return Repeatability.model_validate(
+        {
+            **_mean_differences(differences, dynamic_states, state_scales, scored_columns),
+            "tolerance": tolerance,
+            "logs": len(paired_logs),
+            "manoeuvres": by_manoeuvre,
         }
-        summary |= _mean_differences(differences, dynamic_states, state_scales, scored_columns) | {
-            "manoeuvres": by_manoeuvre
-        }
-    return summary
+    )
 
 
 def find_pairs(
@@ -244,13 +251,14 @@ def _mean_differences(
     state_scales: np.ndarray,
     scored_columns: list[int],
 ) -> dict[str, float]:
+    """Return the fields of `records.RepeatDifferences` from the differences [P, n + 2] of pairs."""
     means = dict(
         zip((*dynamic_states, "position", "heading"), differences.mean(0).tolist(), strict=True)
     )
     normalized_differences = (differences[:, : len(dynamic_states)].mean(0) / state_scales)[
         scored_columns
     ]
-    return means | {"nrmse": float(normalized_differences.mean())}
+    return means | {"pairs": len(differences), "nrmse": float(normalized_differences.mean())}
 
 
 _N_BLOCK_RESAMPLES = 2_000
@@ -448,7 +456,7 @@ def ljung_box_test(segments: Segments, n_lags: int) -> tuple[float, float]:
     return statistic, float(scipy.stats.chi2.sf(statistic, n_lags))
 
 
-SCHEMA = "residnet.goodness/1"
+SCHEMA: Final = "residnet.goodness/1"
 N_LAGS = 20
 """Lags of the whiteness test."""
 
@@ -466,15 +474,35 @@ class OneStepResiduals:
     """
 
     model_name: str
-    model_kind: str
+    model_kind: ModelKind
     n_parameters: Sequence[float]
     residuals: Sequence[np.ndarray]
     reference_name: str | None = None
 
 
+class FitMeasures(NamedTuple):
+    """Measures of a regression; equations (9.11) to (9.16) of document 000.
+
+    Attributes:
+        rmse: root mean square residual.
+        r2: coefficient of determination.
+        r2_adjusted: adjusted for the number of parameters.
+        cp: Mallows' C_p.
+        aic: Akaike's criterion.
+        bic: Bayesian criterion.
+    """
+
+    rmse: float
+    r2: float | None
+    r2_adjusted: float | None
+    cp: float
+    aic: float | None
+    bic: float | None
+
+
 def goodness_of_fit_measures(
     residuals: np.ndarray, measured: np.ndarray, n_parameters: float, noise_variance: float
-) -> dict[str, float | None]:
+) -> FitMeasures:
     """Return RMSE (9.11), R^2 (9.15), adjusted R^2 (9.16), C_p (9.12), AIC (9.13), BIC (9.14).
 
     Equations of document 000, with sums of squares in place of means.
@@ -486,31 +514,31 @@ def goodness_of_fit_measures(
             noise variance of each model itself the criteria do not discriminate.
 
     Returns:
-        rmse, r2, r2_adjusted, cp, aic, bic; None if the target is constant, the noise is zero, or m
-        does not exceed d + 1.
+        The measures; None if the target is constant, the noise is zero, or m does not exceed
+        d + 1.
     """
     n_samples = len(residuals)
     rss = float(residuals @ residuals)
     total_sum_of_squares = float(((measured - measured.mean()) ** 2).sum())
     r2 = 1 - rss / total_sum_of_squares if total_sum_of_squares > 0 else None
     has_noise = noise_variance > 0
-    return {
-        "rmse": math.sqrt(rss / n_samples),
-        "r2": r2,
-        "r2_adjusted": (
+    return FitMeasures(
+        rmse=math.sqrt(rss / n_samples),
+        r2=r2,
+        r2_adjusted=(
             1 - (1 - r2) * (n_samples - 1) / (n_samples - n_parameters - 1)
             if r2 is not None and n_samples > n_parameters + 1
             else None
         ),
-        "cp": (rss + 2 * n_parameters * noise_variance) / n_samples,
-        "aic": (rss + 2 * n_parameters * noise_variance) / (n_samples * noise_variance)
+        cp=(rss + 2 * n_parameters * noise_variance) / n_samples,
+        aic=(rss + 2 * n_parameters * noise_variance) / (n_samples * noise_variance)
         if has_noise
         else None,
-        "bic": (rss + math.log(n_samples) * n_parameters * noise_variance)
+        bic=(rss + math.log(n_samples) * n_parameters * noise_variance)
         / (n_samples * noise_variance)
         if has_noise
         else None,
-    }
+    )
 
 
 def estimate_noise_variance(residuals: np.ndarray, n_parameters: float) -> float:
@@ -527,7 +555,7 @@ def build_goodness_table(
     targets: Sequence[np.ndarray],
     dt: float,
     axes: Iterable[tuple[int, str]] = tuple(enumerate(ACCELERATION_NAMES)),
-) -> list[dict[str, Any]]:
+) -> list[GoodnessRow]:
     """Return a row for each model and axis.
 
     Args:
@@ -553,59 +581,83 @@ def build_goodness_table(
             for model in models
         )
         for model in models:
-            row = {
-                "model": model.model_name,
-                "kind": model.model_kind,
-                "axis": name,
-                "samples": len(pooled_target),
-                "parameters": float(model.n_parameters[axis]),
-            }
-            row |= goodness_of_fit_measures(
+            measures = goodness_of_fit_measures(
                 pooled_residuals[model.model_name],
                 pooled_target,
                 model.n_parameters[axis],
                 variance if math.isfinite(variance) else 0.0,
             )
-            row |= _residual_statistics(residuals_by_model[model.model_name], dt)
+            segments = residuals_by_model[model.model_name]
+            row = _build_row(model, axis, name, segments, measures, dt)
             if model.reference_name in models_by_name:
-                row["difference"] = paired_mae_difference(
-                    residuals_by_model[model.model_name],
+                difference = paired_mae_difference(
+                    segments,
                     residuals_by_model[str(model.reference_name)],
                     str(model.reference_name),
                 )
+                row = row.model_copy(update={"difference": difference})
             rows.append(row)
     return rows
 
 
-def _residual_statistics(segments: Sequence[np.ndarray], dt: float) -> dict[str, Any]:
-    """Return the mean absolute residual with both intervals, and serial-correlation statistics."""
+def _build_row(
+    model: OneStepResiduals,
+    axis: int,
+    name: str,
+    segments: Sequence[np.ndarray],
+    measures: FitMeasures,
+    dt: float,
+) -> GoodnessRow:
+    """Return the row of a model and axis, without the difference to its reference.
+
+    Args:
+        model: the model.
+        axis: number of the acceleration.
+        name: name of the acceleration.
+        segments: residuals of the acceleration, [T] for each segment.
+        measures: measures of the fit.
+        dt: time between samples, s.
+    """
     absolute_residuals = [np.abs(segment) for segment in segments]
     mae_interval = block_bootstrap_interval(absolute_residuals)
     n_lags = min(N_LAGS, max(sum(map(len, segments)) // 5, 1))
     covariance = compute_autocovariance(segments, n_lags)
     statistic, p_value = ljung_box_test(segments, n_lags)
     mean_interval = block_bootstrap_interval(segments)
-    return {
-        "mae": mae_interval.mean,
-        "mae_ci95": _finite_bounds(mae_interval.lower, mae_interval.upper),
-        "mae_ci95_independent": _finite_bounds(
+    return GoodnessRow(
+        model=model.model_name,
+        kind=model.model_kind,
+        axis=name,
+        samples=sum(map(len, segments)),
+        parameters=float(model.n_parameters[axis]),
+        rmse=measures.rmse,
+        r2=measures.r2,
+        r2_adjusted=measures.r2_adjusted,
+        cp=measures.cp,
+        aic=measures.aic,
+        bic=measures.bic,
+        mae=mae_interval.mean,
+        mae_ci95=_finite_bounds(mae_interval.lower, mae_interval.upper),
+        mae_ci95_independent=_finite_bounds(
             *independent_confidence_interval(np.concatenate(absolute_residuals))
         ),
-        "block_seconds": mae_interval.block_length * dt,
-        "mean": mean_interval.mean,
-        "mean_ci95": _finite_bounds(mean_interval.lower, mean_interval.upper),
-        "effective": estimate_serial_dependence(segments).effective_size,
-        "autocorrelation": (
-            (covariance[1:] / covariance[0]).tolist() if covariance[0] > 0 else [0.0] * n_lags
+        block_seconds=mae_interval.block_length * dt,
+        mean=mean_interval.mean,
+        mean_ci95=_finite_bounds(mean_interval.lower, mean_interval.upper),
+        effective=estimate_serial_dependence(segments).effective_size,
+        autocorrelation=(
+            tuple((covariance[1:] / covariance[0]).tolist())
+            if covariance[0] > 0
+            else (0.0,) * n_lags
         ),
-        "ljung_box": statistic,
-        "white_p": p_value,
-    }
+        ljung_box=statistic,
+        white_p=p_value,
+    )
 
 
 def paired_mae_difference(
     residuals: Sequence[np.ndarray], reference_residuals: Sequence[np.ndarray], reference_name: str
-) -> dict[str, Any]:
+) -> MaeDifference:
     """Return the paired difference of two models' mean absolute residuals, with its interval.
 
     It is negative if the model is better than the reference.
@@ -623,23 +675,22 @@ def paired_mae_difference(
     )
     reference_mae = float(np.abs(np.concatenate(list(reference_residuals))).mean())
     bounds = _finite_bounds(interval.lower, interval.upper)
-    return {
-        "to": reference_name,
-        "mae": interval.mean,
-        "ci95": bounds,
-        "excludes_zero": bounds is not None and (bounds[0] > 0 or bounds[1] < 0),
-        "ratio": (reference_mae + interval.mean) / reference_mae if reference_mae > 0 else None,
-    }
+    return MaeDifference(
+        to=reference_name,
+        mae=interval.mean,
+        ci95=bounds,
+        excludes_zero=bounds is not None and (bounds[0] > 0 or bounds[1] < 0),
+        ratio=(reference_mae + interval.mean) / reference_mae if reference_mae > 0 else None,
+    )
 
 
-def _finite_bounds(lower: float, upper: float) -> list[float] | None:
-    return [lower, upper] if math.isfinite(lower) and math.isfinite(upper) else None
+def _finite_bounds(lower: float, upper: float) -> Interval | None:
+    return (lower, upper) if math.isfinite(lower) and math.isfinite(upper) else None
 
 
 def build_goodness_file(
-    run: str, splits: Mapping[str, list[dict[str, Any]]], dt: float
+    run: str, splits: Mapping[str, Sequence[GoodnessRow]], dt: float
 ) -> GoodnessFile:
     """Return the contents of goodness.json."""
-    return GoodnessFile.model_validate(
-        {"schema": SCHEMA, "run": run, "lags": N_LAGS, "step": dt, "splits": dict(splits)}
-    )
+    rows_by_split = {split: tuple(rows) for split, rows in splits.items()}
+    return GoodnessFile(schema=SCHEMA, run=run, lags=N_LAGS, step=dt, splits=rows_by_split)

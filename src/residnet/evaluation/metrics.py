@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import scipy
@@ -18,7 +18,21 @@ from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.names import POSE_ERROR_UNITS
 from residnet.evaluation.band import BandsByModel
 from residnet.evaluation.bands import band_limits, compute_run_errors, count_coverage
-from residnet.evaluation.records import MetricsFile
+from residnet.evaluation.records import (
+    BlockCount,
+    ClassErrors,
+    ClassRow,
+    HorizonRow,
+    Interval,
+    KinematicErrors,
+    MetricsFile,
+    MetricsRow,
+    OutsideRange,
+    PairedDifference,
+    PoseErrors,
+    ProtocolLimits,
+    WorstWindow,
+)
 from residnet.evaluation.verdict import MIN_LOGS_FOR_INTERVAL, describe_divergence
 
 if TYPE_CHECKING:
@@ -47,18 +61,18 @@ class ResamplingBlocks:
 
     Attributes:
         block_indices: block of each window, [W], from 0 on.
-        block_kind: `logs` if a block is all windows of a log, else `windows`: consecutive windows
-            of one log.
+        block_kind: `logs` if a block is all windows of a log; `windows` for consecutive windows of
+            one log; `segments` for uninterrupted parts of logs.
         n_blocks: number of blocks.
     """
 
     block_indices: np.ndarray
-    block_kind: str
+    block_kind: Literal["logs", "windows", "segments"]
     n_blocks: int
 
-    def to_row(self) -> dict[str, Any]:
+    def to_record(self) -> BlockCount:
         """Return the entry `ci95_blocks` of metrics.json."""
-        return {"of": self.block_kind, "count": self.n_blocks}
+        return BlockCount(of=self.block_kind, count=self.n_blocks)
 
 
 def make_resampling_blocks(log_indices: Sequence[int] | np.ndarray) -> ResamplingBlocks | None:
@@ -98,8 +112,8 @@ def make_resampling_blocks(log_indices: Sequence[int] | np.ndarray) -> Resamplin
 
 def bootstrap_intervals(
     values: np.ndarray, resampling_blocks: ResamplingBlocks | None
-) -> list[list[float] | None]:
-    """Return 95 % confidence intervals [low, high] of the means of columns [W, C] over windows.
+) -> list[Interval | None]:
+    """Return 95 % confidence intervals of the means of columns [W, C] over windows.
 
     Intervals are None without blocks.
 
@@ -124,7 +138,7 @@ def bootstrap_intervals(
     # block sums instead of windows: one matrix product gives all resamples of all columns
     tail_probability = bootstrap_tail_probability(resampling_blocks.n_blocks)
     return [
-        [float(lower), float(upper)]
+        (float(lower), float(upper))
         for lower, upper in np.quantile(
             resampled_means, [tail_probability, 1 - tail_probability], axis=0
         ).T
@@ -133,8 +147,8 @@ def bootstrap_intervals(
 
 def prediction_intervals(
     window_errors: np.ndarray, log_indices: np.ndarray
-) -> list[list[float] | None]:
-    """Return 95 % prediction intervals [low, high] of the means of columns [W, C] over new logs.
+) -> list[Interval | None]:
+    """Return 95 % prediction intervals of the means of columns [W, C] over new logs.
 
     The number of new logs equals the number of logs in the data. Windows of a log share manoeuvre,
     weather and speed, so the spread of the means of logs counts. Errors are positive with a random
@@ -171,7 +185,7 @@ def prediction_intervals(
     # relative deviations of means are deviations of logarithms in first order
     interval_factor = math.exp(half_width_factor * relative_std)
     return [
-        [float(mean / interval_factor), float(mean * interval_factor)]
+        (float(mean / interval_factor), float(mean * interval_factor))
         for mean in window_errors.mean(0)
     ]
 
@@ -203,33 +217,30 @@ def paired_difference(
     reference_errors: np.ndarray,
     reference_name: str,
     resampling_blocks: ResamplingBlocks | None,
-) -> dict[str, Any]:
-    """Return the paired difference of two models' mean errors, as in metrics.json.
+) -> PairedDifference:
+    """Return the paired difference of two models' mean errors.
 
     Args:
         model_errors: error of each window, [W].
         reference_errors: error of the reference model over the same windows, [W].
-
-    Returns:
-        The fields of `records.PairedDifference`.
     """
     differences = model_errors - reference_errors
     (confidence_interval,) = bootstrap_intervals(differences[:, None], resampling_blocks)
     reference_mean = float(reference_errors.mean())
     ratio = float(model_errors.mean()) / reference_mean if reference_mean > 0 else None
-    return {
-        "to": reference_name,
-        "nrmse_mean": float(differences.mean()),
-        "ci95": confidence_interval,
-        "excludes_zero": confidence_interval is not None
+    return PairedDifference(
+        to=reference_name,
+        nrmse_mean=float(differences.mean()),
+        ci95=confidence_interval,
+        excludes_zero=confidence_interval is not None
         and (confidence_interval[0] > 0 or confidence_interval[1] < 0),
-        "ratio": ratio,
-        "worse": ratio is not None and ratio > 1.05,
-    }
+        ratio=ratio,
+        worse=ratio is not None and ratio > 1.05,
+    )
 
 
-SCHEMA = "residnet.metrics/1"
-LIMITS_SCHEMA = "residnet.limits/1"
+SCHEMA: Final = "residnet.metrics/1"
+LIMITS_SCHEMA: Final = "residnet.limits/1"
 _N_WORST_WINDOWS = 3
 _N_SPEED_CLASSES = 3
 _MIN_CLASS_WINDOWS = 3
@@ -280,7 +291,7 @@ class ProtocolEvaluation:
         reference_name: str | None,
         window_mask: np.ndarray,
         errors_by_model: Mapping[str, np.ndarray] | None = None,
-    ) -> dict[str, Any] | None:
+    ) -> PairedDifference | None:
         """Return the paired difference of two models over selected windows [W] bool.
 
         None if the reference model was not evaluated. `errors_by_model` [W] replaces the nrmse.
@@ -296,7 +307,7 @@ class ProtocolEvaluation:
             resampling_blocks,
         )
 
-    def build_rows(self, groups: Mapping[str, Sequence[str]]) -> list[dict[str, Any]]:
+    def build_rows(self, groups: Mapping[str, Sequence[str]]) -> list[MetricsRow]:
         """Return the rows of metrics.json.
 
         One row per model for all windows, every kind of manoeuvre and every named group of kinds.
@@ -328,28 +339,24 @@ class ProtocolEvaluation:
                 window_mask = np.isin(manoeuvre_kinds, list(group_kinds))
                 if not window_mask.any():
                     continue
-                labels = {
-                    "model": candidate.name,
-                    "kind": candidate.model_kind,
-                    "split": self.free_run.split,
-                    "protocol": self.free_run.protocol,
-                    "manoeuvre": group_name,
-                }
-                row = labels | self._summarize_windows(candidate.name, window_mask)
-                row["difference"] = self.paired_difference(
-                    candidate.name, candidate.reference, window_mask
-                )
-                metric_rows.append(
-                    row
-                    | (
-                        coverage_by_model[candidate.name].to_row(window_mask)
-                        if candidate.name in coverage_by_model
-                        else {}
+                row = self._summarize_windows(candidate, group_name, window_mask)
+                if candidate.name in coverage_by_model:
+                    coverage = coverage_by_model[candidate.name].summarize(window_mask)
+                    row = row.model_copy(
+                        update={
+                            "band_coverage": coverage.share,
+                            "band_score": coverage.score,
+                            "band_score_constant": coverage.constant_width_score,
+                        }
                     )
-                )
+                metric_rows.append(row)
         return metric_rows
 
-    def _summarize_windows(self, model_name: str, window_mask: np.ndarray) -> dict[str, Any]:
+    def _summarize_windows(
+        self, candidate: Candidate, manoeuvre: str, window_mask: np.ndarray
+    ) -> MetricsRow:
+        """Return the row of one model over selected windows [W] bool, without band coverage."""
+        model_name = candidate.name
         errors = self.errors[model_name]
         resampling_blocks = make_resampling_blocks(self.log_indices[window_mask])
         dof = self.dof
@@ -366,49 +373,58 @@ class ProtocolEvaluation:
         def map_by_state(by_state: np.ndarray) -> dict[str, float]:
             return {dof.dynamic_states[axis]: float(by_state[axis]) for axis in dof.active_indices}
 
-        summary = {
-            "windows": len(n_usable),
-            "n": int(n_usable.sum()),
-            "diverged": sum(
-                prediction.has_diverged
-                for prediction, is_selected in zip(
-                    self.free_run.predictions[model_name], window_mask, strict=True
-                )
-                if is_selected
-            ),
-            "rmse": map_by_state(rmse),
-            "mae": map_by_state(mae),
-            "nrmse": map_by_state(nrmse) | {"mean": float(nrmse[dof.active_indices].mean())},
-            "rmse_ci95": {
+        # the pose errors are the columns after the dynamic states and the NRMSE
+        final_pose_errors: dict[str, Any] = {}
+        for column, pose_error_name in enumerate(pose_errors, dof.n_dynamic + 1):
+            final_pose_errors |= {
+                f"{pose_error_name}_error_end": float(errors_by_window[:, column].mean()),
+                f"{pose_error_name}_error_end_ci95": confidence_intervals[column],
+            }
+        n_diverged = sum(
+            prediction.has_diverged
+            for prediction, is_selected in zip(
+                self.free_run.predictions[model_name], window_mask, strict=True
+            )
+            if is_selected
+        )
+        return MetricsRow(
+            model=model_name,
+            kind=candidate.model_kind,
+            split=self.free_run.split,
+            protocol=self.free_run.protocol,
+            manoeuvre=manoeuvre,
+            windows=len(n_usable),
+            n=int(n_usable.sum()),
+            diverged=n_diverged,
+            rmse=map_by_state(rmse),
+            mae=map_by_state(mae),
+            nrmse=map_by_state(nrmse) | {"mean": float(nrmse[dof.active_indices].mean())},
+            rmse_ci95={
                 dof.dynamic_states[axis]: confidence_intervals[axis] for axis in dof.active_indices
             },
-            "nrmse_mean_ci95": confidence_intervals[dof.n_dynamic],
-            "ci95_blocks": resampling_blocks.to_row() if resampling_blocks is not None else None,
-        }
-        # the pose errors are the columns after the dynamic states and the NRMSE
-        for column, model_name in enumerate(pose_errors, dof.n_dynamic + 1):
-            summary[f"{model_name}_error_end"] = float(errors_by_window[:, column].mean())
-            summary[f"{model_name}_error_end_ci95"] = confidence_intervals[column]
-        return summary
+            nrmse_mean_ci95=confidence_intervals[dof.n_dynamic],
+            ci95_blocks=None if resampling_blocks is None else resampling_blocks.to_record(),
+            difference=self.paired_difference(model_name, candidate.reference, window_mask),
+            **final_pose_errors,
+        )
 
-    def build_limits(self, dt: float) -> dict[str, Any]:
+    def build_limits(self, dt: float) -> ProtocolLimits:
         """Return the part of limits.json for one protocol and split; `dt` of the grid in s."""
-        return {
-            "kinematics": self.evaluate_kinematics(dt),
-            "bands": self.evaluate_by_class(),
-            "worst": {name: self.list_worst_windows(name) for name in self.errors},
-            "compared": self.compare_with_references(),
-            "outside": self.share_outside_training_range(),
-            "horizons": self.evaluate_horizons(dt),
-        }
+        return ProtocolLimits(
+            kinematics=self.evaluate_kinematics(dt),
+            bands=tuple(self.evaluate_by_class()),
+            worst={name: tuple(self.list_worst_windows(name)) for name in self.errors},
+            compared=self.compare_with_references(),
+            outside=self.share_outside_training_range(),
+            horizons=tuple(self.evaluate_horizons(dt)),
+        )
 
-    def evaluate_horizons(self, dt: float) -> list[dict[str, Any]]:
+    def evaluate_horizons(self, dt: float) -> list[HorizonRow]:
         """Return position and attitude errors of all models after 10, 30 and 100 s and at the end.
 
         Returns:
-            The fields of `records.HorizonRow`: one entry for each horizon below the length of the
-            longest window and one for its end. `intervals` are prediction intervals, see
-            `prediction_intervals`.
+            One entry for each horizon below the length of the longest window and one for its end.
+            `intervals` are prediction intervals, see `prediction_intervals`.
         """
         from residnet.evaluation.freerun import compute_integration_errors
 
@@ -444,32 +460,33 @@ class ProtocolEvaluation:
             integration_errors = {
                 "floor": compute_integration_errors(np.stack(measured_states), self.dof, dt)
             }
+            (floor,) = _summarize_pose_errors(integration_errors, log_indices).values()
             entries.append(
-                {
-                    "seconds": n_steps * dt,
-                    "windows": len(measured_states),
-                    "logs": len(set(log_indices.tolist())),
-                    "slowest": float(mean_speeds[reaches_horizon].min()),
-                    "fastest": float(mean_speeds[reaches_horizon].max()),
-                    "sailed": float(np.mean(distances)),
-                    "floor": _summarize_pose_errors(integration_errors, log_indices)["floor"],
-                    "models": _summarize_pose_errors(pose_errors_by_model, log_indices),
-                }
+                HorizonRow(
+                    seconds=n_steps * dt,
+                    windows=len(measured_states),
+                    logs=len(set(log_indices.tolist())),
+                    slowest=float(mean_speeds[reaches_horizon].min()),
+                    fastest=float(mean_speeds[reaches_horizon].max()),
+                    sailed=float(np.mean(distances)),
+                    floor=floor,
+                    models=_summarize_pose_errors(pose_errors_by_model, log_indices),
+                )
             )
         return entries
 
-    def evaluate_kinematics(self, dt: float) -> dict[str, float]:
+    def evaluate_kinematics(self, dt: float) -> KinematicErrors:
         """Return pose errors of the integrated measured velocities (noise floor).
 
         The measured velocities are integrated over each window from its measured pose. A model with
         exact velocities would have these errors.
 
         Returns:
-            Number of windows; mean and root mean square of each pose error at the ends of windows,
-            for example position_mean and position_rms. Empty if some velocities were not measured.
+            Mean and root mean square of each pose error at the ends of windows; no errors if some
+            velocities were not measured.
         """
         if self.dof.fixed_states:
-            return {}
+            return KinematicErrors()
         from residnet.evaluation.freerun import compute_integration_errors
 
         states_by_length: dict[int, list[np.ndarray]] = {}
@@ -481,14 +498,14 @@ class ProtocolEvaluation:
             compute_integration_errors(np.stack(states_of_length), self.dof, dt)
             for states_of_length in states_by_length.values()
         ]
-        summary: dict[str, float] = {"windows": len(self.log_slices)}
+        summary: dict[str, float] = {}
         for name in self.dof.pose_error_names:
             values = np.concatenate(
                 [errors_of_length[name] for errors_of_length in integration_errors]
             )
             summary[f"{name}_mean"] = float(values.mean())
             summary[f"{name}_rms"] = float(np.sqrt(np.mean(values**2)))
-        return summary
+        return KinematicErrors.model_validate({"windows": len(self.log_slices), **summary})
 
     def _mean_speeds(self) -> np.ndarray:
         return np.array(
@@ -498,13 +515,15 @@ class ProtocolEvaluation:
             ]
         )
 
-    def evaluate_by_class(self) -> list[dict[str, Any]]:
+    def evaluate_by_class(self) -> list[ClassRow]:
         """Return errors by thirds of the windows in mean speed and mean true wind speed.
 
         Wind speed only if every log has it. A class of fewer than three windows is omitted, and so
-        is a quantity with a single class. Entries have the fields of `records.ClassRow`.
+        is a quantity with a single class.
         """
-        values_by_quantity = {"speed": self._mean_speeds()}
+        values_by_quantity: dict[Literal["speed", "wind"], np.ndarray] = {
+            "speed": self._mean_speeds()
+        }
         if all(_WIND_CHANNEL in log.log.channels for log, _ in self.log_slices):
             mean_wind_speeds = [
                 log.log[_WIND_CHANNEL][window_slice].mean() for log, window_slice in self.log_slices
@@ -525,53 +544,54 @@ class ProtocolEvaluation:
                 if (class_indices == k).sum() >= _MIN_CLASS_WINDOWS
             ]
             entries += [
-                {
-                    "by": quantity,
-                    "low": float(values[class_mask].min()),
-                    "high": float(values[class_mask].max()),
-                    "windows": int(class_mask.sum()),
-                    "models": {
-                        candidate.name: {
-                            "nrmse_mean": float(
+                ClassRow(
+                    by=quantity,
+                    low=float(values[class_mask].min()),
+                    high=float(values[class_mask].max()),
+                    windows=int(class_mask.sum()),
+                    models={
+                        candidate.name: ClassErrors(
+                            nrmse_mean=float(
                                 self.nrmse_by_window[candidate.name][class_mask].mean()
                             ),
-                            "difference": self.paired_difference(
+                            difference=self.paired_difference(
                                 candidate.name, candidate.reference, class_mask
                             ),
-                        }
+                        )
                         for candidate in self.candidates
                     },
-                }
+                )
                 for class_mask in (class_masks if len(class_masks) > 1 else ())
             ]
         return entries
 
-    def list_worst_windows(self, model_name: str) -> list[dict[str, Any]]:
+    def list_worst_windows(self, model_name: str) -> list[WorstWindow]:
         """Return the three windows with the largest nrmse of a model.
 
-        Entries have the fields of `records.WorstWindow`; the pose error is the first one that the
-        velocities of the model determine.
+        The pose error is the first one that the velocities of the model determine.
         """
         errors = self.errors[model_name]
         nrmse = self.nrmse_by_window[model_name]
         pose_error_name = self.dof.pose_error_names[0]
         pose_errors = errors.final_pose_errors()[pose_error_name]
         return [
-            {
-                "log": self.log_slices[i][0].log.name,
-                "manoeuvre": self.log_slices[i][0].log.manoeuvre,
-                "t": float(self.log_slices[i][0].log.t[self.free_run.windows[i].start]),
-                "nrmse": float(nrmse[i]),
-                "rmse": {
-                    self.dof.dynamic_states[axis]: float(errors.rmse[i, axis])
-                    for axis in self.dof.active_indices
-                },
-                f"{pose_error_name}_error_end": float(pose_errors[i]),
-            }
+            WorstWindow.model_validate(
+                {
+                    "log": self.log_slices[i][0].log.name,
+                    "manoeuvre": self.log_slices[i][0].log.manoeuvre,
+                    "t": float(self.log_slices[i][0].log.t[self.free_run.windows[i].start]),
+                    "nrmse": float(nrmse[i]),
+                    "rmse": {
+                        self.dof.dynamic_states[axis]: float(errors.rmse[i, axis])
+                        for axis in self.dof.active_indices
+                    },
+                    f"{pose_error_name}_error_end": float(pose_errors[i]),
+                }
+            )
             for i in np.argsort(-nrmse, kind="stable")[:_N_WORST_WINDOWS].tolist()
         ]
 
-    def compare_with_references(self) -> dict[str, dict[str, Any]]:
+    def compare_with_references(self) -> dict[str, dict[str, PairedDifference | None]]:
         """Return paired differences of each model to constant velocity and to the first
         baseline.
         """
@@ -589,13 +609,12 @@ class ProtocolEvaluation:
             for model_name in self.errors
         }
 
-    def share_outside_training_range(self) -> dict[str, Any]:
+    def share_outside_training_range(self) -> OutsideRange:
         """Return the share of samples outside the range of the training data.
 
         Returns:
-            `share` of the usable samples with a velocity or an input outside its range, and
-            `channels`: the same for each channel; empty if the ranges are unknown. Depth has no
-            effect on the motion and is ignored.
+            Share of the usable samples with a velocity or an input outside its range; no share if
+            the ranges are unknown. Depth has no effect on the motion and is ignored.
         """
         ranges = next(
             (
@@ -606,7 +625,7 @@ class ProtocolEvaluation:
             {},
         )
         if not ranges:
-            return {}
+            return OutsideRange()
         values = np.concatenate(
             [
                 np.concatenate(
@@ -620,15 +639,15 @@ class ProtocolEvaluation:
         is_outside = (values < lower) | (values > upper)
         is_outside &= np.array([name not in unused_channels for name in ranges])
         shares = dict(zip(ranges, is_outside.mean(0).tolist(), strict=True))
-        return {
-            "share": float(is_outside.any(1).mean()),
-            "channels": {name: share for name, share in shares.items() if share > 0},
-        }
+        return OutsideRange(
+            share=float(is_outside.any(1).mean()),
+            channels={name: share for name, share in shares.items() if share > 0},
+        )
 
 
 def _summarize_pose_errors(
     pose_errors: Mapping[str, Mapping[str, np.ndarray]], log_indices: np.ndarray
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, PoseErrors]:
     """Return means and intervals of the magnitudes [W] of pose errors, by model and name."""
     values = np.column_stack(
         [sizes for sizes_by_name in pose_errors.values() for sizes in sizes_by_name.values()]
@@ -636,7 +655,7 @@ def _summarize_pose_errors(
     means_and_intervals = zip(
         values.mean(0).tolist(), prediction_intervals(values, log_indices), strict=True
     )
-    summary: dict[str, dict[str, Any]] = {}
+    summary: dict[str, PoseErrors] = {}
     for model, sizes_by_name in pose_errors.items():
         mean_and_interval = {name: next(means_and_intervals) for name in sizes_by_name}
         # errors of angles are at most half a turn
@@ -644,28 +663,41 @@ def _summarize_pose_errors(
             name: math.pi if POSE_ERROR_UNITS[name] == "rad" else math.inf for name in sizes_by_name
         }
         intervals_by_name = {
-            name: interval and [interval[0], min(interval[1], upper_bounds[name])]
+            name: interval and (interval[0], min(interval[1], upper_bounds[name]))
             for name, (_, interval) in mean_and_interval.items()
         }
-        summary[model] = {name: mean for name, (mean, _) in mean_and_interval.items()} | {
-            "intervals": intervals_by_name
-        }
+        means = {name: mean for name, (mean, _) in mean_and_interval.items()}
+        summary[model] = PoseErrors.model_validate({**means, "intervals": intervals_by_name})
     return summary
 
 
-def find_row(rows: Sequence[Mapping[str, Any]], **labels: str) -> Mapping[str, Any]:
-    """Return the one row of a model, split, protocol and manoeuvre (`all` by default)."""
-    keys = {"manoeuvre": "all"} | labels
-    matching_rows = [row for row in rows if all(row[key] == value for key, value in keys.items())]
+def find_row(
+    rows: Sequence[MetricsRow],
+    *,
+    model: str,
+    split: str | None = None,
+    protocol: str | None = None,
+    manoeuvre: str = "all",
+) -> MetricsRow:
+    """Return the one row of a model and manoeuvre, of a split and a protocol if they are given.
+
+    Raises:
+        KeyError: if there is no such row, or several.
+    """
+    matching_rows = [
+        row
+        for row in rows
+        if row.model == model
+        and row.manoeuvre == manoeuvre
+        and split in (None, row.split)
+        and protocol in (None, row.protocol)
+    ]
     if len(matching_rows) != 1:
-        raise KeyError(f"{len(matching_rows)} rows with {keys}")
+        raise KeyError(
+            f"{len(matching_rows)} rows of model {model}, split {split}, protocol {protocol},"
+            f" manoeuvre {manoeuvre}"
+        )
     return matching_rows[0]
-
-
-_LABEL_COLUMNS = ("model", "kind", "split", "protocol", "manoeuvre", "selected")
-_COUNT_COLUMNS = ("windows", "diverged", "n")
-_CHANNEL_COLUMNS = ("rmse", "mae", "nrmse")
-_POSE_ERROR_COLUMNS = tuple(f"{end}_error_end" for end in POSE_ERROR_UNITS)
 
 
 def build_metrics_file(
@@ -675,7 +707,7 @@ def build_metrics_file(
     selected: str,
     selected_ensemble: str | None,
     predictor: str,
-    rows: Sequence[Mapping[str, Any]],
+    rows: Sequence[MetricsRow],
 ) -> MetricsFile:
     """Return the contents of metrics.json.
 
@@ -688,29 +720,31 @@ def build_metrics_file(
         predictor: name of the model that is reported first and exported by default.
         rows: rows of all splits, without `selected`.
     """
-    marked_rows = [{**row, "selected": row["model"] == selected} for row in rows]
-    return MetricsFile.model_validate(
-        {
-            "schema": SCHEMA,
-            "run": run,
-            "channels": dict(units),
-            "scales": dict(scales),
-            "selected": selected,
-            "selected_ensemble": selected_ensemble,
-            "predictor": predictor,
-            "rows": marked_rows,
-        }
+    return MetricsFile(
+        schema=SCHEMA,
+        run=run,
+        channels=dict(units),
+        scales=dict(scales),
+        selected=selected,
+        selected_ensemble=selected_ensemble,
+        predictor=predictor,
+        rows=tuple(mark_selected(rows, selected)),
     )
 
 
-def build_metrics_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+def mark_selected(rows: Sequence[MetricsRow], selected: str) -> list[MetricsRow]:
+    """Return the rows with `selected` set, by the name of the selected model."""
+    return [row.model_copy(update={"selected": row.model == selected}) for row in rows]
+
+
+def build_metrics_table(rows: Sequence[MetricsRow]) -> pd.DataFrame:
     """Return rows of metrics.json as a table with one column per number.
 
     Args:
         rows: rows of metrics.json.
 
     Returns:
-        Columns model, kind, split, protocol, manoeuvre (and selected if the rows have it),
+        Columns model, kind, split, protocol, manoeuvre (and selected where a model was chosen),
         windows, diverged, n, then rmse_u, rmse_v, rmse_r (m/s, m/s, rad/s), the same for mae and
         nrmse with nrmse_mean, note (such as "2/12 diverged"; diverged windows count with the
         error of `constant_velocity`), and position_error_end (m), heading_error_end (rad), or
@@ -721,13 +755,22 @@ def build_metrics_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame([_flatten_row(row) for row in rows])
 
 
-def _flatten_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    flat_row = {name: row[name] for name in (*_LABEL_COLUMNS, *_COUNT_COLUMNS) if name in row}
-    for name in _CHANNEL_COLUMNS:
-        flat_row |= {f"{name}_{channel}": value for channel, value in row[name].items()}
+def _flatten_row(row: MetricsRow) -> dict[str, str | float | None]:
+    flat_row: dict[str, str | float | None] = {
+        "model": row.model,
+        "kind": row.kind,
+        "split": row.split,
+        "protocol": row.protocol,
+        "manoeuvre": row.manoeuvre,
+    }
+    if row.selected is not None:
+        flat_row["selected"] = row.selected
+    flat_row |= {"windows": row.windows, "diverged": row.diverged, "n": row.n}
+    for name, errors in {"rmse": row.rmse, "mae": row.mae, "nrmse": row.nrmse}.items():
+        flat_row |= {f"{name}_{channel}": value for channel, value in errors.items()}
     # next to the score, which contains constant-velocity errors for diverged windows
     flat_row["note"] = describe_divergence(row)
-    return flat_row | {name: row[name] for name in _POSE_ERROR_COLUMNS if name in row}
+    return flat_row | {f"{name}_error_end": e for name, e in row.final_pose_errors.items()}
 
 
 INPUT_PREFIX = "input_"

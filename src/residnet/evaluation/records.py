@@ -8,12 +8,16 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from residnet.core.records import FileRecord, Record
+from residnet.core.layout import SIX_DOF_LAYOUT
+from residnet.core.model_names import FORMER_NAMES
+from residnet.core.records import FileRecord, FileRows, Record
 
 ByChannel = dict[str, float]
 """A number for each channel."""
+CurveByChannel = dict[str, tuple[float, ...]]
+"""Numbers for each channel, one for each horizon or measure."""
 Interval = tuple[float, float]
 """Lower and upper limit."""
 ModelKind = Literal["constant_velocity", "baseline", "head", "plant", "ensemble"]
@@ -30,7 +34,7 @@ class BlockCount(Record):
         count: number of blocks.
     """
 
-    of: Literal["logs", "windows", "stretches"]
+    of: Literal["logs", "windows", "stretches", "segments"]
     count: int
 
 
@@ -73,15 +77,19 @@ class MetricsRow(Record):
         nrmse_mean_ci95: interval of the mean of `nrmse`.
         ci95_blocks: the blocks that were resampled.
         position_error_end: distance in m at the end of a window, mean over the windows.
+        position_error_end_ci95: 95 % confidence interval of it.
         heading_error_end: heading error in rad at the end of a window, mean over the windows.
+        heading_error_end_ci95: 95 % confidence interval of it.
         depth_error_end: depth error in m, of a vessel that dives.
+        depth_error_end_ci95: 95 % confidence interval of it.
         attitude_error_end: attitude error in rad, of a vessel that dives.
+        attitude_error_end_ci95: 95 % confidence interval of it.
         difference: paired difference to the reference model of this model.
         band_coverage: share of the samples within the prediction interval by channel, their `mean`,
             and `whole`: the share of windows inside the interval of whole runs.
         band_score: mean interval score in units of the constant-velocity error.
         band_score_constant: interval score of an interval of constant width.
-        selected: whether validation data chose this single model.
+        selected: whether validation data chose this single model; None where nothing was chosen.
     """
 
     model: str
@@ -110,7 +118,43 @@ class MetricsRow(Record):
     band_coverage: ByChannel | None = None
     band_score: float | None = None
     band_score_constant: float | None = None
-    selected: bool
+    selected: bool | None = None
+
+    @field_validator("kind", mode="before")
+    @classmethod
+    def _refuse_former_kinds(cls, kind: object) -> object:
+        if kind in FORMER_NAMES:
+            raise ValueError(
+                f"an earlier version wrote '{kind}', which is '{FORMER_NAMES[str(kind)]}' today"
+            )
+        return kind
+
+    @property
+    def mean_nrmse(self) -> float:
+        """The mean of `nrmse` over the velocities."""
+        return self.nrmse["mean"]
+
+    @property
+    def final_pose_errors(self) -> dict[str, float]:
+        """The pose errors at the end of a window by name (`POSE_ERROR_UNITS`)."""
+        errors = {
+            "position": self.position_error_end,
+            "heading": self.heading_error_end,
+            "depth": self.depth_error_end,
+            "attitude": self.attitude_error_end,
+        }
+        return {name: error for name, error in errors.items() if error is not None}
+
+    @property
+    def final_pose_intervals(self) -> dict[str, Interval | None]:
+        """The 95 % confidence intervals of `final_pose_errors`; None if there are too few logs."""
+        intervals = {
+            "position": self.position_error_end_ci95,
+            "heading": self.heading_error_end_ci95,
+            "depth": self.depth_error_end_ci95,
+            "attitude": self.attitude_error_end_ci95,
+        }
+        return {name: intervals[name] for name in self.final_pose_errors}
 
 
 class MetricsFile(FileRecord):
@@ -190,13 +234,32 @@ class SelectionFile(FileRecord):
 
 
 class PoseErrors(Record):
-    """Mean pose errors at a horizon, with 95 % prediction intervals of the mean over new logs."""
+    """Mean pose errors at a horizon, with 95 % prediction intervals of the mean over new logs.
+
+    Attributes:
+        position: distance in m.
+        heading: heading error in rad.
+        depth: depth error in m, of a vessel that dives.
+        attitude: attitude error in rad, of a vessel that dives.
+        intervals: interval of each error; None if there are too few logs.
+    """
 
     position: float | None = None
     heading: float | None = None
     depth: float | None = None
     attitude: float | None = None
     intervals: dict[str, Interval | None]
+
+    @property
+    def by_name(self) -> dict[str, float]:
+        """The errors by name (`POSE_ERROR_UNITS`), without those that are not defined."""
+        errors = {
+            "position": self.position,
+            "heading": self.heading,
+            "depth": self.depth,
+            "attitude": self.attitude,
+        }
+        return {name: error for name, error in errors.items() if error is not None}
 
 
 class HorizonRow(Record):
@@ -224,7 +287,12 @@ class HorizonRow(Record):
 
 
 class ClassErrors(Record):
-    """Error of a model over the windows of one class."""
+    """Error of a model over the windows of one class.
+
+    Attributes:
+        nrmse_mean: mean error.
+        difference: paired difference to the reference model; None without one.
+    """
 
     nrmse_mean: float
     difference: PairedDifference | None
@@ -249,7 +317,19 @@ class ClassRow(Record):
 
 
 class WorstWindow(Record):
-    """A window with one of the largest errors of a model; `t` is its start in the log in s."""
+    """A window with one of the largest errors of a model.
+
+    Attributes:
+        log: name of the log.
+        manoeuvre: kind of manoeuvre.
+        t: start of the window in the log in s.
+        nrmse: error of the window.
+        rmse: root mean square error of each velocity.
+        position_error_end: distance in m at the end of the window.
+        heading_error_end: heading error in rad at the end of the window.
+        depth_error_end: depth error in m at the end of the window.
+        attitude_error_end: attitude error in rad at the end of the window.
+    """
 
     log: str
     manoeuvre: str
@@ -261,20 +341,74 @@ class WorstWindow(Record):
     depth_error_end: float | None = None
     attitude_error_end: float | None = None
 
+    @property
+    def final_pose_error(self) -> float | None:
+        """The pose error that ranks the windows: the first one that the model determines."""
+        errors = (
+            self.position_error_end,
+            self.heading_error_end,
+            self.depth_error_end,
+            self.attitude_error_end,
+        )
+        return next((error for error in errors if error is not None), None)
+
 
 class OutsideRange(Record):
-    """Share of samples outside the training range, in all and by channel; empty if unknown."""
+    """Share of samples outside the training range.
+
+    Attributes:
+        share: share of the samples with any channel outside; None if the range is unknown.
+        channels: share of each channel that is outside.
+    """
 
     share: float | None = None
-    channels: ByChannel | None = None
+    channels: ByChannel = Field(default_factory=dict)
+
+
+class KinematicErrors(Record):
+    """Pose errors of the integrated measured velocities, mean and root mean square over windows.
+
+    All are absent if some velocities were not measured.
+
+    Attributes:
+        windows: number of windows.
+        position_mean: mean distance in m at the end of a window.
+        position_rms: root mean square of it.
+        heading_mean: mean heading error in rad at the end of a window.
+        heading_rms: root mean square of it.
+        depth_mean: mean depth error in m at the end of a window.
+        depth_rms: root mean square of it.
+        attitude_mean: mean attitude error in rad at the end of a window.
+        attitude_rms: root mean square of it.
+    """
+
+    windows: int = 0
+    position_mean: float | None = None
+    position_rms: float | None = None
+    heading_mean: float | None = None
+    heading_rms: float | None = None
+    depth_mean: float | None = None
+    depth_rms: float | None = None
+    attitude_mean: float | None = None
+    attitude_rms: float | None = None
+
+    @property
+    def means(self) -> dict[str, float]:
+        """The mean errors by name (`POSE_ERROR_UNITS`)."""
+        errors = {
+            "position": self.position_mean,
+            "heading": self.heading_mean,
+            "depth": self.depth_mean,
+            "attitude": self.attitude_mean,
+        }
+        return {name: error for name, error in errors.items() if error is not None}
 
 
 class ProtocolLimits(Record):
     """Limits of the models under one protocol of one split.
 
     Attributes:
-        kinematics: number of windows, and mean and root mean square of each pose error of the
-            integrated measured velocities.
+        kinematics: pose errors of the integrated measured velocities.
         bands: errors by class of speed and wind speed.
         worst: the windows with the largest errors, by model.
         compared: paired differences by model and reference model.
@@ -282,12 +416,86 @@ class ProtocolLimits(Record):
         horizons: pose errors by horizon.
     """
 
-    kinematics: dict[str, int | float]
+    kinematics: KinematicErrors
     bands: tuple[ClassRow, ...]
     worst: dict[str, tuple[WorstWindow, ...]]
     compared: dict[str, dict[str, PairedDifference | None]]
     outside: OutsideRange
     horizons: tuple[HorizonRow, ...]
+
+
+class RepeatTolerance(Record):
+    """How much two repeated runs may differ.
+
+    Attributes:
+        command_share_of_range: root mean square difference of each command over its range.
+        start: difference of each initial velocity.
+    """
+
+    command_share_of_range: float
+    start: ByChannel
+
+
+class RepeatDifferences(Record):
+    """Mean differences between the two runs of a repeated pair, in SI units and rad.
+
+    Attributes:
+        pairs: number of pairs.
+        u: root mean square difference of the surge velocity over a window.
+        v: the same of the sway velocity.
+        r: the same of the yaw rate.
+        p: the same of the roll rate.
+        phi: the same of the roll angle.
+        w: the same of the heave velocity.
+        q: the same of the pitch rate.
+        z: the same of the depth.
+        theta: the same of the pitch angle.
+        position: distance of the ends of the runs in m, each relative to its start.
+        heading: difference of the headings at the end in rad.
+        nrmse: mean of the differences over the scales.
+    """
+
+    pairs: int
+    u: float | None = None
+    v: float | None = None
+    r: float | None = None
+    p: float | None = None
+    phi: float | None = None
+    w: float | None = None
+    q: float | None = None
+    z: float | None = None
+    theta: float | None = None
+    position: float | None = None
+    heading: float | None = None
+    nrmse: float | None = None
+
+    @property
+    def by_channel(self) -> ByChannel:
+        """The differences of the velocities by channel."""
+        differences: dict[str, float | None] = {
+            name: getattr(self, name) for name in SIX_DOF_LAYOUT.dynamic_states
+        }
+        return {name: value for name, value in differences.items() if value is not None}
+
+    @property
+    def final_pose(self) -> dict[str, float]:
+        """The differences of the pose at the end by name (`POSE_ERROR_UNITS`)."""
+        errors = {"position": self.position, "heading": self.heading}
+        return {name: error for name, error in errors.items() if error is not None}
+
+
+class Repeatability(RepeatDifferences):
+    """Differences between repeated manoeuvres of one protocol; absent without pairs.
+
+    Attributes:
+        tolerance: how much two runs may differ to count as repeated.
+        logs: number of logs with a pair.
+        manoeuvres: the same by kind of manoeuvre.
+    """
+
+    tolerance: RepeatTolerance
+    logs: int
+    manoeuvres: dict[str, RepeatDifferences] = Field(default_factory=dict)
 
 
 class LimitsFile(FileRecord):
@@ -302,7 +510,11 @@ class LimitsFile(FileRecord):
     schema_name: Literal["residnet.limits/1"] = Field(alias="schema")
     run: str
     splits: dict[str, dict[str, ProtocolLimits]]
-    repeatability: dict[str, dict[str, Any]]
+    repeatability: dict[str, Repeatability]
+
+    def find(self, split: str, protocol: str) -> ProtocolLimits | None:
+        """Return the limits under one protocol of one split; None without windows."""
+        return self.splits.get(split, {}).get(protocol)
 
 
 # bands.json
@@ -323,7 +535,7 @@ class Activity(Record):
     floor: tuple[float, ...]
     centre: tuple[float, ...]
     spread: tuple[float, ...]
-    slope: dict[str, Any]
+    slope: CurveByChannel
 
 
 class BandRow(Record):
@@ -336,7 +548,7 @@ class BandRow(Record):
         logs: number of logs that calibrated the intervals.
         independent_scores: equivalent number of independent calibration scores.
         cautions: sentences on the limits of the intervals.
-        steps: horizons in time steps; the tables below have one value for each.
+        steps: horizons in time steps; the half widths and `usual_spread` have one value for each.
         half_width: half widths for a run of typical motion.
         half_width_of_any_run: half widths that do not depend on the motion of the run.
         whole_run_factor: factor on the half widths for a whole run.
@@ -353,17 +565,22 @@ class BandRow(Record):
     independent_scores: float
     cautions: tuple[str, ...]
     steps: tuple[float, ...]
-    half_width: dict[str, Any]
-    half_width_of_any_run: dict[str, Any]
-    whole_run_factor: dict[str, Any]
-    constant_half_width: dict[str, Any]
-    score_unit: dict[str, Any]
+    half_width: CurveByChannel
+    half_width_of_any_run: CurveByChannel
+    whole_run_factor: ByChannel
+    constant_half_width: ByChannel
+    score_unit: ByChannel
     activity: Activity
-    usual_spread: dict[str, Any] | None
+    usual_spread: CurveByChannel | None
 
 
 class BandsFile(FileRecord):
-    """bands.json: prediction intervals by model and protocol."""
+    """bands.json: prediction intervals of free runs.
+
+    Attributes:
+        run: name of the run.
+        models: intervals by model and protocol.
+    """
 
     schema_name: Literal["residnet.bands/1"] = Field(alias="schema")
     run: str
@@ -374,7 +591,15 @@ class BandsFile(FileRecord):
 
 
 class MaeDifference(Record):
-    """Paired difference of the mean absolute one-step residuals of two models."""
+    """Paired difference of the mean absolute one-step residuals of two models.
+
+    Attributes:
+        to: name of the reference model.
+        mae: model minus reference; negative if the model is better.
+        ci95: 95 % confidence interval; None if there are too few samples.
+        excludes_zero: whether the interval excludes zero.
+        ratio: residual of the model over that of the reference; None if the latter is zero.
+    """
 
     to: str
     mae: float
@@ -398,10 +623,12 @@ class GoodnessRow(Record):
         cp: Mallows' C_p.
         aic: Akaike's criterion; None without noise.
         bic: Bayesian criterion; None without noise.
-        mae: mean absolute residual, with its block-bootstrap interval and the interval for
-            independent samples.
+        mae: mean absolute residual.
+        mae_ci95: block-bootstrap 95 % interval of `mae`; None if there are too few samples.
+        mae_ci95_independent: 95 % interval of `mae` for independent samples.
         block_seconds: length of a bootstrap block in s.
         mean: mean residual.
+        mean_ci95: block-bootstrap 95 % interval of `mean`.
         effective: number of independent samples with the same variance of the mean.
         autocorrelation: at lags from one sample on.
         ljung_box: statistic of the test for white residuals.
@@ -453,8 +680,20 @@ class GoodnessFile(FileRecord):
 # sanity.json
 
 
+SANITY_CHECKS = ("damping", "stability", "symmetry", "bounded")
+"""The physical checks, in the order in which they are made."""
+
+
 class SanityRow(Record):
-    """The result of one physical check of one model; `ok` is None if it was not made."""
+    """The result of one physical check of one model.
+
+    Attributes:
+        model: name of the model.
+        check: one of `SANITY_CHECKS`.
+        ok: whether the model passed; None where the check does not apply or could not be made.
+        text: one sentence with figures.
+        fault: why the model is unsound, in a few words; empty if the finding is only reported.
+    """
 
     model: str
     check: str
@@ -464,7 +703,11 @@ class SanityRow(Record):
 
 
 class SanityFile(FileRecord):
-    """sanity.json: results of the physical checks."""
+    """sanity.json: results of the physical checks.
+
+    Attributes:
+        findings: results by model and check.
+    """
 
     schema_name: Literal["residnet.sanity/1"] = Field(alias="schema")
     findings: tuple[SanityRow, ...]
@@ -574,7 +817,16 @@ class BookletIndex(Record):
 
 
 class BookletRow(Record):
-    """Indices of one manoeuvre; `demand` holds its settings, `faults` counts failed draws."""
+    """Indices of one manoeuvre.
+
+    Attributes:
+        name: name of the manoeuvre or of the repeated log.
+        manoeuvre: kind of manoeuvre.
+        demand: settings of the manoeuvre.
+        split: split of the repeated log; empty for a standard manoeuvre.
+        faults: number of parameter draws that did not end the manoeuvre.
+        indices: indices by name.
+    """
 
     name: str
     manoeuvre: str
@@ -605,3 +857,112 @@ class BookletFile(FileRecord):
     level: float
     units: dict[str, str]
     pages: tuple[BookletRow, ...]
+
+
+# indices.json
+
+
+class IndexLimit(Record):
+    """The limit of IMO of an index.
+
+    Attributes:
+        limit: the limit.
+        kept: whether it is met.
+    """
+
+    limit: float
+    kept: bool
+
+
+class FlightIndices(Record):
+    """Manoeuvring indices of one simulated manoeuvre.
+
+    Attributes:
+        log: name of the log.
+        manoeuvre: kind of manoeuvre.
+        craft: name of the vessel or model.
+        fault: why the manoeuvre did not end as intended; None if it did.
+        timed_out: whether it ended by its longest duration.
+        indices: values by name in SI units and rad; a list for a spiral. `<name>_lengths` is an
+            index in lengths of the hull.
+        limits: limits of IMO by name of the index.
+    """
+
+    log: str
+    manoeuvre: str
+    craft: str
+    fault: str | None
+    timed_out: bool
+    indices: dict[str, float | tuple[float, ...]]
+    limits: dict[str, IndexLimit]
+
+    @property
+    def scalar_indices(self) -> dict[str, BookletIndex]:
+        """The indices that are numbers, with their lengths and limits."""
+        entries = {}
+        for name, value in self.indices.items():
+            if isinstance(value, tuple) or name.endswith("_lengths"):
+                continue
+            lengths = self.indices.get(f"{name}_lengths")
+            limit = self.limits.get(name)
+            entries[name] = BookletIndex(
+                value=value,
+                ship=value,
+                draws=0,
+                lengths=None if isinstance(lengths, tuple) else lengths,
+                limit=None if limit is None else limit.limit,
+                kept=None if limit is None else limit.kept,
+            )
+        return entries
+
+
+class IndicesFile(FileRecord):
+    """indices.json: manoeuvring indices of simulated manoeuvres.
+
+    Attributes:
+        run: name of the run.
+        length: length of the hull in m; None if it is unknown.
+        units: unit of each index.
+        rows: indices by manoeuvre and vessel.
+    """
+
+    schema_name: Literal["residnet.indices/1"] = Field(alias="schema")
+    run: str
+    length: float | None
+    units: dict[str, str]
+    rows: tuple[FlightIndices, ...]
+
+
+# data_quality.json
+
+
+class LogQuality(Record):
+    """The samples of one prepared log.
+
+    Attributes:
+        log: name of the log.
+        split: train, validation, test or external.
+        manoeuvre: kind of manoeuvre.
+        seconds: duration in s.
+        samples: number of samples.
+        usable: share of the samples at which velocities and position are scored.
+        learned_from: share of the samples with smoothed states and accelerations.
+        masked: share of the samples that each mask excludes.
+        largest: largest magnitude of each state over the usable samples.
+        integrated: pose channels that were integrated from the velocities.
+    """
+
+    log: str
+    split: str
+    manoeuvre: str
+    seconds: float
+    samples: int
+    usable: float
+    learned_from: float
+    masked: ByChannel
+    largest: ByChannel
+    integrated: tuple[str, ...] = ()
+
+
+class DataQualityFile(FileRows[LogQuality]):
+    """data_quality.json: the samples of each log."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final, Literal
 
 import numpy as np
 
@@ -17,10 +18,10 @@ from residnet.core.format import format_number
 from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.evaluation.freerun import FreeRun, FreeRunErrors
 from residnet.evaluation.metrics import MIN_LOGS_AS_BLOCKS, TARGET_BLOCKS
-from residnet.evaluation.records import SelectionFile
+from residnet.evaluation.records import BlockCount, SelectionFile, SelectionRow
 from residnet.preprocessing.prepare import PreparedLog
 
-SCHEMA = "residnet.selection/2"
+SCHEMA: Final = "residnet.selection/2"
 MODEL_FAMILIES = (
     CONSTANT_VELOCITY,
     "baseline",
@@ -86,7 +87,7 @@ class SelectionBlocks:
     """
 
     weights: np.ndarray
-    block_kind: str
+    block_kind: Literal["logs", "stretches"]
 
     @property
     def n_blocks(self) -> int:
@@ -160,28 +161,26 @@ class Selection:
                 candidate, selected_candidate, self.blocks
             )
             rows.append(
-                {
-                    "model": candidate.name,
-                    "family": candidate.family,
-                    "parameters": candidate.n_parameters,
-                    "nrmse_mean": candidate.mean_nrmse,
-                    "ratio": math.exp(mean_log_ratio),
-                    "standard_error": standard_error,
-                    "diverged": candidate.n_diverged,
-                    "sound": candidate.is_sound,
-                    "faults": candidate.faults,
-                }
+                SelectionRow(
+                    model=candidate.name,
+                    family=candidate.family,
+                    parameters=candidate.n_parameters,
+                    nrmse_mean=candidate.mean_nrmse,
+                    ratio=math.exp(mean_log_ratio),
+                    standard_error=standard_error,
+                    diverged=candidate.n_diverged,
+                    sound=candidate.is_sound,
+                    faults=candidate.faults,
+                )
             )
-        return SelectionFile.model_validate(
-            {
-                "schema": SCHEMA,
-                "selected": self.selected,
-                "selected_ensemble": self.selected_ensemble,
-                "predictor": self.default_model,
-                "reason": self.reason,
-                "blocks": {"of": self.blocks.block_kind, "count": self.blocks.n_blocks},
-                "models": rows,
-            }
+        return SelectionFile(
+            schema=SCHEMA,
+            selected=self.selected,
+            selected_ensemble=self.selected_ensemble,
+            predictor=self.default_model,
+            reason=self.reason,
+            blocks=BlockCount(of=self.blocks.block_kind, count=self.blocks.n_blocks),
+            models=tuple(rows),
         )
 
 

@@ -15,8 +15,8 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
-from residnet.evaluation.records import SanityFile
+from residnet.evaluation.records import SANITY_CHECKS, SanityFile, SanityRow
 from residnet.physics.symmetry import (
     find_heeling_propellers,
     get_axis_parities,
@@ -42,8 +42,8 @@ from residnet.physics.symmetry import (
 )
 from residnet.preprocessing.prepare import PreparedLog
 
-SCHEMA = "residnet.sanity/1"
-DAMPING, STABILITY, SYMMETRY, BOUNDEDNESS = CHECKS = ("damping", "stability", "symmetry", "bounded")
+SCHEMA: Final = "residnet.sanity/1"
+DAMPING, STABILITY, SYMMETRY, BOUNDEDNESS = SANITY_CHECKS
 
 _N_CHECK_POINTS = 90
 """Number of recorded states to check, without those of extreme inputs; chosen by hand."""
@@ -72,22 +72,6 @@ _MAX_STEADY_RUNS = 20
 _SETTLING_SHARE = 0.25
 """Number of steady runs that are checked, and the initial share of each for the settling."""
 _DISTURBANCE_SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
-
-
-@dataclass(frozen=True)
-class SanityFinding:
-    """A finding of one check of one model.
-
-    `ok` is None if the check does not apply or could not be made. `fault` is a short text on why
-    the model is unsound, so that an equally good model is preferred; it is empty for a finding that
-    is only reported.
-    """
-
-    model: str
-    check: str
-    ok: bool | None
-    text: str
-    fault: str = ""
 
 
 @dataclass(frozen=True)
@@ -265,8 +249,8 @@ def check_model(
     model: HybridDynamics,
     training_points: TrainingPoints,
     divergence_factor: float = 3.0,
-) -> list[SanityFinding]:
-    """Return the results of all checks of one model, in the order of `CHECKS`.
+) -> list[SanityRow]:
+    """Return the results of all checks of one model, in the order of `SANITY_CHECKS`.
 
     Args:
         spec: description of the model; it holds the training ranges.
@@ -287,10 +271,10 @@ def check_model(
     try:
         return [
             check_damping(spec, model, training_points),
-            SanityFinding(spec.name, STABILITY, None, skip_reason)
+            _skip_check(spec, STABILITY, skip_reason)
             if skip_reason
             else check_stability(spec, model, training_points),
-            SanityFinding(spec.name, SYMMETRY, None, straight_text)
+            _skip_check(spec, SYMMETRY, straight_text)
             if straight_text
             else check_symmetry(spec, model, training_points),
             check_boundedness(spec, model, training_points, divergence_factor),
@@ -301,9 +285,16 @@ def check_model(
 
 def _to_sanity_finding(
     spec: ModelSpec, check: str, passed: bool, text: str, fault: str
-) -> SanityFinding:
+) -> SanityRow:
     full_text = f"unsound: {fault}. {text}" if fault else text
-    return SanityFinding(spec.name, check, passed and not fault, full_text, fault)
+    return SanityRow(
+        model=spec.name, check=check, ok=passed and not fault, text=full_text, fault=fault
+    )
+
+
+def _skip_check(spec: ModelSpec, check: str, reason: str) -> SanityRow:
+    """Return the finding of a check that does not apply or could not be made."""
+    return SanityRow(model=spec.name, check=check, ok=None, text=reason)
 
 
 def settle_memory(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
@@ -326,7 +317,7 @@ def settled_acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
 
 def check_damping(
     spec: ModelSpec, model: HybridDynamics, training_points: TrainingPoints
-) -> SanityFinding:
+) -> SanityRow:
     """Check that each velocity decays by itself: d u_dot/du < 0 and so on, by automatic
     differentiation.
 
@@ -432,7 +423,7 @@ def _range_tensor(limits: Sequence[float]) -> Tensor:
 
 def check_stability(
     spec: ModelSpec, model: HybridDynamics, training_points: TrainingPoints
-) -> SanityFinding:
+) -> SanityRow:
     """Check the growth of small disturbances of sway, yaw, roll and memory in straight running."""
     motion_names = {"v": "sway", "r": "yaw", "p": "roll"}
     motion_text = " and ".join(
@@ -591,7 +582,7 @@ def mirror_inputs(input_names: Sequence[str], w: Tensor) -> Tensor | None:
 
 def check_symmetry(
     spec: ModelSpec, model: HybridDynamics, training_points: TrainingPoints
-) -> SanityFinding:
+) -> SanityRow:
     """Check that mirrored states and inputs give the mirrored acceleration, at recorded points."""
     input_names = spec.signals.input_columns
     x = training_points.x
@@ -602,7 +593,7 @@ def check_symmetry(
             f"not checked: no steering input is recognised among {', '.join(spec.signals.inputs)}"
             " (known are delta and pairs *_port/*_stbd)"
         )
-        return SanityFinding(spec.name, SYMMETRY, None, text)
+        return _skip_check(spec, SYMMETRY, text)
     dof = spec.signals.dof
     parity = torch.tensor(get_axis_parities(model.signals.names), dtype=x.dtype)
     mirrored_states = x * torch.cat((x.new_tensor([1.0, -1.0, -1.0]), parity))
@@ -613,7 +604,7 @@ def check_symmetry(
     ).all(1)
     if not bool(is_inside.any()):
         text = "not checked: no recorded state has its mirror image within the training ranges"
-        return SanityFinding(spec.name, SYMMETRY, None, text)
+        return _skip_check(spec, SYMMETRY, text)
     with torch.no_grad():
         accelerations = settled_acceleration(model, x[is_inside], w[is_inside])
         mirrored_accelerations = settled_acceleration(
@@ -650,7 +641,7 @@ def check_symmetry(
         f" {'' if is_symmetric else reason}RMS over"
         f" {int(is_inside.sum())} points of the training data: {details}"
     )
-    return SanityFinding(spec.name, SYMMETRY, is_symmetric, text)
+    return SanityRow(model=spec.name, check=SYMMETRY, ok=is_symmetric, text=text)
 
 
 def check_boundedness(
@@ -658,7 +649,7 @@ def check_boundedness(
     model: HybridDynamics,
     training_points: TrainingPoints,
     divergence_factor: float,
-) -> SanityFinding:
+) -> SanityRow:
     """Check that the motion with constant inputs is bounded.
 
     Runs start at the recorded points with their inputs, and at zero velocity with inputs at the
@@ -742,23 +733,7 @@ def check_boundedness(
     return _to_sanity_finding(spec, BOUNDEDNESS, False, text, "")
 
 
-def build_sanity_file(findings: Mapping[str, Sequence[SanityFinding]]) -> SanityFile:
+def build_sanity_file(findings: Mapping[str, Sequence[SanityRow]]) -> SanityFile:
     """Return the contents of sanity.json from the findings of each model."""
-    rows = [asdict(finding) for model_findings in findings.values() for finding in model_findings]
-    return SanityFile.model_validate({"schema": SCHEMA, "findings": rows})
-
-
-def read_sanity_findings(run_folder: Path) -> list[SanityFinding]:
-    """Return the results in a run folder's sanity.json; empty without the file.
-
-    Raises:
-        UsageError: if the file is not readable as JSON.
-        DataError: if a key is missing, unknown or of another type.
-    """
-    path = run_folder / "sanity.json"
-    if not path.is_file():
-        return []
-    return [
-        SanityFinding(row.model, row.check, row.ok, row.text, row.fault)
-        for row in SanityFile.read(path).findings
-    ]
+    rows = [row for model_rows in findings.values() for row in model_rows]
+    return SanityFile(schema=SCHEMA, findings=tuple(rows))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import NamedTuple
 
 from residnet.core.format import (
     display_unit,
@@ -14,17 +14,22 @@ from residnet.core.format import (
     format_number,
     join_list,
 )
-from residnet.core.model_names import CONSTANT_VELOCITY
+from residnet.core.model_names import CONSTANT_VELOCITY, PLANT
 from residnet.core.names import POSE_ERROR_UNITS
-
-JsonObject = Mapping[str, Any]
-"""Contents of a JSON object."""
+from residnet.evaluation.records import (
+    HorizonRow,
+    MetricsRow,
+    PairedDifference,
+    PoseErrors,
+    ProtocolLimits,
+    SelectionFile,
+)
 
 UNSEEN_SPLITS = ("test", "external")
 """Splits that are not used in a fit."""
 
 
-def order_protocols(rows: Sequence[JsonObject], split: str, selection_protocol: str) -> list[str]:
+def order_protocols(rows: Sequence[MetricsRow], split: str, selection_protocol: str) -> list[str]:
     """Return the protocols of rows, first the main one of a split.
 
     The main protocol is that of the model selection, unless the logs of the split are too short.
@@ -34,8 +39,8 @@ def order_protocols(rows: Sequence[JsonObject], split: str, selection_protocol: 
         split: the split.
         selection_protocol: protocol of the model selection; empty without a selection.
     """
-    protocol_names = dict.fromkeys(row["protocol"] for row in rows)
-    protocols_of_split = {row["protocol"] for row in rows if row["split"] == split}
+    protocol_names = dict.fromkeys(row.protocol for row in rows)
+    protocols_of_split = {row.protocol for row in rows if row.split == split}
     return sorted(
         protocol_names,
         key=lambda protocol_name: (
@@ -54,7 +59,7 @@ class VerdictEvidence:
         split: split of the free runs.
         rows_by_model: rows of metrics.json under one protocol over all manoeuvres of the split.
         baseline: name of the first baseline; empty for none.
-        selection: contents of selection.json; may be empty.
+        selection: contents of selection.json; None without a selection.
         limits_by_protocol: contents of limits.json for the split by protocol; may be empty.
         data_quality_text: one sentence on the data checks; empty without them.
         protocol: protocol of the rows.
@@ -65,10 +70,10 @@ class VerdictEvidence:
 
     selected: str
     split: str
-    rows_by_model: Mapping[str, JsonObject]
+    rows_by_model: Mapping[str, MetricsRow]
     baseline: str = ""
-    selection: JsonObject = field(default_factory=dict)
-    limits_by_protocol: JsonObject = field(default_factory=dict)
+    selection: SelectionFile | None = None
+    limits_by_protocol: Mapping[str, ProtocolLimits] = field(default_factory=dict)
     data_quality_text: str = ""
     protocol: str = ""
     one_sided_text: str = ""
@@ -126,7 +131,7 @@ def write_verdict(evidence: VerdictEvidence) -> list[str]:
         evidence.data_quality_text,
         *horizon_sentences,
         describe_soundness(evidence),
-        str(evidence.selection.get("reason", "")),
+        "" if evidence.selection is None else evidence.selection.reason,
         describe_extrapolation(evidence),
     ]
     return [sentence for sentence in sentences if sentence]
@@ -138,8 +143,8 @@ def rate_model(evidence: VerdictEvidence) -> str:
         return DO_NOT_USE
     if evidence.selected not in evidence.rows_by_model:
         return ""
-    horizon_entries = known_horizons(evidence)
-    if horizon_entries and not any(_has_enough_data(evidence, entry) for entry in horizon_entries):
+    horizons = known_horizons(evidence)
+    if horizons and not any(_has_enough_data(evidence, horizon.row) for horizon in horizons):
         return TOO_FEW_WINDOWS
     has_limitation = bool(evidence.one_sided_text) or bool(list_unidentifiable_inputs(evidence))
     return GOOD_LEVEL if longest_good_horizon(evidence) and not has_limitation else LIMITED_LEVEL
@@ -179,128 +184,127 @@ def describe_unexcited(evidence: VerdictEvidence) -> str:
     return " ".join(sentences)
 
 
-def known_horizons(evidence: VerdictEvidence) -> list[JsonObject]:
+class ProtocolHorizon(NamedTuple):
+    """Pose errors at a horizon, and the protocol whose windows gave them."""
+
+    protocol: str
+    row: HorizonRow
+
+
+def known_horizons(evidence: VerdictEvidence) -> list[ProtocolHorizon]:
     """Return the horizons with known errors of the selected model, in ascending order.
 
-    A horizon may occur in several protocols; the one with the most windows is used and named under
-    the key `protocol`.
+    A horizon may occur in several protocols; the one with the most windows is used.
     """
-    entry_by_time: dict[float, dict[str, Any]] = {}
+    horizons: dict[float, ProtocolHorizon] = {}
     # the protocol of the rows first, so that others only add horizons or more windows
     for protocol in sorted(evidence.limits_by_protocol, key=lambda name: name != evidence.protocol):
-        for horizon_entry in evidence.limits_by_protocol[protocol].get("horizons") or []:
-            seconds = horizon_entry["seconds"]
-            has_selected_model = evidence.selected in horizon_entry["models"]
-            if seconds in entry_by_time:
-                has_selected_model &= horizon_entry["windows"] > entry_by_time[seconds]["windows"]
-            elif protocol != evidence.protocol:
-                has_selected_model = False
-            if has_selected_model:
-                entry_by_time[seconds] = {**horizon_entry, "protocol": protocol}
-    return [entry_by_time[seconds] for seconds in sorted(entry_by_time)]
+        for row in evidence.limits_by_protocol[protocol].horizons:
+            if evidence.selected not in row.models:
+                continue
+            known_horizon = horizons.get(row.seconds)
+            if known_horizon is None:
+                # the protocol of the verdict determines the horizons, others only add windows
+                is_used = protocol == evidence.protocol
+            else:
+                is_used = row.windows > known_horizon.row.windows
+            if is_used:
+                horizons[row.seconds] = ProtocolHorizon(protocol, row)
+    return [horizons[seconds] for seconds in sorted(horizons)]
 
 
-def _has_enough_data(evidence: VerdictEvidence, horizon_entry: JsonObject) -> bool:
+def _has_enough_data(evidence: VerdictEvidence, row: HorizonRow) -> bool:
     """Return whether a horizon has enough windows, and logs for an interval, for a rating."""
-    has_intervals = all(horizon_entry["models"][evidence.selected]["intervals"].values())
-    return has_intervals and horizon_entry["windows"] >= _MIN_WINDOWS
+    has_intervals = all(row.models[evidence.selected].intervals.values())
+    return has_intervals and row.windows >= _MIN_WINDOWS
 
 
-def _protocol_limits(evidence: VerdictEvidence) -> JsonObject:
-    """Return the entry of limits.json for the protocol of the rows; may be empty."""
-    limits: JsonObject = evidence.limits_by_protocol.get(evidence.protocol) or {}
-    return limits
+def _protocol_limits(evidence: VerdictEvidence) -> ProtocolLimits | None:
+    """Return the entry of limits.json for the protocol of the rows; None without one."""
+    return evidence.limits_by_protocol.get(evidence.protocol)
 
 
 def longest_good_horizon(evidence: VerdictEvidence) -> float:
     """Return the horizon in s up to which the selected model is good; 0 for none."""
-    row = evidence.rows_by_model[evidence.selected]
-    longest_horizon = 0.0
     # one divergence on unseen data excludes the model at any horizon
-    if row.get("diverged") and evidence.split in UNSEEN_SPLITS:
+    if evidence.rows_by_model[evidence.selected].diverged and evidence.split in UNSEEN_SPLITS:
         return 0.0
-    plant_models = {
-        name for name, row in evidence.rows_by_model.items() if row.get("kind") == "plant"
-    }
-    for horizon_entry in known_horizons(evidence):
-        if not _has_enough_data(evidence, horizon_entry):
+    plant_models = {name for name, row in evidence.rows_by_model.items() if row.kind == PLANT}
+    longest_horizon = 0.0
+    for _, row in known_horizons(evidence):
+        if not _has_enough_data(evidence, row):
             return longest_horizon
-        if contradicts_positions(horizon_entry):
+        if contradicts_positions(row):
             continue
-        models = horizon_entry["models"]
-        selected_errors = models[evidence.selected]
-        error_intervals = models[evidence.selected]["intervals"]
+        errors_by_model = {name: errors.by_name for name, errors in row.models.items()}
+        selected_errors = errors_by_model[evidence.selected]
         # the errors of the plant itself, started from noisy measured states, are also a noise floor
         noise_floors = [
-            horizon_entry["floor"],
-            *(models[name] for name in plant_models & set(models)),
+            row.floor.by_name,
+            *(errors_by_model[name] for name in plant_models & set(errors_by_model)),
         ]
-        rival_models = set(models) - {evidence.selected} - plant_models
-        for error_name in error_intervals:
+        rival_models = set(errors_by_model) - {evidence.selected} - plant_models
+        for error_name, interval in row.models[evidence.selected].intervals.items():
+            assert interval is not None, "checked by _has_enough_data"
             error_limit = (
                 _MAX_ANGLE_ERROR
                 if POSE_ERROR_UNITS[error_name] == "rad"
-                else _MAX_DISTANCE_SHARE * horizon_entry["sailed"]
+                else _MAX_DISTANCE_SHARE * row.sailed
             )
-            rival_errors = [models[name][error_name] for name in rival_models]
+            rival_errors = [errors_by_model[name][error_name] for name in rival_models]
             # errors near the noise floor are not the fault of the model
             twice_noise_floor = 2.0 * max(noise_floor[error_name] for noise_floor in noise_floors)
+            selected_error = selected_errors[error_name]
             # a model that is far worse than another one of the run should not be called good
-            is_near_best = selected_errors[error_name] <= max(
+            is_near_best = selected_error <= max(
                 twice_noise_floor,
-                _MAX_RATIO_TO_BEST * min(rival_errors, default=selected_errors[error_name]),
+                _MAX_RATIO_TO_BEST * min(rival_errors, default=selected_error),
             )
-            beats_constant_velocity = CONSTANT_VELOCITY not in models or selected_errors[
-                error_name
-            ] <= max(twice_noise_floor, models[CONSTANT_VELOCITY][error_name])
+            beats_constant_velocity = (
+                CONSTANT_VELOCITY not in errors_by_model
+                or selected_error
+                <= max(twice_noise_floor, errors_by_model[CONSTANT_VELOCITY][error_name])
+            )
             if not (
                 is_near_best
                 and beats_constant_velocity
-                and error_intervals[error_name][1] <= max(error_limit, twice_noise_floor)
+                and interval[1] <= max(error_limit, twice_noise_floor)
             ):
                 return longest_horizon
-        longest_horizon = float(horizon_entry["seconds"])
+        longest_horizon = row.seconds
     return longest_horizon
 
 
-def contradicts_positions(horizon_entry: JsonObject) -> bool:
+def contradicts_positions(row: HorizonRow) -> bool:
     """Return whether measured velocities, integrated, leave the positions by a tenth of the way.
 
     Then velocities and positions are not one motion, and no model is good by them.
     """
-    floor = float(horizon_entry["floor"].get("position", 0.0))
-    return floor > _MAX_DISTANCE_SHARE * float(horizon_entry["sailed"])
+    return (row.floor.position or 0.0) > _MAX_DISTANCE_SHARE * row.sailed
 
 
 def describe_horizons(evidence: VerdictEvidence) -> list[str]:
     """Return sentences on pose errors of the selected model and of the reference models."""
-    horizon_entries = known_horizons(evidence)
-    if not horizon_entries:
+    horizons = known_horizons(evidence)
+    if not horizons:
         return [compare_velocity_errors(evidence)]
-    error_names = [
-        error_name for error_name in POSE_ERROR_UNITS if error_name in horizon_entries[0]["floor"]
+    error_names = list(horizons[0].row.floor.by_name)
+    sufficient_horizons = [
+        horizon for horizon in horizons if _has_enough_data(evidence, horizon.row)
     ]
-    sufficient_entries = [
-        horizon_entry
-        for horizon_entry in horizon_entries
-        if _has_enough_data(evidence, horizon_entry)
-    ]
-    longest_horizon = longest_good_horizon(evidence) if sufficient_entries else 0.0
-    main_entry = next(
-        (
-            candidate_entry
-            for candidate_entry in horizon_entries
-            if candidate_entry["seconds"] == longest_horizon
-        ),
-        (sufficient_entries or horizon_entries)[-1],
+    longest_horizon = longest_good_horizon(evidence) if sufficient_horizons else 0.0
+    main_horizon = next(
+        (horizon for horizon in horizons if horizon.row.seconds == longest_horizon),
+        (sufficient_horizons or horizons)[-1],
     )
-    error_text = _format_errors_with_intervals(main_entry, evidence.selected, main_entry["sailed"])
-    horizon_text = f"{format_number(main_entry['seconds'], 2)} s ahead"
+    main_row = main_horizon.row
+    error_text = _format_errors_with_intervals(main_row.models[evidence.selected], main_row.sailed)
+    horizon_text = f"{format_number(main_row.seconds, 2)} s ahead"
     criterion_sentences = []
-    if not sufficient_entries:
+    if not sufficient_horizons:
         lead_sentence = (
-            f"{format_count(main_entry['windows'], 'window')} of"
-            f" {format_count(main_entry['logs'], 'log')} on"
+            f"{format_count(main_row.windows, 'window')} of"
+            f" {format_count(main_row.logs, 'log')} on"
             f" {evidence.split} data cannot say how good {evidence.selected} is ({_MIN_WINDOWS} of"
             f" {MIN_LOGS_FOR_INTERVAL} logs are needed); {horizon_text} it is off by {error_text}."
         )
@@ -329,32 +333,31 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
         ]
     reference_labels = {CONSTANT_VELOCITY: "constant velocity", evidence.baseline: "baseline"}
     reference_texts = [
-        f"{label} {_format_errors_with_intervals(main_entry, name)}"
+        f"{label} {_format_errors_with_intervals(main_row.models[name])}"
         for name, label in reference_labels.items()
-        if name in main_entry["models"] and name != evidence.selected
+        if name in main_row.models and name != evidence.selected
     ]
     # a pose that was itself integrated from the velocities has only rounding errors
-    has_noise_floor = any(main_entry["floor"][error_name] > 1e-9 for error_name in error_names)
+    has_noise_floor = any(error > 1e-9 for error in main_row.floor.by_name.values())
     noise_floor_text = (
-        f"noise floor (measured velocities, integrated) {_format_pose_errors(main_entry['floor'])}"
+        f"noise floor (measured velocities, integrated) {_format_pose_errors(main_row.floor)}"
     )
     other_horizons = [
-        f"{_format_pose_errors(horizon_entry['models'][evidence.selected])} after"
-        f" {horizon_entry['seconds']:.4g} s"
-        for horizon_entry in horizon_entries
-        if horizon_entry is not main_entry
+        f"{_format_pose_errors(row.models[evidence.selected])} after {row.seconds:.4g} s"
+        for _, row in horizons
+        if row is not main_row
     ]
     has_position = "position" in error_names
     scope_sentence = (
-        f"It holds for {format_count(main_entry['windows'], 'free run')}"
-        f" ({main_entry['protocol']}) of"
-        f" {format_count(main_entry['logs'], 'log')}"
-        + f" at mean speeds of {format_number(main_entry['slowest'], 2)} to"
-        f" {format_number(main_entry['fastest'], 2)} m/s" * has_position + "."
+        f"It holds for {format_count(main_row.windows, 'free run')}"
+        f" ({main_horizon.protocol}) of"
+        f" {format_count(main_row.logs, 'log')}"
+        + f" at mean speeds of {format_number(main_row.slowest, 2)} to"
+        f" {format_number(main_row.fastest, 2)} m/s" * has_position + "."
     )
     contradiction_sentences = []
-    if contradicts_positions(main_entry):
-        share = main_entry["floor"]["position"] / main_entry["sailed"]
+    if contradicts_positions(main_row):
+        share = (main_row.floor.position or 0.0) / main_row.sailed
         contradiction_sentences = [
             "The measured velocities, integrated, leave the measured positions by"
             f" {100.0 * share:.0f} % of the way: check frames, units and clocks of both before any"
@@ -384,37 +387,25 @@ def format_pose_error(error_name: str, error: float) -> str:
     )
 
 
-def _format_pose_errors(errors: JsonObject) -> str:
-    return join_list(
-        [
-            format_pose_error(error_name, errors[error_name])
-            for error_name in POSE_ERROR_UNITS
-            if error_name in errors
-        ]
-    )
+def _format_pose_errors(errors: PoseErrors) -> str:
+    return join_list([format_pose_error(name, error) for name, error in errors.by_name.items()])
 
 
-def _format_errors_with_intervals(
-    horizon_entry: JsonObject, model_name: str, distance_travelled: float = 0.0
-) -> str:
+def _format_errors_with_intervals(errors: PoseErrors, distance_travelled: float = 0.0) -> str:
     """Return errors of position and heading with their intervals as text."""
-    model_errors = horizon_entry["models"][model_name]
     texts = []
-    for error_name in (error_name for error_name in POSE_ERROR_UNITS if error_name in model_errors):
-        interval_limits = model_errors["intervals"][error_name]
-        error_text = format_pose_error(error_name, model_errors[error_name])
-        details = (
-            [format_interval(interval_limits, display_unit(POSE_ERROR_UNITS[error_name])[1], 2)]
-            if interval_limits
-            else []
-        )
+    for error_name, error in errors.by_name.items():
+        interval = errors.intervals[error_name]
+        unit_factor = display_unit(POSE_ERROR_UNITS[error_name])[1]
+        details = [format_interval(interval, unit_factor, 2)] if interval else []
         if error_name == "position" and distance_travelled > 0.0:
             details.append(
-                f"{format_number(100.0 * model_errors[error_name] / distance_travelled, 2)} % of"
+                f"{format_number(100.0 * error / distance_travelled, 2)} % of"
                 f" the {format_number(distance_travelled, 2)} m sailed"
             )
+        error_text = format_pose_error(error_name, error)
         texts.append(error_text + (f" ({', '.join(details)})" if details else ""))
-    has_intervals = all(model_errors["intervals"].values()) or distance_travelled == 0.0
+    has_intervals = all(errors.intervals.values()) or distance_travelled == 0.0
     return join_list(texts) + ("" if has_intervals else ", from too few logs for an interval")
 
 
@@ -427,12 +418,12 @@ def list_model_objections(evidence: VerdictEvidence) -> list[str]:
     if selected_row is None:
         return []
     return [
-        f"on {evidence.split} data its NRMSE is {format_number(_mean_nrmse(selected_row))}, that"
+        f"on {evidence.split} data its NRMSE is {format_number(selected_row.mean_nrmse)}, that"
         f" of {reference_name}"
-        f" {format_number(_mean_nrmse(reference_row))}"
+        f" {format_number(reference_row.mean_nrmse)}"
         for reference_name in dict.fromkeys((CONSTANT_VELOCITY, evidence.baseline))
         if (reference_row := evidence.rows_by_model.get(reference_name)) is not None
-        and _mean_nrmse(selected_row) > _mean_nrmse(reference_row)
+        and selected_row.mean_nrmse > reference_row.mean_nrmse
     ]
 
 
@@ -444,7 +435,7 @@ def is_useless(evidence: VerdictEvidence) -> bool:
         return True
     if selected_row is None or constant_velocity_row is None:
         return False
-    return _mean_nrmse(selected_row) >= _mean_nrmse(constant_velocity_row) or _is_indistinguishable(
+    return selected_row.mean_nrmse >= constant_velocity_row.mean_nrmse or _is_indistinguishable(
         evidence, CONSTANT_VELOCITY
     )
 
@@ -464,19 +455,17 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
     constant_velocity_row = evidence.rows_by_model.get(CONSTANT_VELOCITY)
     if selected_row is None:
         return f"The run holds no free runs of its selected model on {split} data."
-    selected_nrmse = _mean_nrmse(selected_row)
+    selected_nrmse = selected_row.mean_nrmse
     if constant_velocity_row is not None and is_useless(evidence):
         comparison_text = (
-            "NO BETTER"
-            if _mean_nrmse(selected_row) <= _mean_nrmse(constant_velocity_row)
-            else "WORSE"
+            "NO BETTER" if selected_row.mean_nrmse <= constant_velocity_row.mean_nrmse else "WORSE"
         )
         return (
             f"{comparison_text} THAN CONSTANT VELOCITY: on {split} data the selected model"
             f" {model_name} has an NRMSE of"
             f" {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}, and the"
             " constant-velocity model"
-            f" {format_number(_mean_nrmse(constant_velocity_row))}"
+            f" {format_number(constant_velocity_row.mean_nrmse)}"
             f"{_format_paired_interval(evidence, CONSTANT_VELOCITY)}."
             " DO NOT USE it for prediction."
         )
@@ -488,8 +477,8 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
         if reference_row is None or reference_name == model_name:
             continue
         percent_change = (
-            100.0 * (1.0 - selected_nrmse / _mean_nrmse(reference_row))
-            if _mean_nrmse(reference_row) > 0
+            100.0 * (1.0 - selected_nrmse / reference_row.mean_nrmse)
+            if reference_row.mean_nrmse > 0
             else 0.0
         )
         comparison = "better" if percent_change >= 0 else "WORSE"
@@ -509,18 +498,16 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
 
 def describe_soundness(evidence: VerdictEvidence) -> str:
     """Return the result of the physical checks of the selected model; empty without checks."""
-    selection_rows = {
-        selected_row["model"]: selected_row for selected_row in evidence.selection.get("models", [])
-    }
-    selection_row = selection_rows.get(evidence.selected)
+    models = () if evidence.selection is None else evidence.selection.models
+    selection_row = next((row for row in models if row.model == evidence.selected), None)
     if selection_row is None or evidence.selected == CONSTANT_VELOCITY:
         return ""
+    faults = list(selection_row.faults)
     selected_row = evidence.rows_by_model.get(evidence.selected)
-    n_diverged = int(selected_row["diverged"]) if selected_row is not None else 0
-    faults = list(selection_row["faults"])
-    if n_diverged and selected_row is not None and evidence.split in UNSEEN_SPLITS:
+    if selected_row is not None and selected_row.diverged and evidence.split in UNSEEN_SPLITS:
         faults.append(
-            f"{n_diverged} of its {selected_row['windows']} {evidence.split} windows diverged"
+            f"{selected_row.diverged} of its {selected_row.windows} {evidence.split} windows"
+            " diverged"
         )
     if faults:
         return f"It is UNSOUND: {'; '.join(faults)}."
@@ -529,13 +516,13 @@ def describe_soundness(evidence: VerdictEvidence) -> str:
 
 def describe_extrapolation(evidence: VerdictEvidence) -> str:
     """Return the share of data outside the training range; empty if unknown."""
-    range_summary = _protocol_limits(evidence).get("outside") or {}
-    if not range_summary:
+    limits = _protocol_limits(evidence)
+    if limits is None or limits.outside.share is None:
         return ""
-    outside_share = float(range_summary["share"])
+    outside_share = limits.outside.share
     if outside_share == 0:
         return f"All {evidence.split} data lie inside the range of the training data."
-    channels = sorted(range_summary["channels"].items(), key=lambda pair: -pair[1])[:3]
+    channels = sorted(limits.outside.channels.items(), key=lambda pair: -pair[1])[:3]
     channel_texts = ", ".join(
         f"{name} {_format_percent(channel_share)}" for name, channel_share in channels
     )
@@ -546,22 +533,14 @@ def describe_extrapolation(evidence: VerdictEvidence) -> str:
     )
 
 
-def describe_divergence(metrics_row: JsonObject) -> str:
+def describe_divergence(row: MetricsRow) -> str:
     """Return the count of diverged windows of a row, for display next to its error; may be
     empty.
     """
-    return (
-        f"{metrics_row['diverged']}/{metrics_row['windows']} diverged"
-        if metrics_row.get("diverged")
-        else ""
-    )
+    return f"{row.diverged}/{row.windows} diverged" if row.diverged else ""
 
 
-def _mean_nrmse(row: JsonObject) -> float:
-    return float(row["nrmse"]["mean"])
-
-
-def _diverged_suffix(row: JsonObject) -> str:
+def _diverged_suffix(row: MetricsRow) -> str:
     divergence_note = describe_divergence(row)
     return (
         f" ({divergence_note}, which count with the constant-velocity error)"
@@ -570,33 +549,31 @@ def _diverged_suffix(row: JsonObject) -> str:
     )
 
 
-def _difference_to(evidence: VerdictEvidence, reference_name: str) -> JsonObject:
-    """Return the paired difference to another model; empty if it was not computed."""
-    differences = (_protocol_limits(evidence).get("compared") or {}).get(evidence.selected) or {}
-    return differences.get(reference_name) or {}
+def _difference_to(evidence: VerdictEvidence, reference_name: str) -> PairedDifference | None:
+    """Return the paired difference to another model; None if it was not computed."""
+    limits = _protocol_limits(evidence)
+    if limits is None:
+        return None
+    return limits.compared.get(evidence.selected, {}).get(reference_name)
 
 
 def _is_indistinguishable(evidence: VerdictEvidence, reference_name: str) -> bool:
     """Return whether the interval of the difference to another model includes zero."""
-    paired_difference = _difference_to(evidence, reference_name)
-    return (
-        bool(paired_difference)
-        and paired_difference["ci95"] is not None
-        and not paired_difference["excludes_zero"]
-    )
+    difference = _difference_to(evidence, reference_name)
+    return difference is not None and difference.ci95 is not None and not difference.excludes_zero
 
 
 def _format_paired_interval(evidence: VerdictEvidence, reference_name: str) -> str:
     """Return the paired confidence interval of the difference to another model in brackets."""
-    paired_difference = _difference_to(evidence, reference_name)
-    if not paired_difference:
+    difference = _difference_to(evidence, reference_name)
+    if difference is None:
         return ""
-    if paired_difference["ci95"] is None:
+    if difference.ci95 is None:
         return " (too few logs for an interval)"
-    lower, upper = paired_difference["ci95"]
+    lower, upper = difference.ci95
     suffix = (
         ""
-        if paired_difference["excludes_zero"]
+        if difference.excludes_zero
         else ", which includes zero: the difference is not significant"
     )
     return f" (paired 95 % interval of the difference {lower:+.3g} to {upper:+.3g}{suffix})"

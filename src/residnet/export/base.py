@@ -158,7 +158,7 @@ class Exportable(ABC):
         return {
             "build": self.build(),
             "objections": list(self.objections),
-            **assessment.content(),
+            **assessment.model_dump(mode="json"),
         }
 
     @final

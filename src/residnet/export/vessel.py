@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, final
 
 import numpy as np
@@ -25,6 +25,7 @@ from residnet.dynamics.domain_config import (
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.engine.rollout import Rollout, trace_rollout
+from residnet.evaluation.records import MetricsRow
 from residnet.export import base
 from residnet.export.base import Exportable, LoadedExport, NumberArray, RoundingError
 from residnet.export.guard import GuardedDynamics, hold_measured
@@ -247,7 +248,7 @@ class ExportedVessel(Exportable):
     methods = ("initial_state", "warmup", "step", "rollout", "band")
 
     def __init__(
-        self, spec: ModelSpec, model: HybridDynamics, metrics: Sequence[Mapping[str, Any]] = ()
+        self, spec: ModelSpec, model: HybridDynamics, metrics: Sequence[MetricsRow] = ()
     ) -> None:
         for submodule in model.modules():
             if isinstance(submodule, ResidualHead) and submodule.export_error:
@@ -347,7 +348,7 @@ class ExportedVessel(Exportable):
                 for member in spec.members
             ],
             "band": band_entry,
-            "metrics": [dict(row) for row in self.metrics],
+            "metrics": [row.model_dump(mode="json", exclude_unset=True) for row in self.metrics],
             "versions": {"residnet": __version__, "torch": torch.__version__},
             "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         }

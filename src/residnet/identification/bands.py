@@ -284,7 +284,7 @@ class _ProtocolCalibration:
         candidates = [
             Candidate(
                 name,
-                "",
+                self.fitted_models[name].spec.role,
                 model,
                 members=trajectory_member_names(self.fitted_models[name]),
                 spread_members=spread_members,

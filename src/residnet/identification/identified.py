@@ -23,6 +23,7 @@ from residnet.evaluation.freerun import Candidate, FreeRun, run_free_runs
 from residnet.evaluation.goodness import OneStepResiduals, build_goodness_table
 from residnet.evaluation.metrics import ProtocolEvaluation, build_metrics_table
 from residnet.evaluation.protocol import EvaluationConfig
+from residnet.evaluation.records import GoodnessRow, MetricsRow, ProtocolLimits, SanityRow
 from residnet.evaluation.selection import (
     Selection,
     SelectionCandidate,
@@ -31,7 +32,7 @@ from residnet.evaluation.selection import (
     make_selection_blocks,
     select_models,
 )
-from residnet.evaluation.soundness import SanityFinding, TrainingPoints, check_model
+from residnet.evaluation.soundness import TrainingPoints, check_model
 from residnet.heads.base import ClosedFormHead, EquationHead
 from residnet.identification.fitter import FittedModel, find_reference_names
 from residnet.identification.recipe import SINGLE_MODEL_NAME
@@ -62,8 +63,8 @@ class SplitEvaluation:
     split: str
     logs: Sequence[PreparedLog]
     free_runs: list[FreeRun]
-    rows: list[dict[str, Any]]
-    limits_by_protocol: dict[str, Any]
+    rows: list[MetricsRow]
+    limits_by_protocol: dict[str, ProtocolLimits]
     bands_by_model: BandsByModel = field(default_factory=dict)
 
     @property
@@ -271,7 +272,7 @@ class IdentifiedModels(Mapping[str, FittedModel]):
         )
 
     @cached_property
-    def sanity_findings(self) -> dict[str, list[SanityFinding]]:
+    def sanity_findings(self) -> dict[str, list[SanityRow]]:
         """Results of the physical checks by model, without `constant_velocity`."""
         fitted_models = list(self.values())
         settings = self.settings
@@ -514,7 +515,7 @@ GOODNESS_SPLITS = ("train", "test")
 
 def build_goodness_rows(
     fitted_models: Iterable[FittedModel], logs: Mapping[str, Sequence[PreparedLog]], dt: float
-) -> dict[str, list[dict[str, Any]]]:
+) -> dict[str, list[GoodnessRow]]:
     """Return statistics of the one-step residuals of each model, by split.
 
     Large data sets are thinned to evenly spaced logs with 200,000 samples.

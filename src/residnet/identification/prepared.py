@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from residnet.evaluation.protocol import longest_segment_length
 from residnet.identification.settings import FitSettings
 from residnet.preprocessing.masks import UNEXPLAINED_IDLE
 from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
+from residnet.training.records import CurrentRow
 
 _MAX_SAMPLES = 500_000
 """Largest number of samples of a log that are prepared at once, which bounds the memory used."""
@@ -175,7 +175,7 @@ def compute_velocity_limits(
 
 def convert_to_motion_through_water(
     logs: Mapping[str, Sequence[PreparedLog]], settings: FitSettings
-) -> tuple[PreparedSplits, list[dict[str, Any]]]:
+) -> tuple[PreparedSplits, list[CurrentRow]]:
     """Convert logs by split to motion through the water; return them with a table of currents.
 
     The currents of training and validation logs are fitted together with the coefficients of a
@@ -206,10 +206,7 @@ def convert_to_motion_through_water(
     currents, current_rows = estimate_currents(
         baseline, signals, all_logs[:n_fitted], settings.current, all_logs[n_fitted:]
     )
-    north, east = (
-        np.array([row[f"current_{axis}"] for row in current_rows]) for axis in ("north", "east")
-    )
-    current_speeds = np.hypot(north, east)
+    current_speeds = np.array([row.speed for row in current_rows])
     log_message(
         f"  currents of {len(current_rows)} logs: {current_speeds.mean():.3f} m/s on average,"
         f" at most {current_speeds.max():.3f} m/s"

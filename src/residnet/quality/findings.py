@@ -7,16 +7,17 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Final
 
 import numpy as np
 
 from residnet.core.log import Log
 from residnet.core.units import unit_confusions
+from residnet.quality.records import FindingRow, InspectionFile, LogInspection
+from residnet.quality.records import Level as Level
 
-Level = Literal["note", "will mislead", "fatal"]
 LEVELS = ("note", "will mislead", "fatal")
-SCHEMA = "residnet.inspection/1"
+SCHEMA: Final = "residnet.inspection/1"
 _MAX_SUMMARY_KINDS = 4
 """Number of kinds of findings in a summary, which must fit into one line."""
 
@@ -71,14 +72,19 @@ class Finding:
             return self
         return dataclasses.replace(self, level="note", action="the config masks these samples")
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the finding as plain values for JSON."""
-        figures = {
-            name: float(value) if math.isfinite(value) else None
-            for name, value in self.figures.items()
-        }
-        fields = {name: getattr(self, name) for name in ("level", "code", "text", "action")}
-        return {**fields, "effect": self.effect, "figures": figures}
+    def to_row(self) -> FindingRow:
+        """Return the finding as a row of doctor.json."""
+        return FindingRow(
+            level=self.level,
+            code=self.code,
+            text=self.text,
+            action=self.action,
+            effect=self.effect,
+            figures={
+                name: float(value) if math.isfinite(value) else None
+                for name, value in self.figures.items()
+            },
+        )
 
 
 @dataclass(frozen=True)
@@ -239,16 +245,19 @@ class InspectionReport:
         """Return the report as text, one line per finding, the most severe first."""
         sorted_findings = sorted(
             self.findings,
-            key=lambda reported_finding: _severity_key(reported_finding.to_json()),
+            key=lambda reported_finding: _severity_key(reported_finding.to_row()),
             reverse=True,
         )
         return [f"{self.name}: {finding.to_line}" for finding in sorted_findings]
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the report as plain values for JSON."""
-        findings = [finding.to_json() for finding in self.findings]
-        metadata = {"name": self.name, "source": self.source, "misled": self.has_problems}
-        return {**metadata, "findings": findings}
+    def to_record(self) -> LogInspection:
+        """Return the report as a part of doctor.json."""
+        return LogInspection(
+            name=self.name,
+            source=self.source,
+            misled=self.has_problems,
+            findings=tuple(finding.to_row() for finding in self.findings),
+        )
 
 
 def convert_reader_findings(reader_notes: Iterable[Mapping[str, Any]]) -> list[Finding]:
@@ -258,21 +267,21 @@ def convert_reader_findings(reader_notes: Iterable[Mapping[str, Any]]) -> list[F
 
 def build_inspection(
     reports: Sequence[InspectionReport], between_logs: InspectionReport
-) -> dict[str, Any]:
-    """Return all reports as plain values for JSON (schema residnet.inspection/1).
+) -> InspectionFile:
+    """Return the contents of doctor.json.
 
     Args:
         reports: one per log.
         between_logs: report on the set of logs.
     """
-    content = {
-        "schema": SCHEMA,
-        "misled": any(report.has_problems for report in (*reports, between_logs)),
-        "logs": [report.to_json() for report in reports],
-        "together": between_logs.to_json()["findings"],
-    }
-    inspection_summary = summarize_inspection(content)
-    return {**content, "tally": inspection_summary.tally, "first": inspection_summary.first_action}
+    inspection = InspectionFile(
+        schema=SCHEMA,
+        misled=any(report.has_problems for report in (*reports, between_logs)),
+        logs=tuple(report.to_record() for report in reports),
+        together=between_logs.to_record().findings,
+    )
+    summary = summarize_inspection(inspection)
+    return inspection.model_copy(update={"tally": summary.tally, "first": summary.first_action})
 
 
 @dataclass(frozen=True)
@@ -300,11 +309,11 @@ class InspectionSummary:
         return [line for line in (self.tally, self.first_action) if line]
 
 
-def _severity_key(finding: Mapping[str, Any]) -> tuple[int, float]:
-    return LEVELS.index(finding["level"]), float(finding.get("effect") or 0.0)
+def _severity_key(finding: FindingRow) -> tuple[int, float]:
+    return LEVELS.index(finding.level), finding.effect or 0.0
 
 
-def summarize_inspection(inspection: Mapping[str, Any]) -> InspectionSummary:
+def summarize_inspection(inspection: InspectionFile) -> InspectionSummary:
     """Count the findings of an inspection and select the most severe one.
 
     Findings are ranked by level, then by the largest measured effect on a fit, then by the number
@@ -313,16 +322,11 @@ def summarize_inspection(inspection: Mapping[str, Any]) -> InspectionSummary:
     Args:
         inspection: content of doctor.json, or the output of `residnet inspect --json`.
     """
-    logs: Sequence[Mapping[str, Any]] = inspection.get("logs") or []
-    between_logs = {"name": "together", "findings": inspection.get("together") or []}
-    findings_by_code: dict[str, list[tuple[str, Mapping[str, Any]]]] = {}
-    for log_report in (*logs, between_logs):
-        for finding in log_report["findings"]:
-            if finding["level"] != "note":
-                findings_by_code.setdefault(str(finding["code"]), []).append(
-                    (str(log_report["name"]), finding)
-                )
-    n_logs = len(logs)
+    findings_by_code: dict[str, list[tuple[str, FindingRow]]] = {}
+    for name, finding in inspection.named_findings:
+        if finding.level != "note":
+            findings_by_code.setdefault(finding.code, []).append((name, finding))
+    n_logs = len(inspection.logs)
     if not findings_by_code:
         logs_text = "the log" if n_logs == 1 else f"the {n_logs} logs"
         return InspectionSummary(
@@ -366,10 +370,10 @@ def summarize_inspection(inspection: Mapping[str, Any]) -> InspectionSummary:
         key=lambda name_and_finding: _severity_key(name_and_finding[1]),
     )
     log_prefix = "" if name == "together" else f"{name}: "
-    action = f"; {first_finding['action']}" if first_finding["action"] else ""
+    action = f"; {first_finding.action}" if first_finding.action else ""
     effect = _severity_key(first_finding)[1]
     effect_text = f" It changes a fit by {100.0 * effect:.0f} %." if effect else ""
-    text = f"First fix this: {log_prefix}{first_finding['text']}{action}.{effect_text}"
+    text = f"First fix this: {log_prefix}{first_finding.text}{action}.{effect_text}"
     return InspectionSummary(
         n_logs,
         n_logs_with_problems,

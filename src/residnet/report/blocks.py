@@ -10,12 +10,10 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
-from typing import Any, ClassVar, Literal, Protocol, TypeAlias
+from typing import Any, ClassVar, Literal, Protocol, TypeAlias, TypeVar
 
 from residnet.core.format import DASH, format_fixed, format_signed
 
-EXPORTS = "exports.json"
-"""File of a run folder that says what came of each export."""
 CellMark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
 
 
@@ -255,23 +253,32 @@ class Table:
         return "\n".join(line.rstrip() for line in text_lines)
 
 
-Column: TypeAlias = tuple[Any, ...]
+RowT = TypeVar("RowT")
+ColumnValue: TypeAlias = Callable[[RowT], object] | str
+"""The value of a row in a column: a function of the row, or a key of a row that is a mapping (dots
+separate nested keys).
+"""
+ColumnFormat: TypeAlias = int | Callable[[Any], str | Cell]
+"""The format of a value: a number of decimals, or a function that maps the value to text."""
+Column: TypeAlias = (
+    tuple[str, ColumnValue[RowT]]
+    | tuple[str, ColumnValue[RowT], ColumnFormat]
+    | tuple[str, ColumnValue[RowT], ColumnFormat, float]
+)
 """A table column: title, value, format and factor; format and factor are optional.
 
-The value is a key of the row (dots separate nested keys) or a function of the row. The format is a
-number of decimals or a function that maps the value to text. Without a format a `Cell` is used
-unchanged and any other value is converted to text.
+Without a format a `Cell` is used unchanged and any other value is converted to text.
 """
 
 
 def build_table(
-    rows: Iterable[Any],
-    columns: Sequence[Column],
+    rows: Iterable[RowT],
+    columns: Sequence[Column[RowT]],
     *,
     groups: Sequence[tuple[str, int]] = (),
     caption: str = "",
-    is_selected: Callable[[Any], bool] = lambda row: False,
-    group_key: Callable[[Any], Any] | None = None,
+    is_selected: Callable[[RowT], bool] = lambda row: False,
+    group_key: Callable[[RowT], object] | None = None,
 ) -> Table:
     """Build a table with one line for each element of `rows`.
 
@@ -287,10 +294,10 @@ def build_table(
         build_table(rows, [("model", "model"), ("time [s]", "time.mean", 2), ("rms", "rms", 1,
         DEG)])
     """
-    table = Table([title for title, *_ in columns], groups=groups, caption=caption)
-    previous_group: Any = None
+    table = Table([column[0] for column in columns], groups=groups, caption=caption)
+    previous_group: object = None
     for row in rows:
-        label, *cells = [_build_cell(row, *column_format) for _, *column_format in columns]
+        label, *cells = [_build_cell(row, *column[1:]) for column in columns]
         group = group_key(row) if group_key else None
         table.add_row(
             label.text, cells, has_rule=group != previous_group, is_selected=is_selected(row)
@@ -300,12 +307,12 @@ def build_table(
 
 
 def _build_cell(
-    row: Any,
-    key: str | Callable[[Any], Any],
-    formatter: int | Callable[[Any], str | Cell] | None = None,
+    row: RowT,
+    key: ColumnValue[RowT],
+    formatter: ColumnFormat | None = None,
     factor: float = 1.0,
 ) -> Cell:
-    value = key(row) if callable(key) else _get_nested(row, key)
+    value: Any = _get_nested(row, key) if isinstance(key, str) else key(row)
     if formatter is None:
         return value if isinstance(value, Cell) else Cell(str(value), mark="text")
     if value is not None and factor != 1.0:
@@ -314,10 +321,11 @@ def _build_cell(
     return formatted if isinstance(formatted, Cell) else Cell(formatted)
 
 
-def _get_nested(row: Any, keys: str) -> Any:
+def _get_nested(row: object, keys: str) -> object:
+    value = row
     for key in keys.split("."):
-        row = row.get(key) if isinstance(row, Mapping) else None
-    return row
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value
 
 
 def format_paired_interval(bounds: Sequence[float] | None, absent_text: str = DASH) -> Cell:

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from residnet.evaluation.soundness import read_sanity_findings
 from residnet.report.blocks import Section
 from residnet.report.figure import Figure
 from residnet.report.figure_files import read_figures, write_figures
@@ -21,9 +20,8 @@ def _iterate_fit_sections(run: RunFiles) -> Iterator[Section | None]:
     not collapsed.
     """
     folder = run.path / "figures"
-    findings = read_sanity_findings(run.path)
     yield verdict.opening_section(run, read_figures(folder, "track"))
-    yield verdict.cautions_section(run, findings)
+    yield verdict.cautions_section(run)
     yield _figures_section("Error against horizon", folder, "horizon")
     yield free_runs.worst_runs_section(run, read_figures(folder, "free_runs"))
     yield data.quality_section(run)
@@ -36,7 +34,7 @@ def _iterate_fit_sections(run: RunFiles) -> Iterator[Section | None]:
         free_runs.bands_section(run),
         models.goodness_section(run),
         _figures_section("Figures", folder, "(?!(track|horizon|free_runs)$).*"),
-        verdict.sanity_section(run, findings),
+        verdict.sanity_section(run),
     ):
         yield folded_section and replace(folded_section, is_folded=True)
 

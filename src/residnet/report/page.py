@@ -8,20 +8,21 @@ import zlib
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 from markupsafe import Markup, escape
 
 from residnet.core.errors import UsageError
 from residnet.core.files import atomic_write
 from residnet.core.format import format_exponents
+from residnet.core.run_records import ExportRow, ExportsFile, ProvenanceFile
 from residnet.evaluation.verdict import LEVEL_TEXTS
 from residnet.report.blocks import (
-    EXPORTS,
     Block,
     Bullets,
     Cell,
     Code,
+    Column,
     Facts,
     Section,
     build_table,
@@ -30,14 +31,6 @@ from residnet.report.blocks import (
 from residnet.report.browser import InteractiveFigures, render_bokeh
 from residnet.report.figure import Figure
 from residnet.report.run_reader import RunFiles
-
-_PROVENANCE_TITLES = {
-    **{"residnet": "residnet", "git": "git revision", "seed": "seed", "python": "Python"},
-    **{"machine": "machine", "started": "started (UTC)", "seconds": "duration"},
-    **{"packages": "packages", "config": "configuration", "overrides": "overrides"},
-}
-"""Keys of provenance.json that the report shows, with their titles."""
-
 
 _UNIT_SPACE = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
 """The space between a number and its unit."""
@@ -88,7 +81,7 @@ def write_page(
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     files = RunFiles(run)
-    record = files.provenance
+    provenance = files.provenance
     environment = Environment(
         loader=PackageLoader("residnet.report", "templates"),
         autoescape=True,
@@ -105,12 +98,12 @@ def write_page(
         "anchor": lambda title: re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-"),
         "linked": lambda text: glossary.link_words(_break_long_names(str(text))),
     }
-    all_sections = [*sections, *_provenance_sections(run, record)]
+    all_sections = [*sections, *_provenance_sections(run, provenance)]
     text = environment.get_template("page.html.j2").render(
         title=title or files.title,
         description=description or files.description,
-        version=str(record.get("residnet") or ""),
-        date=str(record.get("started") or "")[:10],
+        version="" if provenance is None else provenance.residnet,
+        date="" if provenance is None else provenance.started[:10],
         verdict=[sentence for sentence in verdict if sentence],
         level=level and (level.replace(" ", "-"), LEVEL_TEXTS[level]),
         opening=[section for section in sections if not section.title],
@@ -141,30 +134,35 @@ def exports_section(run: Path) -> Section | None:
     Raises:
         DataError: if exports.json is not readable.
     """
-    rows = RunFiles(run).read_json(EXPORTS).get("exports") or []
-    if not rows:
+    file = ExportsFile.read_optional(run, "exports.json")
+    if file is None or not file.exports:
         return None
-    faults = [f"Not exported: {row['fault']}." for row in rows if row["fault"]]
+    faults = [f"Not exported: {row.fault}." for row in file.exports if row.fault]
 
-    def result(row: Mapping[str, Any]) -> Cell:
-        if row["fault"]:
+    def result(row: ExportRow) -> Cell:
+        if row.fault:
             return flag_cell("not exported", True)
         return Cell("the file gives the model's own answers", mark="text")
 
-    columns = [("model", "model"), ("file", lambda row: row["file"] or ""), ("result", result)]
+    columns: list[Column[ExportRow]] = [
+        ("model", lambda row: row.model),
+        ("file", lambda row: row.file or ""),
+        ("result", result),
+    ]
     blocks: list[Block] = [Bullets(faults, is_warning=True)] if faults else []
-    return Section("Exports for controllers", [*blocks, build_table(rows, columns)])
+    return Section("Exports for controllers", [*blocks, build_table(file.exports, columns)])
 
 
-def _provenance_sections(run: Path, record: Mapping[str, Any]) -> list[Section]:
+def _provenance_sections(run: Path, provenance: ProvenanceFile | None) -> list[Section]:
     """Return the section on provenance and configuration; empty if the folder holds neither."""
     blocks: list[Block] = []
-    if facts := provenance_facts(record):
-        blocks.append(Section("How this run was made", [Facts(facts)], is_folded=True))
-    if inputs := record.get("inputs"):
-        pairs = [(str(name), str(checksum)) for name, checksum in inputs.items()]
-        title = f"SHA-256 of {len(inputs)} input file{'' if len(inputs) == 1 else 's'}"
-        blocks.append(Section(title, [Facts(pairs, is_code=True)], is_folded=True))
+    if provenance is not None:
+        facts = Facts(provenance_facts(provenance))
+        blocks.append(Section("How this run was made", [facts], is_folded=True))
+        if inputs := provenance.inputs:
+            title = f"SHA-256 of {len(inputs)} input file{'' if len(inputs) == 1 else 's'}"
+            checksums = Facts(list(inputs.items()), is_code=True)
+            blocks.append(Section(title, [checksums], is_folded=True))
     resolved = run / "resolved.yaml"
     if resolved.is_file():
         text = resolved.read_text(encoding="utf-8")
@@ -172,17 +170,22 @@ def _provenance_sections(run: Path, record: Mapping[str, Any]) -> list[Section]:
     return [Section("Provenance", blocks)] if blocks else []
 
 
-def provenance_facts(record: Mapping[str, Any]) -> list[tuple[str, str]]:
+def provenance_facts(provenance: ProvenanceFile) -> list[tuple[str, str]]:
     """Return title and text of each entry of `provenance.json` that the report shows."""
-    packages = (record.get("packages") or {}).items()
-    values = {**record, "overrides": " ".join(record.get("overrides") or ())}
-    if (seconds := record.get("seconds")) is not None:
-        values["seconds"] = f"{seconds:.0f} s"
-    values["packages"] = ", ".join(f"{name} {version}" for name, version in packages if version)
-    titled_values = {title: values.get(key) for key, title in _PROVENANCE_TITLES.items()}
-    return [
-        (title, str(value)) for title, value in titled_values.items() if value not in (None, "")
-    ]
+    packages = provenance.packages.items()
+    facts = {
+        "residnet": provenance.residnet,
+        "git revision": provenance.git or "",
+        "seed": str(provenance.seed),
+        "Python": provenance.python,
+        "machine": provenance.machine,
+        "started (UTC)": provenance.started,
+        "duration": f"{provenance.seconds:.0f} s",
+        "packages": ", ".join(f"{name} {version}" for name, version in packages if version),
+        "configuration": provenance.config or "",
+        "overrides": " ".join(provenance.overrides),
+    }
+    return [(title, text) for title, text in facts.items() if text]
 
 
 def _break_long_names(text: str) -> Markup:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -19,22 +19,45 @@ from residnet.core.frames import wrap_angle_array
 from residnet.core.layout import SIX_DOF_LAYOUT, SURGE_SWAY_YAW, DegreesOfFreedom
 from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY, PLANT
 from residnet.core.names import CHANNEL_UNITS, POSE_ERROR_UNITS, to_si
+from residnet.core.records import StoredFile
 from residnet.core.run_loader import read_json_value, require_listed
+from residnet.core.run_records import ProvenanceFile, SummaryFile
 from residnet.core.units import canonical_unit
-from residnet.evaluation.assessment import Assessment
+from residnet.evaluation.assessment import Assessment, CardFinding, name_splits
 from residnet.evaluation.metrics import INPUT_PREFIX, state_column_names
+from residnet.evaluation.records import (
+    BandRow,
+    BandsFile,
+    DataQualityFile,
+    LimitsFile,
+    LogQuality,
+    MetricsFile,
+    MetricsRow,
+    ProtocolLimits,
+    SanityFile,
+    SanityRow,
+    SelectionFile,
+)
 from residnet.evaluation.verdict import order_protocols
+from residnet.identification.records import FitNotes
+from residnet.quality.records import InspectionFile
+from residnet.report.run_settings import (
+    EvaluationSettings,
+    FitRunSettings,
+    ModelSettings,
+    RunSettings,
+    parse_settings,
+    read_settings,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
 JsonObject = Mapping[str, Any]
 """What a JSON object holds."""
+RecordT = TypeVar("RecordT", bound=StoredFile)
 _SPLIT_PRIORITY = ("test", "external", "validation", "train")
 """Splits by how much they say about data that no fit has seen."""
-
-_FINDING_KEYS = ("level", "code", "text", "action")
-"""Keys of a finding in doctor.json that the card of an export repeats."""
 
 
 @dataclass(frozen=True)
@@ -127,13 +150,42 @@ class RunFiles:
         require_listed(self.path, name)
         return read_json_value(path, self.path)
 
-    def read_parquet(self, name: str) -> Any:
+    def read_parquet(self, name: str) -> pd.DataFrame | None:
         """Return a Parquet file of the folder as a data frame; None if it does not exist."""
         path = self.path / name
         if not os.path.lexists(path):
             return None
         require_listed(self.path, name)
         return read_table(path)
+
+    def read_required_parquet(self, name: str) -> pd.DataFrame:
+        """Return a Parquet file of the folder as a data frame.
+
+        Raises:
+            UsageError: if the file does not exist or is not readable.
+        """
+        frame = self.read_parquet(name)
+        return read_table(self.path / name) if frame is None else frame
+
+    def read_record(self, kind: type[RecordT], name: str) -> RecordT | None:
+        """Return the typed contents of a file of the folder; None if it does not exist.
+
+        Args:
+            kind: class of the contents.
+            name: path of the file within the folder.
+
+        Raises:
+            UsageError: if the file cannot be read.
+        """
+        return kind.read_optional(self.path, name)
+
+    def read_required_record(self, kind: type[RecordT], name: str) -> RecordT:
+        """Return the typed contents of a file that every run of a task has.
+
+        Raises:
+            UsageError: if there is no such file, or it cannot be read.
+        """
+        return self.read_record(kind, name) or kind.read(self.path / name, self.path)
 
     def assessment(self, judged: tuple[str, Sequence[str]] | None = None) -> Assessment:
         """Return verdict, data findings and log split of the run for the card of an export.
@@ -145,80 +197,137 @@ class RunFiles:
         Raises:
             DataError: if a file of the run cannot be read.
         """
-        summary = self.read_json("summary.json")
-        inspection = self.read_json("doctor.json")
-        level, verdict = judged or (summary.get("level") or "", summary.get("verdict") or [])
+        if judged is not None:
+            level, verdict = judged
+        else:
+            summary = self.read_record(SummaryFile, "summary.json")
+            level, verdict = ("", ()) if summary is None else (summary.level, summary.verdict)
         findings = None
-        if inspection:
-            logs = [(log["name"], log["findings"]) for log in inspection.get("logs") or []]
-            logs.append(("", inspection.get("together") or []))
-            findings = [
-                {"log": log or None, **{key: row[key] for key in _FINDING_KEYS}}
-                for log, rows in logs
-                for row in rows
-                if row["level"] != "note"
-            ]
-        split: dict[str, list[str]] = {}
-        for entry in self.quality:
-            split.setdefault(str(entry["split"]), []).append(str(entry["log"]))
-        return Assessment(level, tuple(verdict), findings, split or None)
+        if self.inspection is not None:
+            findings = tuple(
+                CardFinding(
+                    log=None if log == "together" else log,
+                    level=finding.level,
+                    code=finding.code,
+                    text=finding.text,
+                    action=finding.action,
+                )
+                for log, finding in self.inspection.named_findings
+                if finding.level != "note"
+            )
+        return Assessment(
+            level=level or None,
+            verdict=tuple(verdict),
+            findings=findings,
+            split=name_splits([(entry.split, entry.log) for entry in self.quality]),
+        )
 
     @cached_property
-    def metrics(self) -> JsonObject:
-        """The contents of metrics.json.
+    def metrics(self) -> MetricsFile:
+        """The contents of metrics.json of a fit.
 
         Raises:
-            UsageError: where the folder holds none.
-            DataError: where it cannot be read.
+            UsageError: if the folder has no such file.
+            DataError: if it cannot be read, or has no rows.
         """
-        path = self.path / "metrics.json"
-        if not path.is_file():
+        metrics = self.read_record(MetricsFile, "metrics.json")
+        if metrics is None:
             raise UsageError(
                 f"{self.path}: no metrics.json here; give the folder of a finished run"
             )
-        content = self.read_json("metrics.json")
-        if not isinstance(content, dict) or not content.get("rows"):
-            raise DataError(f"{path}: holds no rows")
-        return content
+        if not metrics.rows:
+            raise DataError(f"{self.path / 'metrics.json'}: holds no rows")
+        return metrics
 
     @property
-    def rows(self) -> Sequence[JsonObject]:
+    def rows(self) -> Sequence[MetricsRow]:
         """The rows of metrics.json."""
-        rows: Sequence[JsonObject] = self.metrics["rows"]
-        return rows
+        return self.metrics.rows
+
+    @cached_property
+    def task_metrics(self) -> JsonObject:
+        """The contents of metrics.json of a task other than a fit.
+
+        Raises:
+            UsageError: if the folder has no such file.
+            DataError: if it cannot be read, or has no rows.
+        """
+        content: JsonObject = self.read_json("metrics.json")
+        if not content:
+            raise UsageError(
+                f"{self.path}: no metrics.json here; give the folder of a finished run"
+            )
+        if not isinstance(content, dict) or not content.get("rows"):
+            raise DataError(f"{self.path / 'metrics.json'}: holds no rows")
+        return content
 
     @cached_property
     def resolved_config(self) -> JsonObject:
-        """The configuration of the run."""
+        """The configuration of the run with all its keys."""
         path = self.path / "resolved.yaml"
         return load_mapping(path) if path.is_file() else {}
 
     @cached_property
-    def quality(self) -> Sequence[JsonObject]:
-        """What each log holds (data_quality.json)."""
-        return self.read_json("data_quality.json") or []
+    def settings(self) -> RunSettings:
+        """The settings of any task that a page shows."""
+        return read_settings(self.path, RunSettings)
 
     @cached_property
-    def provenance(self) -> JsonObject:
-        """How the run was made (provenance.json)."""
-        provenance: JsonObject = self.read_json("provenance.json")
-        return provenance
+    def fit_settings(self) -> FitRunSettings:
+        """The settings of a fit that its page shows."""
+        return read_settings(self.path, FitRunSettings)
 
     @cached_property
-    def limits(self) -> JsonObject:
-        """What limits the models (limits.json)."""
-        limits: JsonObject = self.read_json("limits.json")
-        return limits
+    def quality(self) -> Sequence[LogQuality]:
+        """The samples of each log (data_quality.json); empty if the file does not exist."""
+        file = self.read_record(DataQualityFile, "data_quality.json")
+        return () if file is None else file.root
+
+    @cached_property
+    def inspection(self) -> InspectionFile | None:
+        """The findings of the data checks (doctor.json); None if the file does not exist."""
+        return self.read_record(InspectionFile, "doctor.json")
+
+    @cached_property
+    def provenance(self) -> ProvenanceFile | None:
+        """How the run was made (provenance.json); None if the file does not exist."""
+        return self.read_record(ProvenanceFile, "provenance.json")
+
+    @cached_property
+    def selection(self) -> SelectionFile | None:
+        """The chosen models and the reason (selection.json); None if the file does not exist."""
+        return self.read_record(SelectionFile, "selection.json")
+
+    @cached_property
+    def limits(self) -> LimitsFile | None:
+        """Where the models fail (limits.json); None if the file does not exist."""
+        return self.read_record(LimitsFile, "limits.json")
+
+    def find_limits(self, protocol: str) -> ProtocolLimits | None:
+        """Return the limits under a protocol of the report split; None if they are unknown."""
+        return None if self.limits is None else self.limits.find(self.report_split, protocol)
+
+    @cached_property
+    def bands(self) -> Mapping[str, Mapping[str, BandRow]]:
+        """Prediction intervals by model and protocol (bands.json); empty without the file."""
+        file = self.read_record(BandsFile, "bands.json")
+        return {} if file is None else file.models
+
+    @cached_property
+    def sanity_findings(self) -> Sequence[SanityRow]:
+        """Results of the physical checks (sanity.json); empty without the file."""
+        file = self.read_record(SanityFile, "sanity.json")
+        return () if file is None else file.findings
 
     @property
     def title(self) -> str:
         """Name of the run, or of its folder if the run has no name."""
-        return str(self.resolved_config.get("name") or self.path.name)
+        return self.settings.name or self.path.name
 
     @property
     def description(self) -> str:
         """Description of the run."""
-        return str(self.resolved_config.get("description") or "")
+        return self.settings.description
 
     @cached_property
     def model_kinds(self) -> dict[str, str]:
@@ -227,23 +336,22 @@ class RunFiles:
 
         Reductions refer to the first baseline; the others are `further` models, judged like heads.
         """
-        kinds = {row["model"]: row.get("kind", "head") for row in self.rows}
+        kinds = {row.model: row.kind for row in self.rows}
         first_baseline = next((model for model, kind in kinds.items() if kind == "baseline"), None)
         return {
             model: "further" if kind == "baseline" and model != first_baseline else kind
             for model, kind in kinds.items()
         }
 
-    @cached_property
-    def selected(self) -> str | None:
-        """The model chosen on validation data, None where none was."""
-        selected_models = [row["model"] for row in self.rows if row.get("selected")]
-        return self.metrics.get("selected") or (selected_models[0] if selected_models else None)
+    @property
+    def selected(self) -> str:
+        """The single model that was chosen on validation data."""
+        return self.metrics.selected
 
-    @cached_property
-    def predictor(self) -> str | None:
-        """Model that is reported first; the selected model by default."""
-        return self.metrics.get("predictor") or self.selected
+    @property
+    def predictor(self) -> str:
+        """The model that is reported first."""
+        return self.metrics.predictor
 
     @cached_property
     def baseline(self) -> str | None:
@@ -276,7 +384,7 @@ class RunFiles:
     @cached_property
     def splits(self) -> list[str]:
         """The splits of the rows, in their order."""
-        return list(dict.fromkeys(row["split"] for row in self.rows))
+        return list(dict.fromkeys(row.split for row in self.rows))
 
     @cached_property
     def report_split(self) -> str:
@@ -293,12 +401,12 @@ class RunFiles:
     @cached_property
     def protocols(self) -> list[str]:
         """The protocols of the rows, the one by which the focus is judged first."""
-        return order_protocols(self.rows, self.report_split, self.evaluation.get("selection", ""))
+        return order_protocols(self.rows, self.report_split, self.evaluation.selection)
 
     @property
     def selection_protocol(self) -> str:
         """The protocol that chose between the models."""
-        return str(self.evaluation.get("selection") or self.protocols[0])
+        return self.evaluation.selection or self.protocols[0]
 
     @cached_property
     def main_protocol(self) -> str:
@@ -306,29 +414,29 @@ class RunFiles:
 
         That which selects comes first.
         """
-        protocol_configs = self.evaluation.get("protocols") or {}
-        fixed_length = [
-            name for name in self.protocols if (protocol_configs.get(name) or {}).get("length")
-        ]
+        fixed_length = [name for name in self.protocols if self._window_length(name)]
         return (fixed_length or self.protocols)[0]
+
+    def _window_length(self, protocol: str) -> float | None:
+        """Return the length of the windows of a protocol in s; None if it has none."""
+        settings = self.evaluation.protocols.get(protocol)
+        return None if settings is None else settings.length
 
     @cached_property
     def horizon_text(self) -> str:
         """When the errors of the main protocol are taken: after so many seconds, or at the end."""
-        length = ((self.evaluation.get("protocols") or {}).get(self.main_protocol) or {}).get(
-            "length"
-        )
+        length = self._window_length(self.main_protocol)
         return f"after {length:g} s" if length else "at the end"
 
     @property
-    def evaluation(self) -> JsonObject:
-        """The section `evaluation` of the configuration."""
-        return self.resolved_config.get("evaluation") or {}
+    def evaluation(self) -> EvaluationSettings:
+        """The settings of the evaluation by free runs."""
+        return self.fit_settings.evaluation
 
     @cached_property
     def channels(self) -> list[str]:
         """The channels that are scored."""
-        return [name for name in self.rows[0]["rmse"] if name != "mean"]
+        return [name for name in self.rows[0].rmse if name != "mean"]
 
     @cached_property
     def dof(self) -> DegreesOfFreedom:
@@ -344,12 +452,8 @@ class RunFiles:
 
     @cached_property
     def pose_errors(self) -> list[str]:
-        """What of `END_UNITS` is scored at the end of free runs."""
-        return [
-            pose_error
-            for pose_error in POSE_ERROR_UNITS
-            if f"{pose_error}_error_end" in self.rows[0]
-        ]
+        """The pose errors that are scored at the end of free runs (`POSE_ERROR_UNITS`)."""
+        return list(self.rows[0].final_pose_errors)
 
     def pose_error_unit(self, pose_error: str) -> tuple[str, str, float]:
         """Return name, unit and the factor to it from SI of an error at the end of free runs."""
@@ -359,14 +463,14 @@ class RunFiles:
 
     def find_row(
         self, model: str | None, split: str, protocol: str, manoeuvre: str = "all"
-    ) -> JsonObject | None:
+    ) -> MetricsRow | None:
         """Return a row of metrics.json; None if it does not exist."""
         key = (model, split, protocol, manoeuvre)
         return next(
             (
                 row
                 for row in self.rows
-                if (row["model"], row["split"], row["protocol"], row.get("manoeuvre", "all")) == key
+                if (row.model, row.split, row.protocol, row.manoeuvre) == key
             ),
             None,
         )
@@ -374,9 +478,7 @@ class RunFiles:
     def manoeuvre_kinds(self, split: str, protocol: str) -> list[str]:
         """Return the kinds and named groups of manoeuvres that have rows, without `all`."""
         names = [
-            row.get("manoeuvre", "all")
-            for row in self.rows
-            if row["split"] == split and row["protocol"] == protocol
+            row.manoeuvre for row in self.rows if row.split == split and row.protocol == protocol
         ]
         return [name for name in dict.fromkeys(names) if name != "all"]
 
@@ -393,9 +495,9 @@ class RunFiles:
 
         This is the unit in the channel map of the log, with degrees instead of radians.
         """
-        reader = (self.resolved_config.get("data") or {}).get("reader") or {}
-        channel_map = (reader.get("channels") or {}).get(channel) or {}
-        if unit := channel_map.get("unit"):
+        data = self.settings.data
+        channels = {} if data is None or data.reader is None else data.reader.channels
+        if channel in channels and (unit := channels[channel].unit):
             unit_name = canonical_unit(unit, CHANNEL_UNITS.get(channel))
             return (
                 display_unit(unit_name)
@@ -406,31 +508,27 @@ class RunFiles:
 
     def si_unit(self, channel: str) -> str:
         """Return the SI unit of a channel, `-` where it is not known."""
-        channel_units = self.metrics.get("channels") or {}
-        return str(channel_units.get(channel) or CHANNEL_UNITS.get(channel, "-"))
+        return self.metrics.channels.get(channel) or CHANNEL_UNITS.get(channel, "-")
 
-    def model_card(self, model: str) -> JsonObject:
-        """Return what models/<model>/model.json holds."""
-        card: JsonObject = self.read_json(f"models/{model}/model.json")
-        return card
+    def model_settings(self, model: str) -> ModelSettings:
+        """Return the description of a model (model.json); defaults if the file does not exist."""
+        name = f"models/{model}/model.json"
+        return parse_settings(self.read_json(name), ModelSettings, self.path / name)
 
-    def fit_notes(self, model: str) -> JsonObject:
-        """Return what models/<model>/fit.json holds."""
-        notes: JsonObject = self.read_json(f"models/{model}/fit.json")
-        return notes
+    def fit_notes(self, model: str) -> FitNotes | None:
+        """Return the notes on the fit of a model (fit.json); None if the file does not exist."""
+        return self.read_record(FitNotes, f"models/{model}/fit.json")
 
     def read_split_windows(self, split: str) -> list[StoredWindow]:
         """Return all stored free runs of a split, in the order of the file names."""
-        manoeuvre_of_log = {
-            make_file_stem(entry["log"]): entry.get("manoeuvre") for entry in self.quality
-        }
+        manoeuvre_of_log = {make_file_stem(entry.log): entry.manoeuvre for entry in self.quality}
         return [
             window
             for path in sorted((self.path / "rollouts" / split).glob("*.parquet"))
             for window in read_windows(
                 read_table(path),
                 path.stem,
-                str(manoeuvre_of_log.get(path.stem) or "unknown"),
+                manoeuvre_of_log.get(path.stem) or "unknown",
                 self.dof,
             )
         ]
@@ -479,7 +577,7 @@ def read_windows(
 
 
 def _band_limits(
-    tables_by_model: Mapping[str, Any], columns: Sequence[str], suffix: str
+    tables_by_model: Mapping[str, pd.DataFrame], columns: Sequence[str], suffix: str
 ) -> dict[str, np.ndarray]:
     """Return the lower or upper band limits [T, 3 + n] of a stored window by model."""
     names = [f"{name}_{suffix}" for name in columns]

@@ -14,21 +14,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from residnet.core.errors import UsageError
 from residnet.core.files import atomic_write, read_json, require_free_space, sha256
 from residnet.core.ownership import RUN_MANIFEST, Manifest
 from residnet.core.run_loader import require_trustworthy
+from residnet.core.run_records import MainFigure, ProvenanceFile, SummaryFile
 from residnet.core.version import __version__
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from residnet.core.records import FileRecord
+    from residnet.core.records import StoredFile
+    from residnet.evaluation.records import MetricsFile
 
 
-SUMMARY_SCHEMA = "residnet.summary/1"
+SUMMARY_SCHEMA: Final = "residnet.summary/1"
 """Schema of summary.json."""
 
 LOG_FILE = "log.txt"
@@ -74,6 +76,10 @@ class RunFolder:
         selection: which model was selected, and why.
         sanity: findings of the physical checks of each model.
         bands: prediction intervals of free runs.
+        inspection: findings of the data checks.
+        currents: estimated currents of the logs.
+        indices: manoeuvring indices of simulated manoeuvres.
+        exports: outcomes of the exports.
     """
 
     def __init__(self, path: Path) -> None:
@@ -97,6 +103,10 @@ class RunFolder:
         self.sanity = path / "sanity.json"
         self.excitation = path / "excitation.json"
         self.bands = path / "bands.json"
+        self.inspection = path / "doctor.json"
+        self.currents = path / "currents.json"
+        self.indices = path / "indices.json"
+        self.exports = path / "exports.json"
 
     @classmethod
     def create(
@@ -214,7 +224,7 @@ class RunFolder:
     @property
     def is_finished(self) -> bool:
         """Whether the run is complete."""
-        return self.summary.is_file() and bool(self.read_summary().get("finished"))
+        return self.summary.is_file() and self.read_summary().finished
 
     def write(self, path: Path, text: str) -> None:
         """Write a text file atomically."""
@@ -225,7 +235,7 @@ class RunFolder:
         """Write a file of standard JSON, without NaN and infinity."""
         self.write(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
-    def write_record(self, path: Path, record: FileRecord) -> None:
+    def write_record(self, path: Path, record: StoredFile) -> None:
         """Write the typed contents of a JSON file."""
         self.write(path, record.to_json_text())
 
@@ -238,41 +248,42 @@ class RunFolder:
         self,
         task: str,
         verdict: Sequence[str],
-        figures: Mapping[str, Mapping[str, Any]],
+        figures: Mapping[str, MainFigure],
         *,
         level: str = "",
         is_finished: bool,
     ) -> None:
         """Write summary.json; `is_finished` marks the run as complete."""
-        content = {
-            "schema": SUMMARY_SCHEMA,
-            "task": task,
-            "finished": is_finished,
-            **({"level": level} if level else {}),
-            "verdict": list(verdict),
-            "figures": {name: dict(figure) for name, figure in figures.items()},
-        }
-        self.write_json(self.summary, content)
+        summary = SummaryFile(
+            schema=SUMMARY_SCHEMA,
+            task=task,
+            finished=is_finished,
+            verdict=tuple(verdict),
+            figures=dict(figures),
+        )
+        if level:
+            # a task without a verdict has no level in the file
+            summary = summary.model_copy(update={"level": level})
+        self.write_record(self.summary, summary)
 
-    def read_summary(self) -> Mapping[str, Any]:
+    def read_summary(self) -> SummaryFile:
         """Return the contents of summary.json.
 
         Raises:
-            UsageError: if the file is not readable.
+            UsageError: if the file is not readable, or a key is missing, unknown or of another
+                type.
         """
-        content = read_json(self.summary)
-        sentences = content.get("verdict")
-        if not isinstance(sentences, list) or not all(isinstance(text, str) for text in sentences):
-            raise UsageError(f"{self.summary}: has no verdict; restore the file, or repeat the run")
-        return content
+        return SummaryFile.read(self.summary)
 
-    def read_metrics(self) -> Mapping[str, Any]:
-        """Return the contents of metrics.json.
+    def read_metrics(self) -> MetricsFile:
+        """Return the contents of metrics.json of a fit.
 
         Raises:
-            UsageError: if there is no such file, or it is not readable.
+            UsageError: if there is no such file, it is not readable, or it is not that of a fit.
         """
-        return read_json(self.metrics)
+        from residnet.evaluation.records import MetricsFile
+
+        return MetricsFile.read(self.metrics)
 
     def read_excitation(self) -> dict[str, Any]:
         """Return the contents of excitation.json; empty for runs of earlier versions."""
@@ -413,10 +424,9 @@ class Provenance:
         """
         if not folder.provenance.is_file():
             return
-        recorded_inputs = read_json(folder.provenance).get("inputs")
-        recorded_checksums = recorded_inputs if isinstance(recorded_inputs, dict) else {}
+        recorded_checksums = ProvenanceFile.read(folder.provenance).inputs
         for path in self.input_paths:
-            if recorded_checksums.get(str(path), "") != sha256(path):
+            if recorded_checksums.get(str(path)) != sha256(path):
                 raise UsageError(
                     f"{path}: has changed since the run in {folder.path} was started; restore"
                     " it, or restart with --overwrite"
@@ -429,21 +439,21 @@ class Provenance:
 
     def write(self, folder: RunFolder) -> None:
         """Write provenance.json, including the time since the start."""
-        content = {
-            "residnet": __version__,
-            "command": sys.argv,
-            "config": None if self.config_path is None else str(self.config_path),
-            "overrides": list(self.overrides),
-            "seed": self.seed,
-            "git": read_git_revision(),
-            "python": platform.python_version(),
-            "machine": f"{platform.system()} {platform.machine()}",
-            "packages": {name: _package_version(name) for name in _RECORDED_PACKAGES},
-            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.start_time)),
-            "seconds": round(time.time() - self.start_time, 1),
-            "inputs": {str(path): sha256(path) for path in self.input_paths},
-        }
-        folder.write_json(folder.provenance, content)
+        provenance = ProvenanceFile(
+            residnet=__version__,
+            command=tuple(sys.argv),
+            config=None if self.config_path is None else str(self.config_path),
+            overrides=tuple(self.overrides),
+            seed=self.seed,
+            git=read_git_revision(),
+            python=platform.python_version(),
+            machine=f"{platform.system()} {platform.machine()}",
+            packages={name: _package_version(name) for name in _RECORDED_PACKAGES},
+            started=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.start_time)),
+            seconds=round(time.time() - self.start_time, 1),
+            inputs={str(path): sha256(path) for path in self.input_paths},
+        )
+        folder.write_record(folder.provenance, provenance)
 
 
 def read_git_revision() -> str | None:

@@ -7,7 +7,6 @@ from typing import Any
 
 from torch import nn
 
-from residnet.core.files import read_json
 from residnet.dynamics.store import Stored, load_model, model_names, read_weights, save_model
 from residnet.evaluation.band import read_bands
 from residnet.identification.fitter import FitStore, FittedModel
@@ -40,11 +39,10 @@ class RunModelStore(FitStore):
             UsageError: if there is no such model, or one of its files has changed.
         """
         verify_checksums(self.folder.models / name)
-        content = read_json(self.folder.bands) if self.folder.bands.is_file() else {}
         return FittedModel(
             *load_model(self.folder.models / name),
             notes=self.folder.read_fit_notes(name),
-            bands=read_bands(content).get(name, {}),
+            bands=read_bands(self.folder.path, name),
         )
 
     def save_module(

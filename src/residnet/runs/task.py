@@ -10,6 +10,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, final
@@ -21,6 +22,7 @@ from residnet.core.errors import DataError, ExportError, ResidnetError, UsageErr
 from residnet.core.files import stage_files
 from residnet.core.names import suggest_name
 from residnet.core.processes import retain_freed_memory
+from residnet.core.run_records import ExportRow, ExportsFile, MainFigure
 from residnet.runs.folder import Provenance, RunFolder, require_apart, write_checksums
 
 if TYPE_CHECKING:
@@ -130,10 +132,10 @@ class SummaryMetric(NamedTuple):
     value: float
     unit: str = "-"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_record(self) -> MainFigure:
         """Return the entry of summary.json; a value that is not finite becomes null."""
         value = float(self.value)
-        return {"value": value if math.isfinite(value) else None, "unit": self.unit}
+        return MainFigure(value=value if math.isfinite(value) else None, unit=self.unit)
 
 
 @dataclass(frozen=True)
@@ -311,20 +313,21 @@ class Task(Config):
             ResidnetError: if the work fails, or its outcome fails a check.
             ExportError: if the run is complete, but a model could not be exported.
         """
-        from residnet.report.blocks import EXPORTS
 
         provenance.write(folder)
         # exports of an earlier run in this folder must not appear in the new report
-        folder.manifest.remove_if_owned(folder.path / EXPORTS)
+        folder.manifest.remove_if_owned(folder.exports)
         with self.reserve_resources():
             outcome = work(folder)
-            summary_fields: Any = {
-                "figures": {
-                    name: figure.to_json() for name, figure in outcome.summary_metrics.items()
+            write_summary = partial(
+                folder.write_summary,
+                self.task,
+                figures={
+                    name: figure.to_record() for name, figure in outcome.summary_metrics.items()
                 },
-                "level": outcome.level,
-            }
-            folder.write_summary(self.task, outcome.verdict, **summary_fields, is_finished=False)
+                level=outcome.level,
+            )
+            write_summary(outcome.verdict, is_finished=False)
             # final version: the report shows it and must be reproducible
             provenance.write(folder)
             verdict = list(outcome.verdict)
@@ -339,9 +342,9 @@ class Task(Config):
                 if outcome.exports:
                     files, export_errors = _write_exports(folder, outcome.exports)
                     verdict += [f"Not exported: {export_error}." for export_error in export_errors]
-                    folder.write_summary(self.task, verdict, **summary_fields, is_finished=False)
+                    write_summary(verdict, is_finished=False)
                     self._write_page(folder, sections, interactive_figures)
-        folder.write_summary(self.task, verdict, **summary_fields, is_finished=True)
+        write_summary(verdict, is_finished=True)
         write_checksums(folder.path)
         if outcome.failure:
             raise DataError(outcome.failure)
@@ -370,10 +373,10 @@ class Task(Config):
             run.path,
             "",
             "",
-            summary["verdict"],
+            summary.verdict,
             [*sections, *([] if exports is None else [exports])],
             interactive_figures,
-            level=str(summary.get("level") or ""),
+            level=summary.level,
         )
 
     @contextmanager
@@ -455,7 +458,6 @@ def _write_exports(
 
     If one model cannot be exported, the other exports and the run still complete.
     """
-    from residnet.report.blocks import EXPORTS
 
     files = list[Path]()
     errors = list[ResidnetError]()
@@ -465,12 +467,14 @@ def _write_exports(
             file = write_export()
         except ResidnetError as error:
             errors.append(error)
-            rows.append({"model": name, "file": None, "fault": str(error)})
+            rows.append(ExportRow(model=name, file=None, fault=str(error)))
         else:
             files.append(file)
             relative_path = (
                 file.relative_to(folder.path) if file.is_relative_to(folder.path) else file
             )
-            rows.append({"model": name, "file": relative_path.as_posix(), "fault": None})
-    folder.write_json(folder.path / EXPORTS, {"schema": "residnet.exports/1", "exports": rows})
+            rows.append(ExportRow(model=name, file=relative_path.as_posix(), fault=None))
+    folder.write_record(
+        folder.exports, ExportsFile(schema="residnet.exports/1", exports=tuple(rows))
+    )
     return files, errors

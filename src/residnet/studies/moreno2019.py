@@ -119,7 +119,10 @@ def sections(files: RunFiles) -> list[Section]:
         " paired by sample, with 95 % intervals. Negative values: joint tuning is better.",
     )
     folder = files.path / "figures" / "moreno2019"
-    figures = [_record_figure(records["test"]), *grid_figures(files.fit_notes("rbf_joint"))]
+    figures = [
+        _record_figure(records["test"]),
+        *grid_figures(files.read_json("models/rbf_joint/fit.json")),
+    ]
     blocks: list[Block] = [
         errors,
         changes,
@@ -139,7 +142,9 @@ def sections(files: RunFiles) -> list[Section]:
     return [Section("Document 001 (Moreno-Salinas et al. 2019)", blocks)]
 
 
-def _velocity_column(title: str, axis: int, factor: float, decimals: int) -> Column:
+def _velocity_column(
+    title: str, axis: int, factor: float, decimals: int
+) -> Column[Mapping[str, Any]]:
     """Return a column of a velocity, with its interval and the published value as notes."""
     name = list(_AXES)[axis]
 

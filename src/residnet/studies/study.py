@@ -86,7 +86,7 @@ def published_cell(value: float | None, published: float | None, digits: int = 4
 
 def comparison_columns(
     key: str, titles: str | Sequence[str], digits: int = 4, factor: float = 1.0
-) -> list[Column]:
+) -> list[Column[Any]]:
     """Return table columns with computed and published numbers.
 
     Args:

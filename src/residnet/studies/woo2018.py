@@ -122,9 +122,7 @@ def error_changes(files: RunFiles, model: str) -> dict[str, float | None]:
     changes: dict[str, float | None] = {}
     for channel, group in _MANOEUVRE_GROUPS.items():
         rows = [files.find_row(name, "test", PROTOCOL, group) for name in ("baseline", model)]
-        baseline_error, model_error = (
-            None if row is None else row["rmse"][channel] for row in rows
-        )
+        baseline_error, model_error = (None if row is None else row.rmse[channel] for row in rows)
         changes[channel] = (
             None
             if baseline_error is None or model_error is None
@@ -135,7 +133,8 @@ def error_changes(files: RunFiles, model: str) -> dict[str, float | None]:
 
 def steady_state_table(files: RunFiles) -> Table:
     """Return the constraints (32) of the linear model with intervals, next to Table 1."""
-    constraints = files.fit_notes("baseline")["steady_constraints"]
+    notes = files.fit_notes("baseline")
+    assert notes is not None, "a finished fit has notes on its baseline"
     published_constraints = load_published("woo2018")["steady"]
     table = Table(
         ["steady state", "Phi", "95 % interval", "bias", "95 % interval", "unit"],
@@ -145,11 +144,17 @@ def steady_state_table(files: RunFiles) -> Table:
     )
     for state, (_, _, unit, factor) in _CHANNELS.items():
         cells: list[Any] = []
-        for key, number in zip(("phi", "bias"), published_constraints[state], strict=True):
-            value = constraints[state][key]
-            error = 1.96 * constraints[state][f"{key}_error"]
+        constraint = notes.steady_constraints[state]
+        estimates = (
+            (constraint.phi, constraint.phi_error),
+            (constraint.bias, constraint.bias_error),
+        )
+        for (value, standard_error), number in zip(
+            estimates, published_constraints[state], strict=True
+        ):
+            error = 1.96 * standard_error
             cells.append(published_cell(factor * value, number, 3))
-            cells.append(format_interval([value - error, value + error], factor, 3))
+            cells.append(format_interval((value - error, value + error), factor, 3))
         force, measure = _DRIVING_FORCES[state]
         table.add_row(f"{state} over {force}", [*cells, f"{unit} per {measure}; {unit}"])
     return table
@@ -175,14 +180,15 @@ def build_figures(files: RunFiles) -> list[Figure]:
     ]
     steering_curves = [(zigzag, "v"), (zigzag, "r"), (step_test, "v"), (step_test, "r")]
     notes = files.fit_notes("baseline")
-    states = notes["steady_states"]
+    assert notes is not None, "a finished fit has notes on its baseline"
+    states = notes.steady_states
     panels_and_traces = []
     for state, (_, _, unit, factor) in _CHANNELS.items():
         (force, measure) = _DRIVING_FORCES[state]
-        constraint = notes["steady_constraints"][state]
+        constraint = notes.steady_constraints[state]
         tau = np.array(states[force])
         force_limits = np.array([tau.min(), tau.max()])
-        fitted_line = factor * (constraint["phi"] * force_limits + constraint["bias"])
+        fitted_line = factor * (constraint.phi * force_limits + constraint.bias)
         traces = {
             "points": (tau, factor * np.array(states[state])),
             "line": (force_limits, fitted_line),
@@ -320,12 +326,13 @@ def _error_figure(
         for offset, split in ((-0.2, "train"), (0.2, "test")):
             rows = [files.find_row(model, split, PROTOCOL, group) for model in models]
             positions = np.arange(len(models)) + offset
-            values = [factor * row["rmse"][channel] if row else np.nan for row in rows]
+            values = [factor * row.rmse[channel] if row else np.nan for row in rows]
             bar_traces[split] = bar_outlines(positions, values, 0.38)
             # there is no interval for too few manoeuvres
             for position, row in zip(positions, rows, strict=True):
-                if row and row["rmse_ci95"][channel]:
-                    lower, upper = row["rmse_ci95"][channel]
+                interval = None if row is None else row.rmse_ci95[channel]
+                if interval is not None:
+                    lower, upper = interval
                     interval_limits.append((position, factor * lower, factor * upper))
         bar_traces["ci95"] = (
             error_bars(*zip(*interval_limits, strict=True))
@@ -334,7 +341,7 @@ def _error_figure(
         )
         noise = files.find_row("plant", "test", PROTOCOL, group)
         if noise:
-            bar_traces["noise"] = (np.zeros(1), np.array([factor * noise["rmse"][channel]]))
+            bar_traces["noise"] = (np.zeros(1), np.array([factor * noise.rmse[channel]]))
         reference = np.array([window.rmse_by_channel("baseline")[column] for window in windows])
         point_traces: dict[str, Curve] = {"one": (np.zeros(1), np.ones(1))}
         medians: list[tuple[float, float]] = []

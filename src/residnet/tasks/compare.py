@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -14,6 +14,7 @@ from residnet.core.errors import UsageError
 from residnet.core.format import format_number, format_signed
 from residnet.core.ownership import record_folder
 from residnet.evaluation.metrics import make_resampling_blocks, paired_difference
+from residnet.evaluation.records import PairedDifference
 from residnet.report.blocks import Block, Cell, Section, Table, build_table, format_paired_interval
 from residnet.report.figure import MAX_PREVIEW_HEIGHT, Case, Figure, Panel, style_family
 from residnet.report.figure_files import write_figure
@@ -42,7 +43,8 @@ class EvaluatedRun(RunFiles):
         super().__init__(RunFolder.open(path).path)
         if not (path / "metrics.json").is_file():
             raise UsageError(f"{path}: has no metrics.json; runs of fits can be compared")
-        self.name, self.model = name, str(self.metrics["selected"])
+        self.name = name
+        self.model = self.metrics.selected
 
     @cached_property
     def windows_by_key(self) -> dict[WindowKey, StoredWindow]:
@@ -152,17 +154,31 @@ def _common_windows(runs: Sequence[EvaluatedRun]) -> dict[str, list[WindowKey]]:
     return windows_by_protocol
 
 
-def compare_paired(runs: Sequence[EvaluatedRun]) -> dict[str, dict[str, Any]]:
+class RunComparison(NamedTuple):
+    """The error of the selected model of one run over the common windows of one protocol.
+
+    Attributes:
+        windows: number of windows.
+        nrmse: mean error.
+        difference: paired difference to the first run.
+    """
+
+    windows: int
+    nrmse: float
+    difference: PairedDifference
+
+
+def compare_paired(runs: Sequence[EvaluatedRun]) -> dict[str, dict[str, RunComparison]]:
     """Compute paired differences to the first run over common windows.
 
     Errors are normalised root mean square errors (NRMSE), averaged over the velocities of all runs,
     with the scales of the first run.
 
     Returns:
-        By protocol and run: number of windows, mean error, difference and its 95 % interval.
+        The comparisons by protocol and run.
     """
-    comparisons: dict[str, dict[str, Any]] = {}
-    scales = {str(name): float(scale) for name, scale in _reference_scales(runs).items()}
+    comparisons: dict[str, dict[str, RunComparison]] = {}
+    scales = _reference_scales(runs)
     for protocol, windows in _common_windows(runs).items():
         errors = [
             np.array(
@@ -173,57 +189,67 @@ def compare_paired(runs: Sequence[EvaluatedRun]) -> dict[str, dict[str, Any]]:
         logs = list(dict.fromkeys(window[0] for window in windows))
         bootstrap_blocks = make_resampling_blocks([logs.index(window[0]) for window in windows])
         comparisons[protocol] = {
-            run.name: {
-                "windows": len(windows),
-                "mean": float(run_errors.mean()),
-                **paired_difference(run_errors, errors[0], runs[0].name, bootstrap_blocks),
-            }
+            run.name: RunComparison(
+                len(windows),
+                float(run_errors.mean()),
+                paired_difference(run_errors, errors[0], runs[0].name, bootstrap_blocks),
+            )
             for run, run_errors in zip(runs, errors, strict=True)
         }
     return comparisons
 
 
-def _reference_scales(runs: Sequence[EvaluatedRun]) -> pd.Series:
+def _reference_scales(runs: Sequence[EvaluatedRun]) -> dict[str, float]:
     """Return the scales of the first run for the common velocities."""
-    return pd.Series(runs[0].metrics["scales"], dtype=float)[common_channels(runs)]
+    return {name: runs[0].metrics.scales[name] for name in common_channels(runs)}
+
+
+class _PairedRow(NamedTuple):
+    """A line of the table of comparisons."""
+
+    run: EvaluatedRun
+    protocol: str
+    comparison: RunComparison
 
 
 def _build_paired_table(
-    runs: Sequence[EvaluatedRun], comparisons: Mapping[str, Mapping[str, Any]]
+    runs: Sequence[EvaluatedRun], comparisons: Mapping[str, Mapping[str, RunComparison]]
 ) -> Table:
     reference_name = runs[0].name
     rows = [
-        {**entries[run.name], "run": run.name, "model": run.model, "protocol": protocol}
+        _PairedRow(run, protocol, entries[run.name])
         for protocol, entries in comparisons.items()
         for run in runs
     ]
     lowest_error = {
-        protocol: min(entry["mean"] for entry in entries.values())
+        protocol: min(entry.nrmse for entry in entries.values())
         for protocol, entries in comparisons.items()
     }
 
-    def format_difference(row: Mapping[str, Any]) -> str:
-        return "" if row["run"] == reference_name else format_signed(row["nrmse_mean"])
+    def format_difference(row: _PairedRow) -> str:
+        is_reference = row.run.name == reference_name
+        return "" if is_reference else format_signed(row.comparison.difference.nrmse_mean)
 
-    def format_interval(row: Mapping[str, Any]) -> Cell:
-        is_reference = row["run"] == reference_name
-        return Cell("") if is_reference else format_paired_interval(row["ci95"], "too few logs")
+    def format_interval(row: _PairedRow) -> Cell:
+        is_reference = row.run.name == reference_name
+        interval = row.comparison.difference.ci95
+        return Cell("") if is_reference else format_paired_interval(interval, "too few logs")
 
     return build_table(
         rows,
         [
-            ("run", "run"),
-            ("model", "model"),
-            ("protocol", "protocol"),
-            ("windows", "windows", str),
-            ("NRMSE [-]", "mean", format_number),
+            ("run", lambda row: row.run.name),
+            ("model", lambda row: row.run.model),
+            ("protocol", lambda row: row.protocol),
+            ("windows", lambda row: row.comparison.windows, str),
+            ("NRMSE [-]", lambda row: row.comparison.nrmse, format_number),
             ("difference", format_difference, str),
             ("95 % interval", format_interval),
         ],
         caption="Selected models over the windows that all runs evaluated, with the scales of"
         f" {reference_name}; differences to {reference_name}, negative where the run is better.",
-        is_selected=lambda row: row["mean"] == lowest_error[row["protocol"]],
-        group_key=lambda row: row["protocol"],
+        is_selected=lambda row: row.comparison.nrmse == lowest_error[row.protocol],
+        group_key=lambda row: row.protocol,
     )
 
 
@@ -265,27 +291,27 @@ def _summarize_value(value: Any) -> str:
 
 
 def _write_conclusion(
-    runs: Sequence[EvaluatedRun], comparisons: Mapping[str, Mapping[str, Any]]
+    runs: Sequence[EvaluatedRun], comparisons: Mapping[str, Mapping[str, RunComparison]]
 ) -> str:
     if not comparisons:
         return "The runs have no common window: their errors cannot be compared in pairs."
     protocol, entries = next(iter(comparisons.items()))
-    best_run = min(runs, key=lambda run: float(entries[run.name]["mean"]))
+    best_run = min(runs, key=lambda run: entries[run.name].nrmse)
     if best_run is runs[0]:
         return f"Over the common windows of {protocol}, no run is better than {best_run.name}."
     entry = entries[best_run.name]
-    certainty = " (significant)." if entry["excludes_zero"] else " (not significant)."
+    certainty = " (significant)." if entry.difference.excludes_zero else " (not significant)."
     return (
-        f"Over {entry['windows']} common windows of {protocol}, {best_run.name}"
+        f"Over {entry.windows} common windows of {protocol}, {best_run.name}"
         f" ({best_run.model}) has"
-        f" the lowest error: {entry['nrmse_mean']:+.3f} against {runs[0].name}{certainty}"
+        f" the lowest error: {entry.difference.nrmse_mean:+.3f} against {runs[0].name}{certainty}"
     )
 
 
 def _plot_error_growth(runs: Sequence[EvaluatedRun], output_folder: Path) -> Block:
     """Plot the growth of the errors of the selected models over the common windows."""
     protocol, windows = next(iter(_common_windows(runs).items()))
-    scales = _reference_scales(runs)
+    scales = pd.Series(_reference_scales(runs))
     error_curves = {}
     for run in runs:
         error = (

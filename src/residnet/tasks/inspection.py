@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +27,7 @@ from residnet.quality import (
     inspect_log_set,
     summarize_inspection,
 )
+from residnet.quality.records import InspectionFile, Level
 
 if TYPE_CHECKING:
     from residnet.tasks.fit.config import FitConfig
@@ -42,16 +42,16 @@ class InspectionResult:
 
     Attributes:
         text: text for the terminal.
-        content: content of the JSON file (schema residnet.inspection/1).
+        inspection: contents of the JSON file.
     """
 
     text: str
-    content: Mapping[str, Any]
+    inspection: InspectionFile
 
     @property
     def has_problems(self) -> bool:
         """Whether the findings would mislead a fit to these logs."""
-        return bool(self.content["misled"])
+        return self.inspection.misled
 
     def write(self, file: Path) -> None:
         """Write the findings as JSON.
@@ -60,7 +60,7 @@ class InspectionResult:
             UsageError: if the file cannot be written.
         """
         with write_owned(file) as temporary_path:
-            temporary_path.write_text(json.dumps(self.content, indent=1) + "\n")
+            temporary_path.write_text(self.inspection.to_json_text(), encoding="utf-8")
 
 
 def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult:
@@ -136,10 +136,9 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
         if not quality_report_of_log.find_by_code("unreadable")
         for line in quality_report_of_log.to_lines()
     ]
-    content = build_inspection(reports, joint_report)
-    return InspectionResult(
-        "\n".join((*summarize_inspection(content).sentences, *lines, *channel_map_lines)), content
-    )
+    inspection = build_inspection(reports, joint_report)
+    sentences = summarize_inspection(inspection).sentences
+    return InspectionResult("\n".join((*sentences, *lines, *channel_map_lines)), inspection)
 
 
 def _read_drafted_results(
@@ -257,6 +256,6 @@ def _check_regressor_conditioning(logs: Sequence[Log], fit_config: FitConfig) ->
         )
         conditioning_figures = {"condition": condition, "regressors": len(varying_indices)}
         # one or two logs are inspected, but not fitted: other logs may excite the regressors
-        level: Any = "will mislead" if is_ill_conditioned and len(logs) > 2 else "note"
+        level: Level = "will mislead" if is_ill_conditioned and len(logs) > 2 else "note"
         findings.append(Finding(level, "regressors", text, conditioning_figures, action))
     return findings

@@ -8,9 +8,9 @@ the module `execute` beside it (`residnet.runs.task.PackageTask`).
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from residnet.baselines import BaselineConfig
 from residnet.core.config import load_config, load_mapping
@@ -18,7 +18,6 @@ from residnet.core.errors import ConfigError, ResidnetError, UsageError
 from residnet.core.files import (
     find_config_folder,
     find_shipped_configs,
-    read_json,
     require_free_space,
 )
 from residnet.core.names import suggest_name
@@ -33,12 +32,17 @@ from residnet.core.registry import (
     list_parts,
 )
 from residnet.core.run_loader import SIZE_LIMITS, name_damaged_key
+from residnet.core.run_records import SummaryFile
 from residnet.export import EXPORT_FORMATS
 from residnet.heads import HeadConfig
 from residnet.io.readers import ReaderConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.runs.folder import RunFolder, require_recorded, write_checksums
 from residnet.runs.task import Task
+
+if TYPE_CHECKING:
+    from residnet.report.blocks import Column
+    from residnet.report.records import RunRow
 
 _TASK_BASE = "residnet.runs.task:Task"
 SINGLE_TASKS = {
@@ -183,12 +187,8 @@ def _vessel_description(name: str, file: Path) -> str:
         return f"(cannot be used: {error})"
 
 
-def list_runs(folder: Path) -> list[dict[str, Any]]:
+def list_runs(folder: Path) -> list[RunRow]:
     """Describe the runs below a folder, the newest first.
-
-    Returns:
-        One entry for each run: run, task, state (`finished`, `unfinished` or `damaged`), best
-        (name, value and unit of its first main figure, or None) and age in s.
 
     Raises:
         UsageError: if the folder does not exist.
@@ -198,49 +198,55 @@ def list_runs(folder: Path) -> list[dict[str, Any]]:
             f"{folder}: no such folder; runs are in the folder runs unless --out was given"
         )
     entries = [_describe_run(file.parent) for file in folder.rglob("resolved.yaml")]
-    return sorted(entries, key=lambda entry: float(entry["age"]))
+    return sorted(entries, key=lambda entry: entry.age)
 
 
-def format_runs(folder: Path, entries: Sequence[Mapping[str, Any]]) -> str:
+def format_runs(folder: Path, entries: Sequence[RunRow]) -> str:
     """Format the list of runs as a table for the terminal."""
+    # reading a config does not import the report
     from residnet.report.blocks import build_table
 
     if not entries:
         return f"{folder}: no runs"
 
-    def format_best(entry: Mapping[str, Any]) -> str:
-        if (figure := entry["best"]) is None:
+    def format_best(entry: RunRow) -> str:
+        if entry.best is None:
             return ""
-        value = "not finite" if figure["value"] is None else f"{figure['value']:.4g}"
-        return f"{figure['name']} {value} {figure['unit']}".removesuffix(" -")
+        value = "not finite" if entry.best.value is None else f"{entry.best.value:.4g}"
+        return f"{entry.best.name} {value} {entry.best.unit}".removesuffix(" -")
 
-    columns = [
-        *((key, key) for key in ("run", "task", "state")),
+    columns: list[Column[RunRow]] = [
+        ("run", lambda entry: entry.run),
+        ("task", lambda entry: entry.task),
+        ("state", lambda entry: entry.state),
         ("best", format_best),
         ("age", _format_age),
     ]
     return build_table(entries, columns).to_text()
 
 
-def _format_age(entry: Mapping[str, Any]) -> str:
-    unit, unit_seconds = next(
-        (pair for pair in _AGE_UNITS if entry["age"] >= pair[1]), _AGE_UNITS[-1]
-    )
-    return f"{entry['age'] / unit_seconds:.0f} {unit}"
+def _format_age(entry: RunRow) -> str:
+    unit, unit_seconds = next((pair for pair in _AGE_UNITS if entry.age >= pair[1]), _AGE_UNITS[-1])
+    return f"{entry.age / unit_seconds:.0f} {unit}"
 
 
-def _describe_run(folder: Path) -> dict[str, Any]:
-    entry: dict[str, Any] = {"run": str(folder), "task": "unknown", "state": "unfinished"}
-    entry |= {"best": None, "age": time.time() - (folder / "resolved.yaml").stat().st_mtime}
+def _describe_run(folder: Path) -> RunRow:
+    from residnet.report.records import RunFigure, RunRow
+
+    config = folder / "resolved.yaml"
+    row = RunRow(run=str(folder), age=time.time() - config.stat().st_mtime)
     try:
-        require_regular(folder / "resolved.yaml", SIZE_LIMITS[".yaml"])
-        entry["task"] = str(load_mapping(folder / "resolved.yaml").get("task", "unknown"))
+        require_regular(config, SIZE_LIMITS[".yaml"])
+        task = str(load_mapping(config).get("task", "unknown"))
+        row = row.model_copy(update={"task": task})
         if not (folder / "summary.json").is_file():
-            return entry
-        content = read_json(folder / "summary.json")
-        entry["state"] = "finished" if content.get("finished") else "unfinished"
-        for name, figure in list((content.get("figures") or {}).items())[:1]:
-            entry["best"] = {"name": name, "value": figure["value"], "unit": figure["unit"]}
-    except (UsageError, ValueError, AttributeError, KeyError, TypeError, OSError):
-        return {**entry, "state": "damaged"}
-    return entry
+            return row
+        summary = SummaryFile.read(folder / "summary.json")
+    except (ResidnetError, ValueError, AttributeError, OSError):
+        return row.model_copy(update={"state": "damaged"})
+    figures = [
+        RunFigure(name=name, value=figure.value, unit=figure.unit)
+        for name, figure in summary.figures.items()
+    ]
+    state = "finished" if summary.finished else "unfinished"
+    return row.model_copy(update={"state": state, "best": next(iter(figures), None)})

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from residnet.core.errors import FitError
 from residnet.core.layout import HEADING, POSITION, VELOCITIES, YAW_RATE
 from residnet.physics.signals import Signals
 from residnet.preprocessing.prepare import PreparedLog
+from residnet.training.records import CurrentRow
 
 if TYPE_CHECKING:
     from residnet.training.current_config import CurrentConfig
@@ -38,7 +39,7 @@ def estimate_currents(
     logs: Sequence[PreparedLog],
     config: CurrentConfig,
     others: Sequence[PreparedLog] = (),
-) -> tuple[np.ndarray, list[dict[str, Any]]]:
+) -> tuple[np.ndarray, list[CurrentRow]]:
     """Return currents to north and east [L + K, 2] in m/s of logs over ground, and their table.
 
     The baseline provides the regressors; its own coefficients are not changed. Standard errors of
@@ -83,13 +84,13 @@ def estimate_currents(
         current = torch.cat((current, other_current))
         error = torch.cat((error, other_error))
     rows = [
-        {
-            "log": p.log.name,
-            "fitted": i < len(logs),
-            "current_north": float(c[0]),
-            "current_east": float(c[1]),
-            "standard_error": (birge_ratio * e).tolist(),
-        }
+        CurrentRow(
+            log=p.log.name,
+            fitted=i < len(logs),
+            current_north=float(c[0]),
+            current_east=float(c[1]),
+            standard_error=(birge_ratio * e).tolist(),
+        )
         for i, (p, c, e) in enumerate(zip((*logs, *others), current, error, strict=True))
     ]
     return current.numpy(), rows

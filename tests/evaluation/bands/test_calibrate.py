@@ -121,7 +121,7 @@ def test_a_roll_has_bands_of_its_own(band: Band) -> None:
         found.unconditional_width[:, :5], band.unconditional_width, rtol=0.05
     )
     run = rolling(runs(1, 1, 5))[0]
-    again = Band.from_json(found.to_json())
+    again = Band.from_record(found.to_record())
     np.testing.assert_allclose(again.half_widths(run.states), found.half_widths(run.states))
     np.testing.assert_allclose(again.simultaneous_factor, found.simultaneous_factor)
     low, high = band_limits(run.states, run.half_widths(found))
@@ -173,5 +173,5 @@ def test_a_band_widens_where_unlike_models_lie_farther_apart_than_usual() -> Non
     assert share(plain, beyond) < 0.5
     assert 0.86 < share(band, beyond) < 0.94
     assert 0.89 < share(band, of_unlike_models(400, 0.02, 2)) < 0.92
-    again = Band.from_json(band.to_json())
+    again = Band.from_record(band.to_record())
     np.testing.assert_allclose(beyond[0].half_widths(again), beyond[0].half_widths(band))

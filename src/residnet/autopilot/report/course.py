@@ -52,8 +52,8 @@ _PANELS = (
 
 
 def _iterate_course_figures(run: RunFiles) -> Iterator[Figure]:
-    tracks = run.read_parquet(TRACKS_FILE)
-    plans = run.read_parquet(COURSES_FILE)
+    tracks = run.read_required_parquet(TRACKS_FILE)
+    plans = run.read_required_parquet(COURSES_FILE)
     spread_runs = run.read_parquet(SPREAD_FILE)
     styles = _run_styles(tracks, "controller")
     yield Figure(
@@ -110,7 +110,7 @@ def _run_styles(runs: Any, column: str) -> dict[str, GlyphStyle]:
 def _circle_radii(run: RunFiles) -> dict[str, list[float]]:
     """Return the radii in m of the buoys' circles by protocol."""
     course = run.resolved_config["course"]
-    min_radius = run.metrics["smallest"]["radius"]
+    min_radius = run.task_metrics["smallest"]["radius"]
     return {
         protocol: [
             course["acceptance"] if protocol == "enter" else max(buoy["radius"], min_radius)
@@ -130,7 +130,7 @@ def _protocol_case(
         (x + r * np.sin(angle), y + r * np.cos(angle))
         for x, y, r in zip(east, north, radii, strict=True)
     ]
-    limit = DEGREES_PER_RADIAN * np.array([-1.0, 1.0]) * run.metrics["rudder"]
+    limit = DEGREES_PER_RADIAN * np.array([-1.0, 1.0]) * run.task_metrics["rudder"]
     track: dict[str, Curve] = {
         "plan": (plan["east"].to_numpy(float), plan["north"].to_numpy(float)),
         "circles": join_with_gaps(circles),
@@ -239,7 +239,9 @@ def sections(run: RunFiles) -> list[Section]:
     """
     write_figures(run.path / "figures", _iterate_course_figures(run))
     sections_written: list[Section] = []
-    for protocol, (nominal_rows, spread_rows) in _rows_by_protocol(run.rows).items():
+    for protocol, (nominal_rows, spread_rows) in _rows_by_protocol(
+        run.task_metrics["rows"]
+    ).items():
         nominal_results = nominal_table(nominal_rows)
         blocks: list[Block] = [Text(_rule_text(nominal_rows)), nominal_results]
         if not sections_written:
@@ -285,7 +287,7 @@ def nominal_table(rows: Sequence[JsonObject]) -> Table:
     def count_column(key: str) -> Any:
         return lambda row: flag_cell(f"{row[key]} of {row['n']}", row[key] != row["n"])
 
-    passing_columns: list[Column] = [
+    passing_columns: list[Column[JsonObject]] = [
         ("on its side", count_column("right_side")),
         ("clear", count_column("clear")),
     ]
@@ -336,8 +338,8 @@ def _is_policy_on_course(row: JsonObject) -> bool:
 
 
 def _course_definitions(run: RunFiles) -> list[str]:
-    metrics = run.metrics
-    steady_turn = run.metrics["smallest"]
+    metrics = run.task_metrics
+    steady_turn = run.task_metrics["smallest"]
     tight_buoys = [
         f"buoy {entry['buoy']} ({format_number(entry['radius'], 4)} m)"
         for entry in metrics["feasibility"]

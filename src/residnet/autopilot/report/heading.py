@@ -54,7 +54,7 @@ _DEPTH_WORDS = AxisWords("depth", "m", 1.0, "pitch rate", "stern planes", ("z", 
 
 def _config_as_run(run: RunFiles) -> Mapping[str, Any]:
     """Return the config with the simulated times, scaled by its pace."""
-    return {**run.resolved_config, **run.metrics.get("flown", {})}
+    return {**run.resolved_config, **run.task_metrics.get("flown", {})}
 
 
 def axis_words(test: Mapping[str, Any]) -> AxisWords:
@@ -83,20 +83,32 @@ _KIND_LABELS = {
 
 def _iterate_autopilot_figures(run: RunFiles) -> Iterator[Figure]:
     conditioned_kinds = {
-        row["model"]: row["kind"] for row in run.rows if row["protocol"] == "conditions"
+        row["model"]: row["kind"]
+        for row in run.task_metrics["rows"]
+        if row["protocol"] == "conditions"
     }
-    nominal_kinds = {row["model"]: row["kind"] for row in run.rows if row["protocol"] == "nominal"}
+    nominal_kinds = {
+        row["model"]: row["kind"]
+        for row in run.task_metrics["rows"]
+        if row["protocol"] == "nominal"
+    }
     yield _response_figure(
-        run.read_parquet(RESPONSES_FILE), nominal_kinds, _config_as_run(run)["test"], run.title
+        run.read_required_parquet(RESPONSES_FILE),
+        nominal_kinds,
+        _config_as_run(run)["test"],
+        run.title,
     )
     axis_labels = axis_words(_config_as_run(run)["test"])
     yield _distribution_figure(
-        run.read_parquet(VESSELS_FILE), nominal_kinds, run.title, axis_labels
+        run.read_required_parquet(VESSELS_FILE), nominal_kinds, run.title, axis_labels
     )
     conditioned = run.read_parquet(CONDITIONS_FILE)
     if conditioned is not None:
         yield _cost_figure(conditioned, conditioned_kinds, run.title, axis_labels)
-    fit_notes = {name: run.fit_notes(name) for name in run.resolved_config.get("policies") or {}}
+    fit_notes = {
+        name: run.read_json(f"models/{name}/fit.json")
+        for name in run.resolved_config.get("policies") or {}
+    }
     if fit_notes:
         yield _learning_figure(fit_notes, run.title)
 
@@ -309,9 +321,11 @@ def sections(run: RunFiles) -> list[Section]:
     write_figures(run.path / "figures", _iterate_autopilot_figures(run))
     test = _config_as_run(run)["test"]
     axis_labels = axis_words(test)
-    settling_comparison = settling_table(run.rows, run.metrics.get("floor"), axis_labels)
+    settling_comparison = settling_table(
+        run.task_metrics["rows"], run.task_metrics.get("floor"), axis_labels
+    )
     conditions = _config_as_run(run).get("conditions")
-    costs = cost_table(run.rows, axis_labels) if conditions else None
+    costs = cost_table(run.task_metrics["rows"], axis_labels) if conditions else None
     previews = [figure.preview() for figure in read_figures(run.path / "figures", "responses")]
     # settling of the nominal vessel and of the spread, or the cost of a change
     opening_table = (
@@ -328,13 +342,16 @@ def sections(run: RunFiles) -> list[Section]:
         ),
         Section(
             "Effort",
-            [effort_table(run.rows, axis_labels), Text(_effort_text(test), is_secondary=True)],
+            [
+                effort_table(run.task_metrics["rows"], axis_labels),
+                Text(_effort_text(test), is_secondary=True),
+            ],
         ),
         *figures_section(run.path / "figures"),
     ]
     if costs is not None and conditions:
         blocks: list[Block] = [costs, Text(_conditions_text(conditions), is_secondary=True)]
-        extrapolation = extrapolation_table(run.rows)
+        extrapolation = extrapolation_table(run.task_metrics["rows"])
         if extrapolation is not None:
             blocks += [Text(["Outside the conditions of tuning and training:"]), extrapolation]
         sections_written.insert(1, Section("Under the stated conditions", blocks))
@@ -376,7 +393,7 @@ def settling_table(
     def max_overshoot(row: JsonObject) -> float:
         return max(float(row[protocol]["overshoot"]["max"]) for protocol in ("corners", "random"))
 
-    columns: list[Column] = [
+    columns: list[Column[Mapping[str, JsonObject]]] = [
         ("controller", "nominal.model"),
         ("nominal [s]", "nominal.settling.max", 2),
     ]
@@ -413,7 +430,7 @@ def effort_table(rows: Sequence[JsonObject], axis_labels: AxisWords) -> Table:
         (f"{axis_labels.rudder} travel [deg]", 2),
     ]
     groups.append(("energy [deg² s]", 2))
-    columns: list[Column] = [("controller", "random.model")]
+    columns: list[Column[Mapping[str, JsonObject]]] = [("controller", "random.model")]
     for quantity, scale in (
         ("iae", axis_labels.scale),
         ("travel", DEGREES_PER_RADIAN),
@@ -569,7 +586,7 @@ def extrapolation_table(rows: Sequence[JsonObject]) -> Table | None:
     )
     if not tests:
         return None
-    columns: list[Column] = [("controller", f"{tests[0]}.model")]
+    columns: list[Column[Mapping[str, JsonObject]]] = [("controller", f"{tests[0]}.model")]
     for test in tests:
         columns += [
             ("mean [s]", f"{test}.cost.mean", 3),

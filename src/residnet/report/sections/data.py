@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from residnet.core.format import DASH, DEGREES_PER_RADIAN, format_minus_signs, format_number
+from residnet.evaluation.records import LogQuality
+from residnet.quality.records import FindingRow
 from residnet.report.blocks import (
     Block,
     Bullets,
@@ -21,6 +23,8 @@ from residnet.report.blocks import (
     flag_cell,
 )
 from residnet.report.run_reader import JsonObject, RunFiles
+from residnet.report.run_settings import ProtocolSettings
+from residnet.training.records import CurrentRow, CurrentsFile
 
 _SEVERE_LEVELS = ("fatal", "will mislead")
 """Levels above a note, the worst first."""
@@ -28,27 +32,31 @@ _SEVERE_LEVELS = ("fatal", "will mislead")
 
 def fit_data_section(run: RunFiles) -> Section | None:
     """Return the section on the data, None where the folder says nothing about them."""
-    baseline = run.resolved_config.get("baseline") or {}
-    samples = run.fit_notes(run.baseline or "baseline").get("samples")
-    logs: dict[str, list[JsonObject]] = {}
+    baseline_notes = run.fit_notes(run.baseline or "baseline")
+    samples = None if baseline_notes is None else baseline_notes.samples
+    logs: dict[str, list[LogQuality]] = {}
     for entry in run.quality:
-        logs.setdefault(entry["split"], []).append(entry)
+        logs.setdefault(entry.split, []).append(entry)
     split_texts = [
-        f"{split} {len(members)} logs, {sum(log['seconds'] for log in members) / 60:.1f} min"
+        f"{split} {len(members)} logs, {sum(log.seconds for log in members) / 60:.1f} min"
         for split, members in logs.items()
     ]
     scale_texts = [
         f"{name} {format_number(run.display_unit(name)[1] * value)} {run.display_unit(name)[0]}"
-        for name, value in (run.metrics.get("scales") or {}).items()
+        for name, value in run.metrics.scales.items()
     ]
-    signals = run.resolved_config.get("signals") or {}
-    forces = signals.get("forces")
-    thrusters = f"the thrusters of {forces}" if isinstance(forces, str) else "given thrusters"
-    input_texts = (
-        ", ".join(signals.get("inputs") or []),
-        "exogenous: " + ", ".join(signals["exogenous"]) if signals.get("exogenous") else "",
-        f"forces from {thrusters}" if forces else "",
+    signals = run.fit_settings.signals
+    thrusters = (
+        f"the thrusters of {signals.forces}"
+        if isinstance(signals.forces, str)
+        else "given thrusters"
     )
+    input_texts = (
+        ", ".join(signals.inputs),
+        "exogenous: " + ", ".join(signals.exogenous) if signals.exogenous else "",
+        f"forces from {thrusters}" if signals.forces else "",
+    )
+    baseline = run.fit_settings.baseline
     fit_text = f", fitted on {samples} samples" if samples else ""
     facts = {
         "data": _data_text(run),
@@ -56,11 +64,11 @@ def fit_data_section(run: RunFiles) -> Section | None:
         "inputs": "; ".join(filter(None, input_texts)),
         "velocities": run.dof.description,
         **_model_facts(run),
-        "baseline": str(baseline.get("kind", "")) + fit_text if baseline else "",
+        "baseline": "" if baseline is None else baseline.kind + fit_text,
         **{
             f"protocol {name}": _protocol_text(protocol)
-            + ("; selects the model" if name == run.evaluation.get("selection") else "")
-            for name, protocol in (run.evaluation.get("protocols") or {}).items()
+            + ("; selects the model" if name == run.evaluation.selection else "")
+            for name, protocol in run.evaluation.protocols.items()
         },
         "NRMSE divides by": ", ".join(scale_texts),
     }
@@ -79,26 +87,27 @@ def fit_data_section(run: RunFiles) -> Section | None:
         ]
     if compatibility := run.read_json("compatibility.json"):
         blocks.append(Section("Instrument errors", compatibility_tables(compatibility)))
-    if currents := run.read_json("currents.json"):
-        blocks.append(Section("Currents", [_currents_table(run, currents)], is_folded=True))
+    currents = run.read_record(CurrentsFile, "currents.json")
+    if currents is not None:
+        blocks.append(Section("Currents", [_currents_table(run, currents.root)], is_folded=True))
     return Section("What was fitted on what", blocks) if blocks else None
 
 
-def _currents_table(run: RunFiles, currents: Any) -> Table:
+def _currents_table(run: RunFiles, currents: Sequence[CurrentRow]) -> Table:
     """Return the estimated current of each log, in the unit of speeds."""
     unit, factor = run.display_unit("u")
 
-    def component(row: JsonObject, key: str, index: int) -> Cell:
-        error = format_number(factor * row["standard_error"][index], 2)
-        return Cell(f"{format_number(factor * row[key], 2)} ± {error}")
+    def component(value: float, standard_error: float) -> Cell:
+        error_text = format_number(factor * standard_error, 2)
+        return Cell(f"{format_number(factor * value, 2)} ± {error_text}")
 
     return build_table(
         currents,
         [
-            ("log", lambda row: row["log"]),
-            (f"north [{unit}]", lambda row: component(row, "current_north", 0)),
-            (f"east [{unit}]", lambda row: component(row, "current_east", 1)),
-            ("coefficients", lambda row: "fitted with it" if row["fitted"] else "of other logs"),
+            ("log", lambda row: row.log),
+            (f"north [{unit}]", lambda row: component(row.current_north, row.standard_error[0])),
+            (f"east [{unit}]", lambda row: component(row.current_east, row.standard_error[1])),
+            ("coefficients", lambda row: "fitted with it" if row.fitted else "of other logs"),
         ],
         caption="Every log ran in a constant current of its own, which was estimated, with one"
         " standard error: as far as the two halves of a log agree. Errors of this page are those of"
@@ -174,37 +183,30 @@ def compatibility_tables(rows: Sequence[JsonObject]) -> list[Block]:
 
 
 def _data_text(run: RunFiles) -> str:
-    data = run.resolved_config.get("data") or {}
-    if not data:
+    data = run.fit_settings.data
+    if data is None:
         return ""
-    if data.get("kind") != "simulated":
-        return (
-            f"measured logs ({(data.get('reader') or {}).get('kind', 'files')}),"
-            f" {len(run.provenance.get('inputs') or {})} files"
-        )
-    text = f"simulated sea trials of vessel {data.get('vessel')}"
-    noise = data.get("noise") or {}
-    if noise:
+    if data.kind != "simulated":
+        reader_kind = "files" if data.reader is None else data.reader.kind
+        n_files = 0 if run.provenance is None else len(run.provenance.inputs)
+        return f"measured logs ({reader_kind}), {n_files} files"
+    text = f"simulated sea trials of vessel {data.vessel}"
+    if data.noise is not None:
         text += (
-            f", noise u {format_number(noise.get('u'), 2)} m/s, v"
-            f" {format_number(noise.get('v'), 2)} m/s, r"
-            f" {format_number(DEGREES_PER_RADIAN * noise.get('r', 0), 2)} deg/s"
+            f", noise u {format_number(data.noise.u, 2)} m/s, v"
+            f" {format_number(data.noise.v, 2)} m/s, r"
+            f" {format_number(DEGREES_PER_RADIAN * data.noise.r, 2)} deg/s"
         )
-    return text + f"; data seed {data.get('seed')}"
+    return text + f"; data seed {data.seed}"
 
 
 def _model_facts(run: RunFiles) -> dict[str, str]:
-    card = run.model_card(run.baseline or "baseline")
-    if not card:
+    model = run.model_settings(run.baseline or "baseline")
+    if model.dt is None:
         return {}
-    signals = card.get("signals") or {}
-    names = [
-        *run.dof.dynamic_states,
-        *(signals.get("inputs") or []),
-        *(signals.get("exogenous") or []),
-    ]
+    names = [*run.dof.dynamic_states, *model.signals.inputs, *model.signals.exogenous]
     ranges = []
-    for name, lower, upper in zip(names, card["low"], card["high"], strict=False):
+    for name, lower, upper in zip(names, model.low, model.high, strict=False):
         if name in run.dof.fixed_states:
             continue
         unit, factor = run.display_unit(name)
@@ -212,39 +214,43 @@ def _model_facts(run: RunFiles) -> dict[str, str]:
         # dimensionless channels have the unit "-"
         ranges.append(range_text if unit == "-" else f"{range_text} {unit}")
     return {
-        "model step": f"{card['dt']:g} s, {card['integrator']}; inputs held over a step",
+        "model step": f"{model.dt:g} s, {model.integrator}; inputs held over a step",
         "training range": "; ".join(ranges),
     }
 
 
-def _protocol_text(protocol: JsonObject) -> str:
-    if protocol.get("kind") == "windows":
+def _protocol_text(protocol: ProtocolSettings) -> str:
+    if protocol.kind == "windows" and protocol.length is not None:
         return (
-            f"back-to-back windows of {protocol['length']:g} s, the first from"
-            f" {protocol.get('first', 0):g} s on, each from the measured state"
+            f"back-to-back windows of {protocol.length:g} s, the first from"
+            f" {protocol.first:g} s on, each from the measured state"
         )
-    if protocol.get("kind") == "manoeuvre":
+    if protocol.kind == "manoeuvre" and protocol.initial is not None:
         return (
             "whole manoeuvres; they start from the mean velocities of the first"
-            f" {protocol['initial']:g} s and are scored after them"
+            f" {protocol.initial:g} s and are scored after them"
         )
-    return str(protocol.get("kind", "not described"))
+    return protocol.kind
 
 
 def quality_tables(run: RunFiles) -> tuple[Table, Table]:
     """Return the contents of the logs by split and kind of manoeuvre, and for each log."""
-    groups: dict[tuple[str, str], list[JsonObject]] = {}
+    groups: dict[tuple[str, str], list[LogQuality]] = {}
     for entry in run.quality:
-        groups.setdefault((entry["split"], entry.get("manoeuvre") or DASH), []).append(entry)
+        groups.setdefault((entry.split, entry.manoeuvre), []).append(entry)
 
-    def label(members: Sequence[JsonObject]) -> str:
-        return f"{members[0]['split']}: {(members[0].get('manoeuvre') or DASH).replace('_', ' ')}"
+    def label(members: Sequence[LogQuality]) -> str:
+        return f"{members[0].split}: {(members[0].manoeuvre or DASH).replace('_', ' ')}"
 
-    columns: list[Column] = [
-        ("seconds", lambda logs: f"{sum(log['seconds'] for log in logs):.0f}", str),
-        ("samples", lambda logs: sum(log["samples"] for log in logs), str),
-        ("scored [%]", lambda logs: _mean_percentage(logs, "usable"), format_number),
-        ("learned from [%]", lambda logs: _mean_percentage(logs, "learned_from"), format_number),
+    columns: list[Column[Sequence[LogQuality]]] = [
+        ("seconds", lambda logs: f"{sum(log.seconds for log in logs):.0f}", str),
+        ("samples", lambda logs: sum(log.samples for log in logs), str),
+        ("scored [%]", lambda logs: _mean_percentage(logs, lambda log: log.usable), format_number),
+        (
+            "learned from [%]",
+            lambda logs: _mean_percentage(logs, lambda log: log.learned_from),
+            format_number,
+        ),
         ("masked", _masked_text),
         *(
             (
@@ -257,45 +263,61 @@ def quality_tables(run: RunFiles) -> tuple[Table, Table]:
             for unit, factor in [run.display_unit(name)]
         ),
     ]
-    summary_columns: list[Column] = [("split, manoeuvre", label), ("logs", len, str), *columns]
+    summary_columns: list[Column[Sequence[LogQuality]]] = [
+        ("split, manoeuvre", label),
+        ("logs", len, str),
+        *columns,
+    ]
+    log_columns: list[Column[Sequence[LogQuality]]] = [("log", lambda logs: logs[0].log), *columns]
     return (
-        build_table(groups.values(), summary_columns, group_key=lambda logs: logs[0]["split"]),
-        build_table(
-            [[log] for log in run.quality], [("log", lambda logs: logs[0]["log"]), *columns]
-        ),
+        build_table(groups.values(), summary_columns, group_key=lambda logs: logs[0].split),
+        build_table([[log] for log in run.quality], log_columns),
     )
 
 
-def _mean_percentage(logs: Sequence[JsonObject], key: str) -> float:
-    samples = sum(log["samples"] for log in logs)
-    return float(100 * sum(log[key] * log["samples"] for log in logs) / samples)
+def _mean_percentage(logs: Sequence[LogQuality], share: Callable[[LogQuality], float]) -> float:
+    """Return the mean of a share over the samples of logs, in percent."""
+    samples = sum(log.samples for log in logs)
+    return 100 * sum(share(log) * log.samples for log in logs) / samples
 
 
-def _largest_value(logs: Sequence[JsonObject], channel: str) -> float:
-    return float(max((log.get("largest") or {}).get(channel, math.nan) for log in logs))
+def _largest_value(logs: Sequence[LogQuality], channel: str) -> float:
+    return max(log.largest.get(channel, math.nan) for log in logs)
 
 
-def _masked_text(logs: Sequence[JsonObject]) -> str:
-    samples = sum(log["samples"] for log in logs)
+def _masked_text(logs: Sequence[LogQuality]) -> str:
+    samples = sum(log.samples for log in logs)
     masked_shares: dict[str, float] = {}
     for log in logs:
-        for reason, share in (log.get("masked") or {}).items():
-            masked_shares[reason] = (
-                masked_shares.get(reason, 0.0) + share * log["samples"] / samples
-            )
+        for reason, share in log.masked.items():
+            masked_shares[reason] = masked_shares.get(reason, 0.0) + share * log.samples / samples
     text = ", ".join(f"{reason} {100 * share:.2g} %" for reason, share in masked_shares.items())
     return text or "nothing"
 
 
+class _FindingKind(NamedTuple):
+    """All findings of one level and code, with the names of their logs.
+
+    The rank is the place of the level in `_SEVERE_LEVELS`, the worst first.
+    """
+
+    code: str
+    rank: int
+    findings: Sequence[tuple[str, FindingRow]]
+
+    @property
+    def example(self) -> FindingRow:
+        """The first finding."""
+        return self.findings[0][1]
+
+
 def quality_section(run: RunFiles) -> Section | None:
     """Return the findings by kind and the notes by log, None where the run has no doctor.json."""
-    report = run.read_json("doctor.json")
-    logs = report.get("logs") or []
-    if not logs:
+    if run.inspection is None or not run.inspection.logs:
         return None
-    findings = [(str(log["name"]), finding) for log in logs for finding in log["findings"]]
-    findings += [("together", finding) for finding in report.get("together") or []]
-    severe_findings = [(name, finding) for name, finding in findings if finding["level"] != "note"]
+    logs = run.inspection.logs
+    findings = run.inspection.named_findings
+    severe_findings = [(name, finding) for name, finding in findings if finding.level != "note"]
     mask_note = "What the masks of this run leave out does not count."
     if severe_findings:
         n_misled = len({name for name, _ in severe_findings} - {"together"})
@@ -309,28 +331,34 @@ def quality_section(run: RunFiles) -> Section | None:
     blocks: list[Block] = [Text(summary)]
     if severe_findings:
         # one row for each kind of finding, the worst first
-        findings_by_kind: dict[tuple[int, str], list[tuple[str, JsonObject]]] = {}
+        findings_by_kind: dict[tuple[int, str], list[tuple[str, FindingRow]]] = {}
         for name, finding in severe_findings:
-            key = (_SEVERE_LEVELS.index(finding["level"]), str(finding["code"]))
+            key = (_SEVERE_LEVELS.index(finding.level), finding.code)
             findings_by_kind.setdefault(key, []).append((name, finding))
-        columns: list[Column] = [
-            ("finding", lambda row: row[0][1].replace("_", " ")),
-            ("level", lambda row: flag_cell(_SEVERE_LEVELS[row[0][0]], row[0][0] == 0)),
-            ("logs", lambda row: len({name for name, _ in row[1]}), str),
+        kinds = [
+            _FindingKind(code, rank, named_findings)
+            for (rank, code), named_findings in sorted(
+                findings_by_kind.items(), key=lambda item: item[0]
+            )
+        ]
+        columns: list[Column[_FindingKind]] = [
+            ("finding", lambda kind: kind.code.replace("_", " ")),
+            ("level", lambda kind: flag_cell(_SEVERE_LEVELS[kind.rank], kind.rank == 0)),
+            ("logs", lambda kind: len({name for name, _ in kind.findings}), str),
             (
                 "for example",
-                lambda row: Cell(format_minus_signs(row[1][0][1]["text"]), row[1][0][0], "text"),
+                lambda kind: Cell(
+                    format_minus_signs(kind.example.text), kind.findings[0][0], "text"
+                ),
             ),
-            ("what to do", lambda row: row[1][0][1]["action"]),
+            ("what to do", lambda kind: kind.example.action),
         ]
-        blocks.append(
-            build_table(sorted(findings_by_kind.items(), key=lambda row: row[0]), columns)
-        )
+        blocks.append(build_table(kinds, columns))
     notes: dict[str, list[str]] = {}
     for name, finding in findings:
-        if finding["level"] == "note":
-            action = f"; {finding['action']}" if finding["action"] else ""
-            notes.setdefault(name, []).append(format_minus_signs(f"{finding['text']}{action}"))
+        if finding.level == "note":
+            action = f"; {finding.action}" if finding.action else ""
+            notes.setdefault(name, []).append(format_minus_signs(f"{finding.text}{action}"))
     if notes:
         by_log = [Section(name, [Bullets(texts)]) for name, texts in notes.items()]
         blocks.append(Section("Notes, log by log", by_log, is_folded=True))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 from residnet.core.format import (
     DASH,
@@ -18,6 +18,12 @@ from residnet.core.format import (
     join_list,
 )
 from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY
+from residnet.evaluation.records import (
+    MetricsRow,
+    PairedDifference,
+    ProtocolLimits,
+    Repeatability,
+)
 from residnet.evaluation.verdict import describe_divergence, format_pose_error
 from residnet.report.blocks import (
     Block,
@@ -32,7 +38,7 @@ from residnet.report.blocks import (
     format_paired_interval,
 )
 from residnet.report.figure import Figure
-from residnet.report.run_reader import JsonObject, RunFiles
+from residnet.report.run_reader import RunFiles
 
 
 def distinct_manoeuvres(run: RunFiles, split: str, protocol: str) -> list[str]:
@@ -40,11 +46,11 @@ def distinct_manoeuvres(run: RunFiles, split: str, protocol: str) -> list[str]:
 
     A group of a single kind holds the same runs as that kind.
     """
-    seen_errors: list[Any] = []
+    seen_errors: list[list[tuple[int, dict[str, float]]]] = []
     manoeuvre_kinds: list[str] = []
     for manoeuvre_kind in run.manoeuvre_kinds(split, protocol):
         rows = [run.find_row(model, split, protocol, manoeuvre_kind) for model in run.model_kinds]
-        error_values = [(row["windows"], row["rmse"]) for row in rows if row is not None]
+        error_values = [(row.windows, row.rmse) for row in rows if row is not None]
         if error_values not in seen_errors:
             seen_errors.append(error_values)
             manoeuvre_kinds.append(manoeuvre_kind)
@@ -134,7 +140,7 @@ def errors_table(run: RunFiles, split: str) -> Table:
         if (row := run.find_row(model, split, protocol))
     ]
 
-    def cell(row: JsonObject, key: str) -> Cell:
+    def cell(row: MetricsRow, key: str) -> Cell:
         quantity_cell = _quantity_cell(run, key, row)
         # a terminal has no room for what stands in small print, but for what diverged
         note = describe_divergence(row) if key == "nrmse" else ""
@@ -143,16 +149,16 @@ def errors_table(run: RunFiles, split: str) -> Table:
     return build_table(
         rows,
         [
-            ("model", lambda row: run.model_label(row["model"])),
-            ("protocol", "protocol"),
+            ("model", lambda row: run.model_label(row.model)),
+            ("protocol", lambda row: row.protocol),
             *(
                 (title, lambda row, key=key: cell(row, key))
                 for key, title in _quantity_titles(run).items()
             ),
         ],
         caption=f"Free-run errors on {split} data, mean over windows.",
-        is_selected=lambda row: row["model"] == run.selected,
-        group_key=lambda row: row["protocol"],
+        is_selected=lambda row: row.model == run.selected,
+        group_key=lambda row: row.protocol,
     )
 
 
@@ -169,64 +175,64 @@ def errors_by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | Non
         if (row := run.find_row(name, split, protocol, manoeuvre_kind))
     ]
 
-    def label(row: JsonObject) -> str:
+    def label(row: MetricsRow) -> str:
         # the kind stands once, before its first model
-        prefix = f"{row['manoeuvre'].replace('_', ' ')}: " if row["model"] == models[0] else ""
-        return prefix + run.model_label(row["model"])
+        prefix = f"{row.manoeuvre.replace('_', ' ')}: " if row.model == models[0] else ""
+        return prefix + run.model_label(row.model)
 
     return build_table(
         rows,
         [
             ("manoeuvre, model", label),
-            ("runs", "windows", str),
+            ("runs", lambda row: row.windows, str),
             *(
                 (title, lambda row, key=key: _quantity_cell(run, key, row))
                 for key, title in _quantity_titles(run).items()
             ),
         ],
-        is_selected=lambda row: row["model"] == run.selected,
-        group_key=lambda row: row["manoeuvre"],
+        is_selected=lambda row: row.model == run.selected,
+        group_key=lambda row: row.manoeuvre,
     )
 
 
-def _quantity_cell(run: RunFiles, key: str, row: JsonObject | None) -> Cell:
+def _quantity_cell(run: RunFiles, key: str, row: MetricsRow | None) -> Cell:
     """Return what a row says of a quantity, and its change against the baseline's on its data."""
     if row is None:
         return Cell(DASH)
     if key == "diverged":
-        return Cell(f"{row['diverged']}/{row['windows']}", mark="bad" if row["diverged"] else "")
+        return Cell(f"{row.diverged}/{row.windows}", mark="bad" if row.diverged else "")
     if key in run.pose_errors:
-        return Cell(
-            format_number(run.pose_error_unit(key)[2] * row.get(f"{key}_error_end", math.nan), 2)
-        )
+        error = row.final_pose_errors.get(key, math.nan)
+        return Cell(format_number(run.pose_error_unit(key)[2] * error, 2))
     diverged_text = describe_divergence(row)
     if key == "nrmse":
-        interval = row.get("nrmse_mean_ci95")
+        interval = row.nrmse_mean_ci95
         small_print = (
             f"{format_number(interval[0])}–{format_number(interval[1])}" if interval else ""
         )
-        value = row["nrmse"]["mean"]
+        value = row.mean_nrmse
         is_worse = False
         factor = 1.0
     else:
-        value = row["rmse"].get(key)
         factor = run.display_unit(key)[1]
-        if value is None:
+        if key not in row.rmse:
             return Cell(DASH)
-        row_key = (row["split"], row["protocol"], row.get("manoeuvre", "all"))
-        is_reference = run.model_kinds[row["model"]] in (CONSTANT_VELOCITY, BASELINE)
-        baseline_row = None if is_reference else run.find_row(run.baseline, *row_key)
-        is_worse = baseline_row is not None and value > 1.005 * baseline_row["rmse"][key]
+        value = row.rmse[key]
+        is_reference = run.model_kinds[row.model] in (CONSTANT_VELOCITY, BASELINE)
+        baseline_row = (
+            None
+            if is_reference
+            else run.find_row(run.baseline, row.split, row.protocol, row.manoeuvre)
+        )
+        is_worse = baseline_row is not None and value > 1.005 * baseline_row.rmse[key]
         small_print = (
-            format_relative_change(value, baseline_row["rmse"][key])
+            format_relative_change(value, baseline_row.rmse[key])
             if baseline_row is not None
             else ""
         )
     note = "; ".join(text for text in (small_print, diverged_text) if text)
     si = f"{format_number(value)} {run.si_unit(key)}" if factor != 1.0 else ""
-    return Cell(
-        format_number(factor * value), note, "bad" if is_worse or row["diverged"] else "", si
-    )
+    return Cell(format_number(factor * value), note, "bad" if is_worse or row.diverged else "", si)
 
 
 def limits_section(run: RunFiles) -> Section | None:
@@ -239,10 +245,8 @@ def limits_section(run: RunFiles) -> Section | None:
     for protocol in run.protocols:
         row = run.find_row(main_model, run.report_split, protocol)
         if row is not None:
-            protocol_limits = (
-                (run.limits.get("splits") or {}).get(run.report_split, {}).get(protocol, {})
-            )
-            repeatability = (run.limits.get("repeatability") or {}).get(protocol)
+            protocol_limits = run.find_limits(protocol)
+            repeatability = None if run.limits is None else run.limits.repeatability.get(protocol)
             blocks = [
                 _error_breakdown_table(run, main_model, protocol, protocol_limits),
                 None
@@ -266,70 +270,85 @@ def limits_section(run: RunFiles) -> Section | None:
     return Section(title, [*protocol_sections, Text(notes, is_secondary=True)])
 
 
+class _BreakdownRow(NamedTuple):
+    """The error of a model over the windows of one kind of manoeuvre, speed or wind speed.
+
+    Attributes:
+        group: what the windows have in common: `kind`, `speed` or `wind`.
+        label: the kind, or the range of speeds.
+        windows: number of windows.
+        nrmse: mean error.
+        difference: paired difference to the reference model; None without one.
+    """
+
+    group: str
+    label: str
+    windows: int
+    nrmse: float
+    difference: PairedDifference | None
+
+
 def _error_breakdown_table(
-    run: RunFiles, main_model: str, protocol: str, protocol_limits: JsonObject
+    run: RunFiles, main_model: str, protocol: str, protocol_limits: ProtocolLimits | None
 ) -> Table:
     """Return the errors by kind of manoeuvre, speed and wind."""
-    breakdown_rows: list[JsonObject] = []
+    breakdown_rows: list[_BreakdownRow] = []
     for manoeuvre_kind in ["all", *distinct_manoeuvres(run, run.report_split, protocol)]:
         if row := run.find_row(main_model, run.report_split, protocol, manoeuvre_kind):
-            row_fields = {
-                "by": "kind",
-                "label": manoeuvre_kind.replace("_", " "),
-                "windows": row["windows"],
-            }
-            difference = row.get("difference") or {}
+            label = manoeuvre_kind.replace("_", " ")
             breakdown_rows.append(
-                {**row_fields, "value": row["nrmse"]["mean"], "apart": difference}
+                _BreakdownRow("kind", label, row.windows, row.mean_nrmse, row.difference)
             )
-    for band in protocol_limits.get("bands") or []:
-        if model_band := band["models"].get(main_model):
+    for class_row in () if protocol_limits is None else protocol_limits.bands:
+        if class_errors := class_row.models.get(main_model):
             label = (
-                f"{band['by']} {format_number(band['low'], 2)} to"
-                f" {format_number(band['high'], 2)} m/s"
+                f"{class_row.by} {format_number(class_row.low, 2)} to"
+                f" {format_number(class_row.high, 2)} m/s"
             )
-            row_fields = {"by": band["by"], "label": label, "windows": band["windows"]}
-            difference = model_band["difference"] or {}
             breakdown_rows.append(
-                {**row_fields, "value": model_band["nrmse_mean"], "apart": difference}
+                _BreakdownRow(
+                    class_row.by,
+                    label,
+                    class_row.windows,
+                    class_errors.nrmse_mean,
+                    class_errors.difference,
+                )
             )
-    reference = next((line["apart"]["to"] for line in breakdown_rows if line["apart"]), None)
+    reference = next((line.difference.to for line in breakdown_rows if line.difference), None)
 
-    def ratio_cell(line: JsonObject) -> Cell:
-        value = line["apart"].get("ratio")
-        text = DASH if value is None else format_percent_change(100 * (value - 1))
-        return flag_cell(text, line["apart"].get("worse"))
+    def ratio_cell(line: _BreakdownRow) -> Cell:
+        if line.difference is None or line.difference.ratio is None:
+            return Cell(DASH)
+        text = format_percent_change(100 * (line.difference.ratio - 1))
+        return flag_cell(text, line.difference.worse)
 
-    def reference_nrmse(line: JsonObject) -> float:
-        return float(line["value"] - line["apart"].get("nrmse_mean", math.nan))
+    def reference_nrmse(line: _BreakdownRow) -> float:
+        return math.nan if line.difference is None else line.nrmse - line.difference.nrmse_mean
 
-    columns: list[Column] = [
-        ("windows of", "label"),
-        ("windows", "windows", str),
-        (f"NRMSE of {main_model}", "value", format_number),
+    def difference_text(line: _BreakdownRow) -> str:
+        return DASH if line.difference is None else format_signed(line.difference.nrmse_mean)
+
+    columns: list[Column[_BreakdownRow]] = [
+        ("windows of", lambda line: line.label),
+        ("windows", lambda line: line.windows, str),
+        (f"NRMSE of {main_model}", lambda line: line.nrmse, format_number),
     ]
     if reference:
         columns += [
             (f"NRMSE of {reference}", reference_nrmse, format_number),
             ("change", ratio_cell),
-            (
-                "difference",
-                "apart.nrmse_mean",
-                lambda by: DASH if by is None else format_signed(by),
-            ),
+            ("difference", difference_text, str),
             (
                 "paired 95 % interval",
-                lambda line: format_paired_interval(line["apart"].get("ci95")),
+                lambda line: format_paired_interval(line.difference and line.difference.ci95),
             ),
         ]
-    return build_table(breakdown_rows, columns, group_key=lambda line: line["by"])
+    return build_table(breakdown_rows, columns, group_key=lambda line: line.group)
 
 
 def worst_runs_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     """Return the worst free runs of the main protocol, and a figure to look into them with."""
-    protocol_limits = (
-        (run.limits.get("splits") or {}).get(run.report_split, {}).get(run.main_protocol, {})
-    )
+    protocol_limits = run.find_limits(run.main_protocol)
     blocks = [
         block
         for block in (_worst_windows_table(run, run.main_model, protocol_limits), *figures)
@@ -339,56 +358,62 @@ def worst_runs_section(run: RunFiles, figures: Sequence[Figure]) -> Section | No
 
 
 def _worst_windows_table(
-    run: RunFiles, main_model: str, protocol_limits: JsonObject
+    run: RunFiles, main_model: str, protocol_limits: ProtocolLimits | None
 ) -> Table | None:
     """Return the windows with the largest errors of a model, None where none are recorded."""
-    entries = (protocol_limits.get("worst") or {}).get(main_model) or []
-    if not entries:
+    windows = () if protocol_limits is None else protocol_limits.worst.get(main_model, ())
+    if not windows:
         return None
-    channels = [name for name in run.channels if name in entries[0]["rmse"]]
+    channels = [name for name in run.channels if name in windows[0].rmse]
     pose_error = run.pose_errors[0]
     factor = run.pose_error_unit(pose_error)[2]
     return build_table(
-        entries,
+        windows,
         [
             (
                 "worst windows",
-                lambda entry: f"{entry['log']} ({entry['manoeuvre'].replace('_', ' ')})",
+                lambda window: f"{window.log} ({window.manoeuvre.replace('_', ' ')})",
             ),
-            ("log time at start [s]", "t", 1),
-            ("NRMSE", "nrmse", format_number),
+            ("log time at start [s]", lambda window: window.t, 1),
+            ("NRMSE", lambda window: window.nrmse, format_number),
             *(
-                (_quantity_titles(run)[c], f"rmse.{c}", format_number, run.display_unit(c)[1])
-                for c in channels
+                (
+                    _quantity_titles(run)[channel],
+                    lambda window, channel=channel: window.rmse[channel],
+                    format_number,
+                    run.display_unit(channel)[1],
+                )
+                for channel in channels
             ),
             (
                 _quantity_titles(run)[pose_error],
-                lambda e: format_number(factor * e[f"{pose_error}_error_end"], 2),
-                str,
+                lambda window: window.final_pose_error,
+                lambda error: format_number(error, 2),
+                factor,
             ),
         ],
     )
 
 
-def _repeatability_text(run: RunFiles, repeatability: JsonObject) -> str:
-    tolerance = repeatability["tolerance"]
+def _repeatability_text(run: RunFiles, repeatability: Repeatability) -> str:
+    tolerance = repeatability.tolerance
 
     def format_velocities(values: Mapping[str, float], *digits: int) -> str:
         return ", ".join(
             f"{name} {format_number(run.display_unit(name)[1] * values[name], *digits)}"
             f" {run.display_unit(name)[0]}"
-            for name in tolerance["start"]
+            for name in tolerance.start
         )
 
     criterion = (
-        f"commands within {100 * tolerance['command_share_of_range']:.0f} % of their range (root"
+        f"commands within {100 * tolerance.command_share_of_range:.0f} % of their range (root"
         " mean square over the window) and initial velocities within"
-        f" {format_velocities(tolerance['start'], 2)}"
+        f" {format_velocities(tolerance.start, 2)}"
     )
     logs_text = (
         "the logs evaluated here" if run.report_split == "external" else "the logs of all splits"
     )
-    if not repeatability["pairs"]:
+    if not repeatability.pairs:
         return (
             f"Repeatability: {logs_text} hold no two stretches as long as a window with"
             f" {criterion}. How"
@@ -396,32 +421,33 @@ def _repeatability_text(run: RunFiles, repeatability: JsonObject) -> str:
         )
     single_run_factor = 1 / math.sqrt(2)
     pairs_text = ", ".join(
-        f"{name.replace('_', ' ')} {part['pairs']}"
-        for name, part in repeatability["manoeuvres"].items()
+        f"{name.replace('_', ' ')} {differences.pairs}"
+        for name, differences in repeatability.manoeuvres.items()
     )
+    final_pose = repeatability.final_pose
     pose_error_text = join_list(
         [
-            format_pose_error(pose_error, repeatability[pose_error])
+            format_pose_error(pose_error, final_pose[pose_error])
             for pose_error in run.pose_errors
-            if pose_error in repeatability
+            if pose_error in final_pose
         ]
     )
     position_text = (
-        f" and {format_number(single_run_factor * repeatability['position'], 2)} m"
+        f" and {format_number(single_run_factor * final_pose['position'], 2)} m"
         if "position" in run.pose_errors
         else ""
     )
-    exogenous = (run.resolved_config.get("signals") or {}).get("exogenous")
-    wind_text = " A model that knows the wind, as these do, can do better." if exogenous else ""
+    knows_wind = bool(run.fit_settings.signals.exogenous)
+    wind_text = " A model that knows the wind, as these do, can do better." if knows_wind else ""
     return (
-        f"Repeatability: {format_count(repeatability['pairs'], 'pair')} of stretches"
+        f"Repeatability: {format_count(repeatability.pairs, 'pair')} of stretches"
         f" ({pairs_text}) in"
-        f" {repeatability['logs']} of {logs_text} have {criterion}. Their measured motions differ"
+        f" {repeatability.logs} of {logs_text} have {criterion}. Their measured motions differ"
         f" by"
-        f" {format_velocities(repeatability)} (root"
+        f" {format_velocities(repeatability.by_channel)} (root"
         f" mean square), and by {pose_error_text} at the end. Each motion is off their mean by"
         f" 1/√2 of that: an NRMSE of"
-        f" {format_number(single_run_factor * repeatability['nrmse'])}{position_text}."
+        f" {format_number(single_run_factor * (repeatability.nrmse or 0.0))}{position_text}."
         " The remaining differences of commands and"
         " starts are part of it. A model that knows only commands and initial velocities is left"
         f" with an error of this order in such runs, whatever its form.{wind_text}"
@@ -432,11 +458,10 @@ def bands_section(run: RunFiles) -> Section | None:
     """Return width and coverage of the prediction bands with their limitations; None without
     bands.
     """
-    models: JsonObject = run.read_json("bands.json").get("models") or {}
-    if not models:
+    if not run.bands:
         return None
-    band = next(iter(next(iter(models.values())).values()))
-    level = f"{100 * band['level']:.0f} %"
+    band = next(iter(next(iter(run.bands.values())).values()))
+    level = f"{100 * band.level:.0f} %"
     introduction = [
         f"A band is to hold {level} of the errors of a free run on logs that nobody has seen. It"
         " grows with the horizon, and is wider where the predicted run is livelier or the models"
@@ -445,7 +470,7 @@ def bands_section(run: RunFiles) -> Section | None:
         f"The tables say what the bands held of the {run.report_split} data. Whole: share of the"
         f" runs that"
         f" a band holds from beginning to end, each channel for itself, where it is widened to hold"
-        f" {level} of them. Score: mean width, and {2 / (1 - band['level']):.0f} times what lies"
+        f" {level} of them. Score: mean width, and {2 / (1 - band.level):.0f} times what lies"
         " outside, in units of the error of the constant-velocity model; less is better. Beside"
         " it stands a band of one"
         " width at all horizons.",
@@ -455,26 +480,24 @@ def bands_section(run: RunFiles) -> Section | None:
         blocks.append(Bullets(warnings, is_warning=True))
     for protocol in run.protocols:
         models_rows = [run.find_row(model, run.report_split, protocol) for model in run.model_kinds]
-        rows_with_bands = [row for row in models_rows if row and "band_coverage" in row]
+        rows_with_bands = [row for row in models_rows if row and row.band_coverage]
         if not rows_with_bands:
             continue
         coverage_tables = [
             _coverage_table(
-                rows_with_bands, "model", lambda row: run.model_label(row["model"]), run.selected
+                rows_with_bands, "model", lambda row: run.model_label(row.model), run.selected
             )
         ]
         manoeuvre_rows = [
             run.find_row(run.main_model, run.report_split, protocol, kind)
             for kind in distinct_manoeuvres(run, run.report_split, protocol)
         ]
-        manoeuvre_rows_with_bands = [
-            row for row in manoeuvre_rows if row and "band_coverage" in row
-        ]
+        manoeuvre_rows_with_bands = [row for row in manoeuvre_rows if row and row.band_coverage]
         if len(manoeuvre_rows_with_bands) > 1:
             title = f"manoeuvre, {run.main_model}"
             coverage_tables.append(
                 _coverage_table(
-                    manoeuvre_rows_with_bands, title, lambda row: row["manoeuvre"].replace("_", " ")
+                    manoeuvre_rows_with_bands, title, lambda row: row.manoeuvre.replace("_", " ")
                 )
             )
         blocks.append(
@@ -485,48 +508,55 @@ def bands_section(run: RunFiles) -> Section | None:
 
 def band_cautions(run: RunFiles, model: str) -> list[str]:
     """Return sentences on the limitations of the prediction bands of a model."""
-    bands_by_protocol: JsonObject = (run.read_json("bands.json").get("models") or {}).get(
-        model
-    ) or {}
+    bands_by_protocol = run.bands.get(model, {})
     windows = run.read_split_windows(run.report_split) if bands_by_protocol else []
     sentences: list[str] = []
     for protocol, band in bands_by_protocol.items():
-        sentences += [text for text in band["cautions"] if text not in sentences]
+        sentences += [text for text in band.cautions if text not in sentences]
         lengths = [float(w.t[-1] - w.t[0]) for w in windows if w.protocol == protocol]
         max_duration = max(lengths, default=0.0)
-        if max_duration > band["horizon"] + 1e-6:
+        if max_duration > band.horizon + 1e-6:
             sentences.append(
                 f"Runs of protocol {protocol} last up to {format_fixed(max_duration, 0)} s, and"
                 f" the band is"
-                f" calibrated up to {format_fixed(band['horizon'], 0)} s only; beyond, it grows in"
+                f" calibrated up to {format_fixed(band.horizon, 0)} s only; beyond, it grows in"
                 " proportion to time, without any promise."
             )
     return sentences
 
 
 def _coverage_table(
-    rows: Sequence[JsonObject], title: str, label: Any, selected_model: str | None = None
+    rows: Sequence[MetricsRow],
+    title: str,
+    label: Callable[[MetricsRow], str],
+    selected_model: str | None = None,
 ) -> Table:
-    def comparison_cell(row: JsonObject, name: str) -> Cell:
-        value = row.get(name)
-        band_score = row["band_score"]
+    """Return coverage and interval score of rows with prediction intervals."""
+
+    def constant_width_cell(row: MetricsRow) -> Cell:
         note = (
-            format_percent_change(100 * (value / band_score - 1))
-            if value is not None and band_score > 0
+            format_percent_change(100 * (row.band_score_constant / row.band_score - 1))
+            if row.band_score_constant is not None and row.band_score
             else ""
         )
-        return Cell(format_number(value), note)
+        return Cell(format_number(row.band_score_constant), note)
 
-    channels = [name for name in rows[0]["band_coverage"] if name not in ("mean", "whole")]
+    def coverage(row: MetricsRow, name: str) -> float | None:
+        return (row.band_coverage or {}).get(name)
+
+    channels = [name for name in rows[0].band_coverage or {} if name not in ("mean", "whole")]
 
     return build_table(
         rows,
         [
             (title, label),
-            *((name, f"band_coverage.{name}", 2) for name in (*channels, "mean", "whole")),
-            ("bands", "band_score", format_number),
-            ("one width", lambda row: comparison_cell(row, "band_score_constant")),
+            *(
+                (name, lambda row, name=name: coverage(row, name), 2)
+                for name in (*channels, "mean", "whole")
+            ),
+            ("bands", lambda row: row.band_score, format_number),
+            ("one width", constant_width_cell),
         ],
         groups=[("coverage", len(channels) + 2), ("score", 2)],
-        is_selected=lambda row: row["model"] == selected_model,
+        is_selected=lambda row: row.model == selected_model,
     )

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +20,13 @@ from residnet.core.format import (
     format_number,
 )
 from residnet.core.log import Log
+from residnet.evaluation.records import (
+    BookletFile,
+    BookletIndex,
+    BookletRow,
+    FlightIndices,
+    IndicesFile,
+)
 from residnet.manoeuvres.closed_loop import Spiral, Zigzag
 from residnet.manoeuvres.open_loop import Replay
 from residnet.manoeuvres.trials import ManoeuvreRun
@@ -51,7 +58,10 @@ from residnet.report.figure import (
     step_curve,
 )
 from residnet.report.figure_files import figures_section, read_figures
-from residnet.report.run_reader import JsonObject, RunFiles
+from residnet.report.run_reader import RunFiles
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _MAX_SEPARATE_FLIGHTS = 12
 """Most flights that have a table and a picture each; of more, the first of each kind has."""
@@ -102,10 +112,10 @@ def index_title(name: str) -> str:
 
 def sections(run: RunFiles) -> list[Section]:
     """Return the sections with manoeuvring indices and the figures in the folder."""
-    content = run.read_json("indices.json")
+    content = run.read_record(IndicesFile, "indices.json")
     figures = read_figures(run.path / "figures", "manoeuvres")
     sections_written = []
-    if content.get("rows"):
+    if content is not None and content.rows:
         sections_written.append(
             Section("", [*(figure.preview() for figure in figures), _trials_table(content)])
         )
@@ -115,50 +125,41 @@ def sections(run: RunFiles) -> list[Section]:
     return [*sections_written, *figures_section(run.path / "figures")]
 
 
-def _trials_table(content: JsonObject) -> Table:
+def _trials_table(content: IndicesFile) -> Table:
     """Return a row for each flight: what went wrong, else the most telling of its indices."""
 
-    def main_index(row: JsonObject) -> str:
-        return next((name for name in _MAIN_INDICES if name in row["indices"]), "")
+    def main_index(row: FlightIndices) -> str:
+        return next((name for name in _MAIN_INDICES if name in row.indices), "")
 
-    def outcome(row: JsonObject) -> Cell | str:
-        if row["fault"]:
-            return flag_cell(row["fault"], True)
+    def outcome(row: FlightIndices) -> Cell | str:
+        if row.fault:
+            return flag_cell(row.fault, True)
         return index_title(main_index(row)) or "ended as it should"
 
-    def value(row: JsonObject) -> str:
-        entry = _scalar_indices(row).get(main_index(row))
-        return (
-            DASH
-            if entry is None
-            else "{} {}".format(*_format_index(content, main_index(row), entry))
-        )
+    def value(row: FlightIndices) -> str:
+        name = main_index(row)
+        entry = row.scalar_indices.get(name)
+        return DASH if entry is None else "{} {}".format(*_format_index(content, name, entry.value))
 
-    rows = sorted(content["rows"], key=lambda row: not row["fault"])
-    has_several = len({row["craft"] for row in rows}) > 1
-    columns: list[Column] = [("flight", "log")]
-    return build_table(
-        rows[: max(_MAX_SEPARATE_FLIGHTS, sum(bool(row["fault"]) for row in rows))],
-        [
-            *columns,
-            *([("vessel", "craft")] if has_several else []),
-            ("outcome", outcome),
-            ("value", value, str),
-        ],
-    )
+    rows = sorted(content.rows, key=lambda row: not row.fault)
+    columns: list[Column[FlightIndices]] = [("flight", lambda row: row.log)]
+    if len({row.craft for row in rows}) > 1:
+        columns.append(("vessel", lambda row: row.craft))
+    columns += [("outcome", outcome), ("value", value, str)]
+    n_shown = max(_MAX_SEPARATE_FLIGHTS, sum(bool(row.fault) for row in rows))
+    return build_table(rows[:n_shown], columns)
 
 
-def _introduction(content: JsonObject) -> str:
-    length = content.get("length")
-    if length is None:
+def _introduction(content: IndicesFile) -> str:
+    if content.length is None:
         text = "The length of the hull is not known, so there are no values in hull lengths."
     else:
         text = (
-            f"L: hull lengths of {format_number(length)} m. The limits are those of IMO resolution"
-            " MSC.137(76), where they apply to a manoeuvre."
+            f"L: hull lengths of {format_number(content.length)} m. The limits are those of IMO"
+            " resolution MSC.137(76), where they apply to a manoeuvre."
         )
     kinds_without_indices = dict.fromkeys(
-        str(row["manoeuvre"]).replace("_", " ") for row in content["rows"] if not row["indices"]
+        row.manoeuvre.replace("_", " ") for row in content.rows if not row.indices
     )
     return text + (
         f" Flights without indices: {', '.join(kinds_without_indices)}."
@@ -167,49 +168,34 @@ def _introduction(content: JsonObject) -> str:
     )
 
 
-def indices_text(content: JsonObject) -> str:
+def indices_text(content: IndicesFile) -> str:
     """Return the contents of indices.json for the terminal."""
     return "\n\n".join(f"{title}\n{table.to_text()}" for title, table in index_tables(content))
 
 
-def _scalar_indices(row: JsonObject) -> dict[str, JsonObject]:
-    """Return the scalar indices of a manoeuvre with non-dimensional lengths and limits."""
-    indices: JsonObject = row["indices"]
-    return {
-        name: {
-            "value": value,
-            "lengths": indices.get(f"{name}_lengths"),
-            **row["limits"].get(name, {}),
-        }
-        for name, value in indices.items()
-        if not isinstance(value, list) and not name.endswith("_lengths")
-    }
-
-
 def _format_index(
-    content: JsonObject, name: str, entry: JsonObject, key: str = "value"
+    content: IndicesFile | BookletFile, name: str, value: float | None
 ) -> tuple[str, str]:
-    """Return the displayed value and unit of an index."""
-    unit, factor = display_unit(str(content["units"].get(name, "-")))
-    value = entry.get(key)
+    """Return the displayed value of an index, a dash for None, and its unit."""
+    unit, factor = display_unit(content.units.get(name, "-"))
     return format_number(None if value is None else factor * value, 4), unit
 
 
-def index_tables(content: JsonObject) -> list[tuple[str, Table]]:
+def index_tables(content: IndicesFile) -> list[tuple[str, Table]]:
     """Return titles and tables of the manoeuvring indices in indices.json.
 
     With few manoeuvres each has a table with one row per index. With many manoeuvres there is one
     table per kind with one row per manoeuvre.
     """
-    groups: dict[str, list[JsonObject]] = {}
-    is_separate = len({row["log"] for row in content["rows"]}) <= _MAX_SEPARATE_FLIGHTS
-    for row in content["rows"]:
-        if _scalar_indices(row):
-            groups.setdefault(str(row["log" if is_separate else "manoeuvre"]), []).append(row)
+    groups: dict[str, list[FlightIndices]] = {}
+    is_separate = len({row.log for row in content.rows}) <= _MAX_SEPARATE_FLIGHTS
+    for row in content.rows:
+        if row.scalar_indices:
+            groups.setdefault(row.log if is_separate else row.manoeuvre, []).append(row)
     return [
         (
             name.replace("_", " "),
-            _table_by_index(content, {row["craft"]: _scalar_indices(row) for row in rows})
+            _table_by_index(content, {row.craft: row.scalar_indices for row in rows})
             if is_separate
             else _table_by_trial(content, rows),
         )
@@ -218,91 +204,102 @@ def index_tables(content: JsonObject) -> list[tuple[str, Table]]:
 
 
 def _limit_cell(
-    content: JsonObject, crafts: Mapping[str, Mapping[str, JsonObject]], name: str
+    content: IndicesFile | BookletFile,
+    crafts: Mapping[str, Mapping[str, BookletIndex]],
+    name: str,
 ) -> Cell:
     """Return the limit of an index, with a note whether all crafts meet it."""
     limited_entries = [
-        craft_indices[name]
+        entry
         for craft_indices in crafts.values()
-        if "limit" in craft_indices.get(name, {})
+        if (entry := craft_indices.get(name)) is not None and entry.limit is not None
     ]
     if not limited_entries:
         return Cell("")
-    is_met = all(entry["kept"] for entry in limited_entries)
-    share_met = limited_entries[0].get("kept_share")
+    is_met = all(entry.kept for entry in limited_entries)
+    share_met = limited_entries[0].kept_share
     note = (
         ("kept" if is_met else "exceeded")
         if share_met is None
         else f"kept by {100 * share_met:.0f} %"
     )
-    limit_text = _format_index(content, name, limited_entries[0], "limit")[0]
+    limit_text = _format_index(content, name, limited_entries[0].limit)[0]
     return Cell(limit_text, note, "" if is_met else "bad")
 
 
-def _table_by_index(content: JsonObject, crafts: Mapping[str, Mapping[str, JsonObject]]) -> Table:
+def _difference_text(
+    content: IndicesFile | BookletFile,
+    crafts: Mapping[str, Mapping[str, BookletIndex]],
+    name: str,
+) -> str:
+    """Return the value of the second of two crafts minus that of the first, for display."""
+    first, second = (craft_indices.get(name) for craft_indices in crafts.values())
+    difference = None if first is None or second is None else second.value - first.value
+    return _format_index(content, name, difference)[0]
+
+
+def _table_by_index(
+    content: IndicesFile | BookletFile, crafts: Mapping[str, Mapping[str, BookletIndex]]
+) -> Table:
     """Return one row per index of a manoeuvre, with the second craft compared to the first.
 
     Args:
-        content: content of indices.json; its `units` hold the units of the indices.
-        crafts: for each craft `value` by index and optionally `lengths`, `interval` over draws,
-            `scale_text` at full scale, `limit_cell`, `is_met` and `kept_share` of the draws.
+        content: contents of the file, which hold the units of the indices.
+        crafts: indices of each craft by name.
     """
     entries = [entry for craft_indices in crafts.values() for entry in craft_indices.values()]
 
-    def format_value(craft: str, key: str, name: str) -> str:
-        return _format_index(content, name, crafts[craft].get(name, {}), key)[0]
+    def format_value(craft: str, name: str) -> str:
+        entry = crafts[craft].get(name)
+        return _format_index(content, name, None if entry is None else entry.value)[0]
+
+    def format_ship_value(craft: str, name: str) -> str:
+        entry = crafts[craft].get(name)
+        return _format_index(content, name, None if entry is None else entry.ship)[0]
 
     def lengths(craft: str, name: str) -> str:
-        n_lengths = crafts[craft].get(name, {}).get("lengths")
-        return "" if n_lengths is None else format_fixed(n_lengths, 2)
-
-    def difference_text(name: str) -> str:
-        values: list[Any] = [
-            craft_indices.get(name, {}).get("value") for craft_indices in crafts.values()
-        ]
-        return _format_index(
-            content, name, {} if None in values else {"value": values[1] - values[0]}
-        )[0]
+        entry = crafts[craft].get(name)
+        return "" if entry is None or entry.lengths is None else format_fixed(entry.lengths, 2)
 
     def interval_text(name: str) -> str:
         (craft_indices,) = crafts.values()
-        return format_interval(
-            craft_indices[name].get("interval"), display_unit(content["units"][name])[1]
-        )
+        return format_interval(craft_indices[name].interval, display_unit(content.units[name])[1])
 
-    columns: list[Column] = [
+    columns: list[Column[str]] = [
         ("index", index_title),
-        ("unit", lambda name: _format_index(content, name, {})[1], str),
-        *((craft, partial(format_value, craft, "value"), str) for craft in crafts),
-        *([("difference", difference_text, str)] if len(crafts) == 2 else []),
+        ("unit", lambda name: _format_index(content, name, None)[1], str),
+        *((craft, partial(format_value, craft), str) for craft in crafts),
     ]
-    if any("interval" in entry for entry in entries):
-        columns.append((f"{100 * content['level']:.0f} % interval", interval_text, str))
-    if any(entry.get("lengths") is not None for entry in entries):
+    if len(crafts) == 2:
+        columns.append(("difference", partial(_difference_text, content, crafts), str))
+    if isinstance(content, BookletFile) and any(entry.interval for entry in entries):
+        columns.append((f"{100 * content.level:.0f} % interval", interval_text, str))
+    if any(entry.lengths is not None for entry in entries):
         columns += [(f"{craft} [L]", partial(lengths, craft), str) for craft in crafts]
-    if float(content.get("scale", 1)) != 1:
-        columns += [("ship", partial(format_value, craft, "ship"), str) for craft in crafts]
-    if any("limit" in entry for entry in entries):
+    if isinstance(content, BookletFile) and content.scale != 1:
+        columns += [("ship", partial(format_ship_value, craft), str) for craft in crafts]
+    if any(entry.limit is not None for entry in entries):
         columns.append(("IMO limit", partial(_limit_cell, content, crafts)))
     return build_table(
         dict.fromkeys(name for craft_indices in crafts.values() for name in craft_indices), columns
     )
 
 
-def _table_by_trial(content: JsonObject, rows: Sequence[JsonObject]) -> Table:
+def _table_by_trial(content: IndicesFile, rows: Sequence[FlightIndices]) -> Table:
     """Return a row for each flight of one kind of manoeuvre."""
-    has_several = len({row["craft"] for row in rows}) > 1
+    has_several = len({row.craft for row in rows}) > 1
 
-    def cell(row: JsonObject, name: str) -> Cell:
-        entry = _scalar_indices(row).get(name, {})
-        text, _ = _format_index(content, name, entry)
-        return Cell(text) if entry.get("kept", True) else Cell(text, "beyond the IMO limit", "bad")
+    def cell(row: FlightIndices, name: str) -> Cell:
+        entry = row.scalar_indices.get(name)
+        text, _ = _format_index(content, name, None if entry is None else entry.value)
+        is_exceeded = entry is not None and entry.kept is False
+        return Cell(text, "beyond the IMO limit", "bad") if is_exceeded else Cell(text)
 
-    columns: list[Column] = [
-        ("log", lambda row: f"{row['log']} ({row['craft']})" if has_several else row["log"])
+    columns: list[Column[FlightIndices]] = [
+        ("log", lambda row: f"{row.log} ({row.craft})" if has_several else row.log)
     ]
-    for name in dict.fromkeys(name for row in rows for name in _scalar_indices(row)):
-        title = f"{index_title(name)} [{_format_index(content, name, {})[1]}]"
+    for name in dict.fromkeys(name for row in rows for name in row.scalar_indices):
+        title = f"{index_title(name)} [{_format_index(content, name, None)[1]}]"
         columns.append((title, lambda row, name=name: cell(row, name)))
     return build_table(rows, columns)
 
@@ -442,36 +439,34 @@ def booklet_section(run: RunFiles) -> Section | None:
 
     None where the run has no booklet.json.
     """
-    content = run.read_json("booklet.json")
-    if not content:
+    content = run.read_record(BookletFile, "booklet.json")
+    if content is None:
         return None
-    scale = float(content["scale"])
-    hull_text = f"a hull of {format_number(float(content['length']))} m"
+    scale = content.scale
+    hull_text = f"a hull of {format_number(content.length)} m"
     hull_text += f", a model at 1:{format_number(scale)}" if scale != 1 else ""
     scale_text = " The column ship scales the values by Froude's law." if scale != 1 else ""
     introduction = (
-        f"Model {content['model']} ran these manoeuvres for {hull_text}.{scale_text} The intervals"
-        f" ({100 * content['level']:.0f} %) come from {content['draws']} draws of the parameters"
+        f"Model {content.model} ran these manoeuvres for {hull_text}.{scale_text} The intervals"
+        f" ({100 * content.level:.0f} %) come from {content.draws} draws of the parameters"
         " from their uncertainty after the trials. They assume that the model's form is right."
     )
     blocks: list[Block] = [Text(introduction)]
-    for page in content["pages"]:
-        if not page["split"]:
-            page_blocks: list[Block] = [
-                _table_by_index(content, {content["model"]: page["indices"]})
-            ]
-            if page["faults"]:
-                draws = format_count(page["faults"], "draw")
+    for page in content.pages:
+        if not page.split:
+            page_blocks: list[Block] = [_table_by_index(content, {content.model: page.indices})]
+            if page.faults:
+                draws = format_count(page.faults, "draw")
                 warning = f"The intervals leave out {draws} that did not end the manoeuvre."
                 page_blocks.append(Bullets([warning], is_warning=True))
             blocks.append(Section(page_title(page), page_blocks))
-    repeated_pages = [page for page in content["pages"] if page["split"]]
+    repeated_pages = [page for page in content.pages if page.split]
     if repeated_pages:
-        first_overshoots = [page["indices"].get("first_overshoot", {}) for page in repeated_pages]
+        first_overshoots = [page.indices.get("first_overshoot") for page in repeated_pages]
         differences = [
-            abs(overshoot["difference"])
+            abs(overshoot.difference)
             for overshoot in first_overshoots
-            if "difference" in overshoot
+            if overshoot is not None and overshoot.difference is not None
         ]
         introduction = (
             "The model steers the rudder angle of each trial and reverses it at the trial's"
@@ -487,60 +482,65 @@ def booklet_section(run: RunFiles) -> Section | None:
     return Section("Manoeuvring booklet", blocks)
 
 
-def page_title(page: JsonObject) -> str:
+def page_title(page: BookletRow) -> str:
     """Return the name of a page, with the split of a measured log."""
-    name = str(page["name"])
-    return f"{name} ({page['split']})" if page["split"] else name.replace("_", " ")
+    return f"{page.name} ({page.split})" if page.split else page.name.replace("_", " ")
 
 
-def _repeated_zigzag_table(content: JsonObject, pages: Sequence[JsonObject]) -> Table:
+def _repeated_zigzag_table(content: BookletFile, pages: Sequence[BookletRow]) -> Table:
     """Return measured and predicted indices of the repeated zigzags, a row for each."""
-    index_units = {
-        name: display_unit(content["units"][name])
-        for name in _COMPARED_INDICES
-        if any("measured" in page["indices"].get(name, {}) for page in pages)
-    }
 
-    def cell(page: JsonObject, name: str, key: str) -> Cell:
-        entry = page["indices"].get(name, {})
-        factor = index_units[name][1]
-        if "measured" not in entry:
-            return Cell(DASH)
-        if key == "difference":
-            return Cell(format_number(factor * entry[key], 2))
-        note = format_interval(entry.get("interval"), factor) if key == "value" else ""
-        return Cell(format_number(factor * entry[key]), note)
+    def measured_index(page: BookletRow, name: str) -> BookletIndex | None:
+        entry = page.indices.get(name)
+        return None if entry is None or entry.measured is None else entry
 
-    return build_table(
-        pages,
-        [
-            ("log", page_title),
-            *(
-                (title, lambda page, name=name, key=key: cell(page, name, key))
-                for name in index_units
-                for title, key in (
-                    ("measured", "measured"),
-                    ("model", "value"),
-                    ("difference",) * 2,
-                )
-            ),
-        ],
-        groups=[(f"{index_title(name)} [{unit}]", 3) for name, (unit, _) in index_units.items()],
-    )
+    columns: list[Column[BookletRow]] = [("log", page_title)]
+    groups: list[tuple[str, int]] = []
+    for name in _COMPARED_INDICES:
+        if not any(measured_index(page, name) for page in pages):
+            continue
+        unit, factor = display_unit(content.units[name])
+        groups.append((f"{index_title(name)} [{unit}]", 3))
+
+        def measured_cell(page: BookletRow, name: str = name, factor: float = factor) -> Cell:
+            entry = measured_index(page, name)
+            if entry is None or entry.measured is None:
+                return Cell(DASH)
+            return Cell(format_number(factor * entry.measured))
+
+        def model_cell(page: BookletRow, name: str = name, factor: float = factor) -> Cell:
+            entry = measured_index(page, name)
+            if entry is None:
+                return Cell(DASH)
+            return Cell(
+                format_number(factor * entry.value), format_interval(entry.interval, factor)
+            )
+
+        def difference_cell(page: BookletRow, name: str = name, factor: float = factor) -> Cell:
+            entry = measured_index(page, name)
+            if entry is None or entry.difference is None:
+                return Cell(DASH)
+            return Cell(format_number(factor * entry.difference, 2))
+
+        columns += [
+            ("measured", measured_cell),
+            ("model", model_cell),
+            ("difference", difference_cell),
+        ]
+    return build_table(pages, columns, groups=groups)
 
 
 def booklet_figures(run: RunFiles) -> Iterator[Figure]:
     """Draw the turning circles with all draws and the repeated zigzags of a booklet."""
-    content = run.read_json("booklet.json")
+    content = run.read_record(BookletFile, "booklet.json")
     frame = run.read_parquet("booklet.parquet")
-    if not content or frame is None:
+    if content is None or frame is None:
         return
     by_page = {str(name): rows for name, rows in frame.groupby("page", sort=False)}
-    pages: list[Mapping[str, Any]] = content["pages"]
-    circle_pages = [page for page in pages if page["manoeuvre"] == "turning_circle"]
+    circle_pages = [page for page in content.pages if page.manoeuvre == "turning_circle"]
     if circle_pages:
         yield _turning_circle_figure(by_page, circle_pages, content)
-    zigzag_pages = [page for page in pages if page["manoeuvre"] == "zigzag"]
+    zigzag_pages = [page for page in content.pages if page.manoeuvre == "zigzag"]
     for first_index in range(0, len(zigzag_pages), _MAX_ZIGZAGS):
         figure_pages = zigzag_pages[first_index : first_index + _MAX_ZIGZAGS]
         panels = [
@@ -552,7 +552,7 @@ def booklet_figures(run: RunFiles) -> Iterator[Figure]:
             "Zigzags in closed loop",
             "The model steers by its own heading with the rudder angle and the reversals of"
             " each trial; the rudder is dotted. Look for the height of the peaks (overshoot)"
-            f" and for periods that run apart. The band holds {100 * content['level']:.0f} % of the"
+            f" and for periods that run apart. The band holds {100 * content.level:.0f} % of the"
             " draws at each instant.",
             {
                 "band": GlyphStyle(
@@ -566,10 +566,7 @@ def booklet_figures(run: RunFiles) -> Iterator[Figure]:
             [
                 Case(
                     "",
-                    [
-                        _zigzag_curves(by_page[page["name"]], content["level"])
-                        for page in figure_pages
-                    ],
+                    [_zigzag_curves(by_page[page.name], content.level) for page in figure_pages],
                 )
             ],
             columns=min(2, len(figure_pages)),
@@ -577,9 +574,9 @@ def booklet_figures(run: RunFiles) -> Iterator[Figure]:
 
 
 def _turning_circle_figure(
-    by_page: Mapping[str, Any], pages: Sequence[Mapping[str, Any]], content: JsonObject
+    by_page: Mapping[str, pd.DataFrame], pages: Sequence[BookletRow], content: BookletFile
 ) -> Figure:
-    length = float(content["length"])
+    length = content.length
     panel: dict[str, Curve] = {}
     styles = {
         "draws": GlyphStyle("draws", SOLID_STYLE.color, width=0.7, alpha=0.12, z_order=1),
@@ -587,16 +584,16 @@ def _turning_circle_figure(
     }
     curves_by_role: dict[bool, list[Curve]] = {True: [], False: []}
     for page in pages:
-        rows = by_page[page["name"]]
-        indices = page["indices"]
+        rows = by_page[page.name]
         for draw_number, draw_rows in rows[rows["draw"] >= 0].groupby("draw"):
             curves_by_role[draw_number == 0].append(
-                (draw_rows["y"] / length, draw_rows["x"] / length)
+                (draw_rows["y"].to_numpy() / length, draw_rows["x"].to_numpy() / length)
             )
-        if "tactical_diameter" in indices:
+        if "tactical_diameter" in page.indices:
             turn_sign = 1.0 if rows[rows["draw"] == 0]["psi"].iloc[-1] > 0 else -1.0
             advance, transfer, diameter = (
-                indices[name]["lengths"] for name in ("advance", "transfer", "tactical_diameter")
+                page.indices[name].value / length
+                for name in ("advance", "transfer", "tactical_diameter")
             )
             name = page_title(page)
             panel[name] = join_with_gaps(
@@ -620,7 +617,7 @@ def _turning_circle_figure(
         "booklet_circles",
         "Turning circles",
         "North is up; distances are in hull lengths from the place of the order. Thin"
-        f" lines are {content['draws']} draws of the model's parameters. Black lines mark"
+        f" lines are {content.draws} draws of the model's parameters. Black lines mark"
         " advance (to 90 deg) and tactical diameter (to 180 deg) of the fitted model.",
         styles | {"start": START_STYLE},
         [Panel("north [hull lengths]", "east [hull lengths]", kind="map", height=380)],
@@ -628,8 +625,8 @@ def _turning_circle_figure(
     )
 
 
-def _zigzag_curves(rows: Any, level: float) -> dict[str, Curve]:
-    def relative_heading_deg(draw_rows: Any) -> np.ndarray:
+def _zigzag_curves(rows: pd.DataFrame, level: float) -> dict[str, Curve]:
+    def relative_heading_deg(draw_rows: pd.DataFrame) -> np.ndarray:
         heading_change: np.ndarray = (
             DEGREES_PER_RADIAN * (draw_rows["psi"] - draw_rows["psi"].iloc[0]).to_numpy()
         )

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from residnet.core.errors import ConfigError
 from residnet.core.format import (
@@ -20,11 +18,14 @@ from residnet.core.format import (
 )
 from residnet.core.format import format_integer as whole_number
 from residnet.core.names import CHANNEL_UNITS
+from residnet.evaluation.records import GoodnessFile, GoodnessRow
 from residnet.evaluation.verdict import describe_divergence
+from residnet.identification.records import CoefficientRow, FitNotes, Hyperparameter
 from residnet.physics.terms import parse_term
 from residnet.report.blocks import Block, Cell, CellMark, Code, Section, Table, Text, build_table
 from residnet.report.figure import BLUE, Case, Curve, Figure, GlyphStyle, Panel, style_family
-from residnet.report.run_reader import JsonObject, RunFiles
+from residnet.report.run_reader import RunFiles
+from residnet.report.run_settings import HeadSettings, ModelSettings
 from residnet.report.sections.runs import AXES, model_styles, short_label
 
 _EXTRA_UNITS = {"wind_u": "m/s", "wind_v": "m/s", "wind_mag": "m/s"}
@@ -43,9 +44,9 @@ def models_section(run: RunFiles) -> Section | None:
     """Return the section on identified and learned models."""
     candidate_sections = [_baseline_section(run), _head_section(run)]
     candidate_sections += [
-        _equation_section(model, run.fit_notes(model))
+        _equation_section(model, notes)
         for model in run.heads
-        if run.fit_notes(model).get("equations")
+        if (notes := run.fit_notes(model)) is not None and notes.equations
     ]
     present_sections = [section for section in candidate_sections if section is not None]
     return Section("Models", present_sections) if present_sections else None
@@ -63,11 +64,11 @@ def _baseline_section(run: RunFiles) -> Section | None:
     further_baselines = [model for model, kind in run.model_kinds.items() if kind == "further"]
     for model in (run.baseline or "baseline", *further_baselines):
         notes = run.fit_notes(model)
-        if not notes.get("coefficients"):
+        if notes is None or not notes.coefficients:
             continue
         baseline_blocks: list[Block] = [_coefficient_table(notes)]
         title = f"Parameters of {model}"
-        if notes.get("refit"):
+        if notes.refit is not None:
             baseline_blocks.insert(0, Text(_refit_text(model, notes), is_secondary=True))
             title += ", refitted through rollouts"
         blocks += (
@@ -78,10 +79,10 @@ def _baseline_section(run: RunFiles) -> Section | None:
     return Section("Baseline parameters", blocks) if len(blocks) > 1 else None
 
 
-def _refit_text(model: str, notes: JsonObject) -> str:
+def _refit_text(model: str, notes: FitNotes) -> str:
     fixed_terms, unidentifiable_terms = (
-        ", ".join(f"{term} in {axis.replace('_dot', '')}′" for axis, term in notes.get(key) or [])
-        for key in ("feeding", "open")
+        ", ".join(f"{term} in {axis.replace('_dot', '')}′" for axis, term in parameters)
+        for parameters in (notes.feeding, notes.open)
     )
     text = (
         f"{model}: values and standard errors are those after the refit through rollouts. The"
@@ -94,31 +95,30 @@ def _refit_text(model: str, notes: JsonObject) -> str:
     return text
 
 
-def _coefficient_table(notes: JsonObject) -> Table:
+def _coefficient_table(notes: FitNotes) -> Table:
     """Return coefficients with their standard errors, to two digits of these, and units."""
 
-    def value(entry: JsonObject) -> str:
-        value = float(entry["value"])
-        error = float(entry["standard_error"])
+    def value(row: CoefficientRow) -> str:
+        error = row.standard_error
         decimals = max(1 - math.floor(math.log10(error)), 0) if error > 0 else 7
         # an exact one has no error to tell its digits by
-        return format_fixed(value, decimals) if decimals <= 6 else format_number(value, 4)
+        return format_fixed(row.value, decimals) if decimals <= 6 else format_number(row.value, 4)
 
-    def ratio(entry: JsonObject) -> Cell:
-        value = abs(float(entry["value"]))
-        error = float(entry["standard_error"])
+    def ratio(row: CoefficientRow) -> Cell:
+        value = abs(row.value)
+        error = row.standard_error
         if error <= 1e-9 * value:
             return Cell("exact")
         return Cell(format_number(value / error, 2), mark="weak" if value < 2 * error else "")
 
     return build_table(
-        notes["coefficients"],
+        notes.coefficients,
         [
-            ("term", lambda entry: f"{entry['axis'].replace('_dot', '')}′: {entry['term']}"),
+            ("term", lambda row: f"{row.axis.replace('_dot', '')}′: {row.term}"),
             ("value", value, str),
-            ("standard error", lambda entry: format_number(float(entry["standard_error"]), 2), str),
+            ("standard error", lambda row: format_number(row.standard_error, 2), str),
             ("value / error", ratio),
-            ("unit", lambda entry: term_unit(entry["axis"], entry["term"]), str),
+            ("unit", lambda row: term_unit(row.axis, row.term), str),
         ],
     )
 
@@ -167,36 +167,53 @@ def _head_section(run: RunFiles) -> Section | None:
 
     None if the folder holds no notes on any fit.
     """
-    if not any(run.fit_notes(model) for model in run.heads):
+    notes_by_model = {model: run.fit_notes(model) for model in run.heads}
+    if not any(notes_by_model.values()):
         return None
+    # a model without a file has empty notes
+    notes_or_defaults = {model: notes or FitNotes() for model, notes in notes_by_model.items()}
 
     def parameter_count(model: str) -> str:
-        notes = run.fit_notes(model)
-        n_parameters = notes.get("parameters") or 3 * (int(notes.get("terms", -1)) + 1)
+        notes = notes_or_defaults[model]
+        n_parameters = notes.parameters
+        if not n_parameters and isinstance(notes.terms, float):
+            # closed forms have a coefficient for each term and an offset, on each of three axes
+            n_parameters = 3 * (notes.terms + 1)
         return whole_number(n_parameters) if n_parameters else DASH
 
     def error_cell(model: str) -> Cell:
         row = run.find_row(model, "validation", run.selection_protocol)
-        value = row["nrmse"]["mean"] if row else run.fit_notes(model).get("validation")
-        has_diverged = row is not None and row["diverged"]
+        value = notes_or_defaults[model].validation if row is None else row.mean_nrmse
+        has_diverged = row is not None and row.diverged > 0
         note = describe_divergence(row) if row else ""
         mark: CellMark = "best" if model == run.selected else "bad" if has_diverged else ""
         return Cell(format_number(value), note, mark)
 
     def head_kind(model: str) -> str:
-        card = run.model_card(model)
-        return str((card.get("head") or {}).get("kind") or card.get("role", DASH))
+        settings = run.model_settings(model)
+        head_name = "" if settings.head is None else settings.head.kind
+        return head_name or settings.role or DASH
+
+    def epochs_text(model: str) -> str:
+        epochs = notes_or_defaults[model].epochs
+        return DASH if epochs is None else str(epochs)
 
     table = build_table(
         run.heads,
         [
             ("head", run.model_label),
             ("kind", head_kind, str),
-            ("complexity", lambda model: _complexity_text(run, model)),
+            (
+                "complexity",
+                lambda model: _complexity_text(run.model_settings(model), notes_or_defaults[model]),
+            ),
             ("parameters", parameter_count, str),
-            ("inputs; baseline below", lambda model: _inputs_text(run, model)),
-            ("fit [s]", lambda model: format_number(run.fit_notes(model).get("seconds"), 2), str),
-            ("epochs", lambda model: str(run.fit_notes(model).get("epochs", DASH)), str),
+            (
+                "inputs; baseline below",
+                lambda model: _inputs_text(run.model_settings(model), notes_or_defaults[model]),
+            ),
+            ("fit [s]", lambda model: format_number(notes_or_defaults[model].seconds, 2), str),
+            ("epochs", epochs_text, str),
             ("validation NRMSE [-]", error_cell),
         ],
         is_selected=lambda model: model == run.selected,
@@ -210,55 +227,46 @@ def _head_section(run: RunFiles) -> Section | None:
     )
 
 
-def _inputs_text(run: RunFiles, model: str) -> str:
+def _inputs_text(settings: ModelSettings, notes: FitNotes) -> str:
     """Return the inputs of a head and the baseline below it, or the members of an ensemble."""
-    notes = run.fit_notes(model)
-    head = run.model_card(model).get("head") or {}
-    if notes.get("members"):
-        return "mean of " + ", ".join(notes["members"])
-    if not head:
-        return "refitted through rollouts" if notes.get("refit") else "least squares"
-    baseline_name = notes.get("baseline", "baseline")
-    inputs = ", ".join(head.get("features") or []) or "all channels"
-    return inputs if baseline_name == "baseline" else f"{inputs}; {baseline_name}"
+    if notes.members:
+        return "mean of " + ", ".join(notes.members)
+    if settings.head is None:
+        return "refitted through rollouts" if notes.refit is not None else "least squares"
+    inputs = ", ".join(settings.head.features or ()) or "all channels"
+    return inputs if notes.baseline == "baseline" else f"{inputs}; {notes.baseline}"
 
 
-_COMPLEXITY_FORMATS = {
-    "terms": "{} basis functions",
-    "order": "order {} (latent variables)",
-    "penalty": "penalty {}",
-    "hidden": "layers of {}",
-    "hidden_size": "{} hidden units",
-}
-"""Keys of head notes and cards with their display format."""
-
-
-def _complexity_text(run: RunFiles, model: str) -> str:
-    head = run.model_card(model).get("head") or {}
-    texts = []
-    # a card's `term_figures` are names
-    properties = dict(run.fit_notes(model)) | {
-        key: head[key] for key in ("hidden", "hidden_size") if key in head
+def _complexity_text(settings: ModelSettings, notes: FitNotes) -> str:
+    """Return the selected settings of a head and the size of its network."""
+    head = settings.head or HeadSettings()
+    formats: dict[str, Hyperparameter | None] = {
+        "{} basis functions": notes.terms,
+        "order {} (latent variables)": notes.order,
+        "penalty {}": notes.penalty,
+        "layers of {}": head.hidden,
+        "{} hidden units": head.hidden_size,
     }
-    for key, text_format in _COMPLEXITY_FORMATS.items():
-        if key in properties:
-            values = properties[key] if isinstance(properties[key], list) else [properties[key]]
-            texts.append(text_format.format(", ".join(f"{value:g}" for value in values)))
-    return ("; ".join(texts) or DASH) + (" for each axis" if head.get("per_axis") else "")
+    texts = []
+    for text_format, value in formats.items():
+        if value is not None:
+            values = value if isinstance(value, tuple) else (value,)
+            numbers = [text if isinstance(text, str) else f"{text:g}" for text in values]
+            texts.append(text_format.format(", ".join(numbers)))
+    return ("; ".join(texts) or DASH) + (" for each axis" if head.per_axis else "")
 
 
-def _equation_section(model: str, notes: JsonObject) -> Section:
+def _equation_section(model: str, notes: FitNotes) -> Section:
     """Return the equations of a model with their uncertainty and non-identifiable terms."""
-    delay = notes.get("delay")
-    introduction = "SI units. The head adds these accelerations to its baseline." + (
-        f" Delayed inputs act {delay['seconds']:g} s after they are given." if delay else ""
-    )
+    introduction = "SI units. The head adds these accelerations to its baseline."
+    if notes.delay is not None:
+        introduction += f" Delayed inputs act {notes.delay.seconds:g} s after they are given."
     return Section(
         f"Equations of {model}",
         [
             Text(introduction, is_secondary=True),
             Code(
-                "\n".join(equation["text"] for equation in notes["equations"].values()),
+                "\n".join(equation.text for equation in notes.equations.values()),
                 wraps_lines=True,
             ),
             _coefficient_table(notes),
@@ -267,33 +275,31 @@ def _equation_section(model: str, notes: JsonObject) -> Section:
     )
 
 
-def equation_remarks(notes: JsonObject) -> list[str]:
+def equation_remarks(notes: FitNotes) -> list[str]:
     """Return sentences on non-identifiable combinations of terms."""
     sentences = []
-    equal_terms: dict[str, JsonObject] = {}
-    for name, equation in notes["equations"].items():
-        equal_terms |= equation["same_as_simpler"]
+    equal_terms: dict[str, dict[str, float]] = {}
+    for name, equation in notes.equations.items():
+        equal_terms |= equation.same_as_simpler
         sentences.append(
-            f"{name}: {equation['candidates']} candidate terms differ on these data (condition"
-            f" number {equation['condition']:.1e}). {100 * equation['error_share']:.2g} % of the"
+            f"{name}: {equation.candidates} candidate terms differ on these data (condition"
+            f" number {equation.condition:.1e}). {100 * equation.error_share:.2g} % of the"
             " target (RMS) stays unexplained."
         )
-        for term, alternatives in equation["cannot_tell_apart"].items():
+        for term, alternatives in equation.cannot_tell_apart.items():
             sentences.append(
                 f"{name}: the data cannot tell {term} from {_join_truncated(alternatives)}."
             )
-        if equation["undecided"]:
-            terms = [
-                f"{term} ({100 * share:.0f} %)" for term, share in equation["undecided"].items()
-            ]
+        if equation.undecided:
+            terms = [f"{term} ({100 * share:.0f} %)" for term, share in equation.undecided.items()]
             sentences.append(
                 f"{name}: these terms were left out, but within two standard errors they could"
                 f" make up the stated share of the target: {_join_truncated(terms)}."
             )
-    if notes["unexcited"]:
+    if notes.unexcited:
         sentences.append(
             "These terms are 0 in all samples, so nothing is known of them:"
-            f" {_join_truncated(notes['unexcited'])}."
+            f" {_join_truncated(notes.unexcited)}."
         )
     if equal_terms:
         texts = [
@@ -310,7 +316,7 @@ def equation_remarks(notes: JsonObject) -> list[str]:
     return sentences
 
 
-def _join_truncated(names: list[str]) -> str:
+def _join_truncated(names: Sequence[str]) -> str:
     remainder = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
     return ", ".join(names[:_MAX_LISTED]) + remainder
 
@@ -318,7 +324,9 @@ def _join_truncated(names: list[str]) -> str:
 def term_figures(run: RunFiles) -> Iterator[Figure]:
     """Draw the equation of every model along a log, term by term (document 000, 6.4.2)."""
     frame = run.read_parquet("terms.parquet")
-    for model, rows in [] if frame is None else frame.groupby("model", sort=False):
+    if frame is None:
+        return
+    for model, rows in frame.groupby("model", sort=False):
         panel_curves: list[dict[str, Curve]] = []
         axes = [axis for axis in AXES if (rows["axis"] == axis).any()]
         for axis in axes:
@@ -382,19 +390,21 @@ def term_figures(run: RunFiles) -> Iterator[Figure]:
 def evolution_figures(run: RunFiles) -> Iterator[Figure]:
     """Draw the best error of each generation of every model that was bred (Figures 6.2, 6.3)."""
     for model in run.heads:
-        equations = run.fit_notes(model).get("equations", {})
-        panel_curves: list[Any] = []
+        notes = run.fit_notes(model)
+        equations = {} if notes is None else notes.equations
+        panel_curves: list[dict[str, Curve]] = []
         panels: list[Panel] = []
-        for axis, row in ((axis, row) for axis, row in equations.items() if "history" in row):
-            errors = pd.DataFrame(row["history"])
-            selected_generation = errors.iloc[[row["generation"]]]
+        for axis, equation in equations.items():
+            if not equation.history:
+                continue
+            generations = np.arange(len(equation.history))
+            validation = np.array([row.validation for row in equation.history])
+            selected_generation = [equation.generation]
             panel_curves.append(
-                {split: (errors.index.to_numpy(), errors[split].to_numpy()) for split in _SPLITS}
-                | {
-                    "kept": (
-                        selected_generation.index.to_numpy(),
-                        selected_generation["validation"].to_numpy(),
-                    )
+                {
+                    "train": (generations, np.array([row.train for row in equation.history])),
+                    "validation": (generations, validation),
+                    "kept": (generations[selected_generation], validation[selected_generation]),
                 }
             )
             label = "" if panels else "share of the mean square [-]"
@@ -421,12 +431,12 @@ def learning_figure(run: RunFiles) -> Figure | None:
     head_cases = []
     reference = run.find_row(run.baseline, "validation", run.selection_protocol)
     for model in run.heads:
-        points = pd.DataFrame(run.fit_notes(model).get("curve") or [])
-        if points.empty:
+        notes = run.fit_notes(model)
+        if notes is None or not notes.curve:
             continue
-        points = points.reindex(columns=["epoch", "stage", "loss", "validation"])
-        epoch, stage, loss, validation = points.fillna({"stage": 0}).to_numpy(float).T
-        epoch += 1
+        points = [(row.epoch + 1, row.stage, row.loss, row.validation) for row in notes.curve]
+        # a missing number becomes NaN, which is not drawn
+        epoch, stage, loss, validation = np.array(points, dtype=float).T
         # each stage has a loss of its own
         stage_starts = np.flatnonzero(np.diff(stage)) + 1
         loss_curves: dict[str, Curve] = {
@@ -437,7 +447,7 @@ def learning_figure(run: RunFiles) -> Figure | None:
             "validation": (epoch[has_validation], validation[has_validation])
         }
         if reference is not None:
-            error_curves["baseline"] = (epoch[:1], np.array([reference["nrmse"]["mean"]]))
+            error_curves["baseline"] = (epoch[:1], np.array([reference.mean_nrmse]))
         if has_validation.any():
             best_index = [int(np.nanargmin(validation))]
             error_curves["best"] = (epoch[best_index], validation[best_index])
@@ -446,17 +456,11 @@ def learning_figure(run: RunFiles) -> Figure | None:
                 epoch[stage_starts] - 0.5,
                 np.zeros(len(stage_starts)),
             )
-        # runs of earlier versions have the settings in their config only
-        training = (
-            run.fit_notes(model).get("training")
-            or (run.resolved_config.get("training") or {}).get(model)
-            or {}
-        )
-        multi_step_stages = training.get("multi_step") or []
-        stage_labels = {
-            k + 1: f"{stage_config['horizon']:g} s"
-            for k, stage_config in enumerate(multi_step_stages)
-        } | {0: "one-step"}
+        training = notes.training or run.fit_settings.training.get(model)
+        stages = () if training is None else training.multi_step
+        stage_labels = {0: "one-step"} | {
+            k + 1: f"{stage_settings.horizon:g} s" for k, stage_settings in enumerate(stages)
+        }
         texts = [
             (
                 0,
@@ -497,11 +501,12 @@ def goodness_section(run: RunFiles) -> Section | None:
 
     It uses the split of the report, or another split if that has no samples.
     """
-    splits = run.read_json("goodness.json").get("splits") or {}
+    goodness = run.read_record(GoodnessFile, "goodness.json")
+    splits = {} if goodness is None else goodness.splits
     split = next((name for name in (run.report_split, *splits) if splits.get(name)), "")
     axis_sections: list[Block] = []
     for axis, (title, *_) in AXES.items():
-        axis_rows = [row for row in splits.get(split, []) if row["axis"] == axis]
+        axis_rows = [row for row in splits.get(split, ()) if row.axis == axis]
         if axis_rows:
             name = axis.removesuffix("_dot")
             unit, factor = run.display_unit(name)
@@ -540,58 +545,56 @@ def goodness_section(run: RunFiles) -> Section | None:
     )
 
 
-def _goodness_tables(rows: list[JsonObject], factor: float) -> list[Table]:
+def _goodness_tables(rows: Sequence[GoodnessRow], factor: float) -> list[Table]:
     """Return how close each model fits on one axis, and how sure its residuals are."""
 
-    def whiteness_cell(row: JsonObject) -> Cell:
-        p = row["white_p"]
+    def whiteness_cell(row: GoodnessRow) -> Cell:
+        p = row.white_p
         return Cell(
             "< 0.001" if p < 1e-3 else format_number(p, 2),
             mark="" if p > _MIN_WHITE_NOISE_P else "weak",
         )
 
-    def difference_cell(row: JsonObject) -> Cell:
-        paired = row.get("difference")
+    def difference_cell(row: GoodnessRow) -> Cell:
+        paired = row.difference
         if paired is None:
             return Cell(DASH)
-        text = (
-            f"{format_number(factor * paired['mae'])} ({format_interval(paired['ci95'], factor)})"
-        )
-        return Cell(text, f"to {paired['to']}", "best" if paired["excludes_zero"] else "")
+        text = f"{format_number(factor * paired.mae)} ({format_interval(paired.ci95, factor)})"
+        return Cell(text, f"to {paired.to}", "best" if paired.excludes_zero else "")
 
     return [
         build_table(
             rows,
             [
-                ("model", "model"),
-                ("parameters", "parameters", format_number),
-                ("RMSE", "rmse", format_number, factor),
-                ("R²", "r2", format_number),
-                ("adjusted R²", "r2_adjusted", format_number),
-                ("C_p", "cp", format_number, factor**2),
-                ("AIC", lambda row: format_number(row["aic"], 4), str),
-                ("BIC", lambda row: format_number(row["bic"], 4), str),
+                ("model", lambda row: row.model),
+                ("parameters", lambda row: row.parameters, format_number),
+                ("RMSE", lambda row: row.rmse, format_number, factor),
+                ("R²", lambda row: row.r2, format_number),
+                ("adjusted R²", lambda row: row.r2_adjusted, format_number),
+                ("C_p", lambda row: row.cp, format_number, factor**2),
+                ("AIC", lambda row: format_number(row.aic, 4), str),
+                ("BIC", lambda row: format_number(row.bic, 4), str),
             ],
         ),
         build_table(
             rows,
             [
-                ("model", "model"),
-                ("mean |residual|", "mae", format_number, factor),
-                ("95 %, blocks", lambda row: format_interval(row["mae_ci95"], factor), str),
+                ("model", lambda row: row.model),
+                ("mean |residual|", lambda row: row.mae, format_number, factor),
+                ("95 %, blocks", lambda row: format_interval(row.mae_ci95, factor), str),
                 (
                     "95 %, independent",
                     lambda row: Cell(
-                        format_interval(row["mae_ci95_independent"], factor), mark="weak"
+                        format_interval(row.mae_ci95_independent, factor), mark="weak"
                     ),
                 ),
-                ("block [s]", lambda row: format_number(row["block_seconds"], 2), str),
+                ("block [s]", lambda row: format_number(row.block_seconds, 2), str),
                 (
                     "independent samples",
-                    lambda row: f"{row['effective']:.0f} of {row['samples']}",
+                    lambda row: f"{row.effective:.0f} of {row.samples}",
                     str,
                 ),
-                ("correlation at lag 1", lambda row: format_number(row["autocorrelation"][0]), str),
+                ("correlation at lag 1", lambda row: format_number(row.autocorrelation[0]), str),
                 ("white, p", whiteness_cell),
                 ("difference", difference_cell),
             ],
@@ -599,17 +602,14 @@ def _goodness_tables(rows: list[JsonObject], factor: float) -> list[Table]:
     ]
 
 
-def _goodness_sentences(rows: list[JsonObject]) -> list[str]:
+def _goodness_sentences(rows: Sequence[GoodnessRow]) -> list[str]:
     """Return the correction of confidence intervals for autocorrelation and the whiteness of
     residuals.
     """
-    interval_widths = [
-        [np.ptp(row[key] or [0.0]) for key in ("mae_ci95", "mae_ci95_independent")] for row in rows
-    ]
     width_ratios = [
-        blocks / independent
-        for blocks, independent in interval_widths
-        if blocks and independent > 0
+        np.ptp(row.mae_ci95) / np.ptp(row.mae_ci95_independent)
+        for row in rows
+        if row.mae_ci95 and row.mae_ci95_independent and np.ptp(row.mae_ci95_independent) > 0
     ]
     sentences = []
     if width_ratios:
@@ -617,7 +617,7 @@ def _goodness_sentences(rows: list[JsonObject]) -> list[str]:
             "The interval that takes the samples for independent is"
             f" {min(width_ratios):.1f} to {max(width_ratios):.1f} times too narrow."
         )
-    white_models = [row["model"] for row in rows if row["white_p"] > _MIN_WHITE_NOISE_P]
+    white_models = [row.model for row in rows if row.white_p > _MIN_WHITE_NOISE_P]
     sentences.append(
         f"The residuals of {', '.join(white_models)} pass for white noise."
         if white_models

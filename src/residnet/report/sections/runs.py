@@ -300,8 +300,7 @@ def _select_windows(
 
 def _rank_by_error(run: RunFiles, windows: Sequence[StoredWindow]) -> list[StoredWindow]:
     """Return the runs of the leading model, the one of least error first."""
-    stored_scales = run.metrics.get("scales") or {}
-    scales = {name: float(stored_scales.get(name, 1.0)) for name in run.dof.dynamic_states}
+    scales = {name: run.metrics.scales.get(name, 1.0) for name in run.dof.dynamic_states}
     return sorted(
         (window for window in windows if run.main_model in window.predicted),
         key=lambda one: (one.mean_nrmse(run.main_model, scales), one.log, one.number),
@@ -433,7 +432,9 @@ def _build_error_panels(
 def residual_figure(run: RunFiles) -> Figure | None:
     """Draw residual targets against predictions, a case for each head."""
     frame = run.read_parquet("residuals.parquet")
-    models = [] if frame is None else [head for head in run.heads if (frame["model"] == head).any()]
+    if frame is None:
+        return None
+    models = [head for head in run.heads if (frame["model"] == head).any()]
     if not models:
         return None
     axes = [f"{name}_dot" for name in run.dof.velocities]
@@ -492,7 +493,7 @@ def residual_figure(run: RunFiles) -> Figure | None:
 def band_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw the half width of the prediction bands of the main model against the errors."""
     model = run.main_model
-    bands_by_protocol = (run.read_json("bands.json").get("models") or {}).get(model) or {}
+    bands_by_protocol = run.bands.get(model, {})
     cases = []
     coverage_level = 0.0
     panels, factors = _build_error_panels(run, "", 165)
@@ -504,7 +505,7 @@ def band_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None
         ]
         if not band_windows:
             continue
-        coverage_level = float(band["level"])
+        coverage_level = band.level
         # of the position the box about the circle: half its width is the radius
         widths = [
             pd.DataFrame(

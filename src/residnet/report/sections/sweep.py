@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,8 @@ from residnet.report.figure import (
     tick_labels,
 )
 from residnet.report.figure_files import write_figures
-from residnet.report.run_reader import JsonObject, RunFiles
+from residnet.report.records import SweepFile, SweepTrial
+from residnet.report.run_reader import RunFiles
 from residnet.report.sections.variants import VARIANTS_FILE, variant_sections
 
 _MAX_SHOWN_TRIALS = 15
@@ -42,14 +42,14 @@ _RANK_GROUPS = (
 """Groups of trials by their rank: from which share of them, to which, and how they are drawn."""
 
 
-def parallel_coordinates(content: Mapping[str, Any]) -> Figure:
+def parallel_coordinates(content: SweepFile) -> Figure:
     """Draw each finished trial of sweep.json as a line over its keys to its value."""
-    rows = [row for row in content["trials"] if row["value"] is not None]
-    values = np.array([row["value"] for row in rows])
-    rank = np.argsort(np.argsort(values if content["minimized"] else -values))
-    keys = list(content["keys"])
+    rows = [trial for trial, _ in content.completed]
+    values = np.array([value for _, value in content.completed])
+    rank = np.argsort(np.argsort(values if content.minimized else -values))
+    keys = content.keys
     positions, ticks = zip(
-        *(_axis_positions(rows, key, key in content["log"]) for key in keys), strict=True
+        *(_axis_positions(rows, key, key in content.log) for key in keys), strict=True
     )
     value_range = np.ptp(values) or 1.0
     heights = np.column_stack([*positions, (values - values.min()) / value_range])
@@ -93,12 +93,12 @@ def parallel_coordinates(content: Mapping[str, Any]) -> Figure:
     )
 
 
-def _progress_figure(content: Mapping[str, Any]) -> Figure:
+def _progress_figure(content: SweepFile) -> Figure:
     """Draw the value of each trial, and the best one so far."""
-    rows = [row for row in content["trials"] if row["value"] is not None]
-    rows.sort(key=lambda row: int(row["number"]))
-    trial_numbers, values = (np.array([row[key] for row in rows]) for key in ("number", "value"))
-    running_best = np.minimum if content["minimized"] else np.maximum
+    value_by_number = {trial.number: value for trial, value in content.completed}
+    trial_numbers = np.array(sorted(value_by_number))
+    values = np.array([value_by_number[number] for number in sorted(value_by_number)])
+    running_best = np.minimum if content.minimized else np.maximum
     return Figure(
         "course",
         "Course of the sweep",
@@ -122,9 +122,9 @@ def _progress_figure(content: Mapping[str, Any]) -> Figure:
     )
 
 
-def _importance_figure(content: Mapping[str, Any]) -> Figure:
+def _importance_figure(content: SweepFile) -> Figure:
     """Draw the share of each key in the variance of the values."""
-    importances = dict(sorted(content["importance"].items(), key=lambda pair: -pair[1]))
+    importances = dict(sorted(content.importance.items(), key=lambda pair: -pair[1]))
     outlines = bar_outlines(range(len(importances)), importances.values())[::-1]
     return Figure(
         "importance",
@@ -147,17 +147,21 @@ def _importance_figure(content: Mapping[str, Any]) -> Figure:
 
 
 def _axis_positions(
-    rows: Sequence[Mapping[str, Any]], key: str, log: bool
+    rows: Sequence[SweepTrial], key: str, log: bool
 ) -> tuple[np.ndarray, list[tuple[float, str]]]:
     """Return the heights of the trials on the axis of a key [trials], and marks on that axis."""
-    key_values = [row["values"][key] for row in rows]
-    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in key_values):
-        numeric_values = np.log(key_values) if log else np.array(key_values, dtype=float)
+    key_values = [row.values[key] for row in rows]
+    numbers = [
+        value
+        for value in key_values
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    ]
+    if len(numbers) == len(key_values):
+        numeric_values = np.log(numbers) if log else np.array(numbers, dtype=float)
         value_range = np.ptp(numeric_values) or 1.0
-        end_marks = [(0.0, f"{min(key_values):.4g}"), (1.0, f"{max(key_values):.4g}")]
-        return (numeric_values - numeric_values.min()) / value_range, end_marks[
-            : len(set(key_values))
-        ]
+        end_marks = [(0.0, f"{min(numbers):.4g}"), (1.0, f"{max(numbers):.4g}")]
+        heights = (numeric_values - numeric_values.min()) / value_range
+        return heights, end_marks[: len(set(numbers))]
     texts = [json.dumps(value) for value in key_values]
     categories = sorted(set(texts))
     step = 1.0 / max(len(categories) - 1, 1)
@@ -179,26 +183,26 @@ def sections(run: RunFiles) -> list[Section]:
     """Return the sections with the best trials, the figures in the folder and all trials."""
     if (run.path / VARIANTS_FILE).is_file():
         return variant_sections(run)
-    content = run.read_json("sweep.json")
+    content = run.read_required_record(SweepFile, "sweep.json")
     figures = []
-    if content["best"] is not None:
+    if content.best is not None:
         figures = [parallel_coordinates(content), _progress_figure(content)]
-        if content["importance"]:
+        if content.importance:
             figures.append(_importance_figure(content))
     figures = write_figures(run.path / "figures", figures)
     introduction = [
         f"Each trial is a run of its own below trials/; sought is the"
-        f" {'least' if content['minimized'] else 'greatest'} {objective_text(content)}.",
+        f" {'least' if content.minimized else 'greatest'} {objective_text(content)}.",
         "best.yaml holds the config of the best trial with all its keys.",
     ]
-    by_number = sorted(content["trials"], key=lambda row: int(row["number"]))
+    by_number = sorted(content.trials, key=lambda trial: trial.number)
     best_trials = trials_table(content)
     return [
         Section(
             "",
             [
                 *figures[:1],
-                best_trials.select_columns(0, 1 + len(content["keys"])),
+                best_trials.select_columns(0, 1 + len(content.keys)),
                 Text(introduction, is_secondary=True),
             ],
         ),
@@ -207,36 +211,35 @@ def sections(run: RunFiles) -> list[Section]:
     ]
 
 
-def trials_table(content: JsonObject) -> Table:
+def trials_table(content: SweepFile) -> Table:
     """Return the best trials of sweep.json with their values, the best first."""
-    sign = 1.0 if content["minimized"] else -1.0
-    finished = [row for row in content["trials"] if row["value"] is not None]
-    finished.sort(key=lambda row: (sign * row["value"], row["number"]))
-    return _build_trials_table(content, finished[:_MAX_SHOWN_TRIALS])
+    sign = 1.0 if content.minimized else -1.0
+    ranked = sorted(content.completed, key=lambda pair: (sign * pair[1], pair[0].number))
+    return _build_trials_table(content, [trial for trial, _ in ranked[:_MAX_SHOWN_TRIALS]])
 
 
-def _build_trials_table(content: JsonObject, rows: Sequence[JsonObject]) -> Table:
-    def value(row: JsonObject, key: str) -> str:
-        key_value = row["values"][key]
+def _build_trials_table(content: SweepFile, rows: Sequence[SweepTrial]) -> Table:
+    def value(row: SweepTrial, key: str) -> str:
+        key_value = row.values[key]
         return f"{key_value:.4g}" if isinstance(key_value, float) else json.dumps(key_value)
 
     return build_table(
         rows,
         [
-            ("trial", "number"),
+            ("trial", lambda row: row.number),
             (
                 objective_text(content),
-                lambda row: "" if row["value"] is None else format_number(row["value"], 5),
+                lambda row: "" if row.value is None else format_number(row.value, 5),
                 str,
             ),
-            *((key, lambda row, key=key: value(row, key), str) for key in content["keys"]),
-            ("run [s]", "seconds", 1),
-            ("state", lambda row: Cell(row["state"], row["fault"], mark="text")),
+            *((key, lambda row, key=key: value(row, key), str) for key in content.keys),
+            ("run [s]", lambda row: row.seconds, 1),
+            ("state", lambda row: Cell(row.state, row.fault, mark="text")),
         ],
-        is_selected=lambda row: row["number"] == content["best"],
+        is_selected=lambda row: row.number == content.best,
     )
 
 
-def objective_text(content: JsonObject) -> str:
+def objective_text(content: SweepFile) -> str:
     """Return the name and unit of the objective; dimensionless objectives have no unit sign."""
-    return str(content["objective"]).removesuffix(" [-]")
+    return content.objective.removesuffix(" [-]")

@@ -132,7 +132,7 @@ def tabulate_variants(rows: Sequence[JsonObject], reference: str) -> Table:
             f"{row['nrmse_mean']:.4f}", note, "bad" if n_diverged else "best" if is_lowest else ""
         )
 
-    protocol_columns: list[Column] = [
+    protocol_columns: list[Column[JsonObject]] = [
         ("NRMSE", format_error),
         ("sd of seeds", lambda row: row["nrmse_sd"], 4),
         (

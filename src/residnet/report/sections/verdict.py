@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from residnet.core.format import (
     DASH,
@@ -13,14 +14,14 @@ from residnet.core.format import (
     format_percent_change,
 )
 from residnet.core.model_names import CONSTANT_VELOCITY
-from residnet.evaluation.soundness import CHECKS, SanityFinding
+from residnet.evaluation.records import SANITY_CHECKS, Interval, SanityRow
 from residnet.evaluation.verdict import UNSEEN_SPLITS, VerdictEvidence, describe_divergence
 from residnet.evaluation.verdict import rate_model as judged_level
 from residnet.evaluation.verdict import write_verdict as judged
 from residnet.quality import summarize_inspection
 from residnet.report.blocks import Bullets, Cell, Facts, Section, Text, build_table
 from residnet.report.figure import Figure
-from residnet.report.run_reader import JsonObject, RunFiles
+from residnet.report.run_reader import RunFiles
 from residnet.report.sections.free_runs import distinct_manoeuvres
 
 
@@ -54,14 +55,12 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
     rows = {
         model: row for model in run.model_kinds if (row := run.find_row(model, split, protocol))
     }
-    quality_report = run.read_json("doctor.json")
+    inspection = run.inspection
     quality_summary = (
-        summarize_inspection(quality_report).tally if quality_report.get("logs") else ""
+        summarize_inspection(inspection).tally if inspection is not None and inspection.logs else ""
     )
     dof_text = run.dof.description
-    if integrated_channels := next(
-        (log["integrated"] for log in run.quality if log.get("integrated")), None
-    ):
+    if integrated_channels := next((log.integrated for log in run.quality if log.integrated), None):
         quality_summary = (
             f"{_NO_POSE_TEXT.format(', '.join(integrated_channels))} {quality_summary}".strip()
             if not dof_text
@@ -77,19 +76,21 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
         if dof_text
         else quality_summary
     )
-    one_sided_findings = (
-        finding for finding in quality_report.get("together") or [] if finding["code"] == "one_side"
+    one_sided_texts = (
+        finding.text
+        for finding in (() if inspection is None else inspection.together)
+        if finding.code == "one_side" and finding.level != "note"
     )
     return VerdictEvidence(
         selected,
         split,
         rows,
         run.baseline or "",
-        run.read_json("selection.json"),
-        (run.limits.get("splits") or {}).get(split, {}),
+        run.selection,
+        {} if run.limits is None else run.limits.splits.get(split, {}),
         quality_summary,
         protocol,
-        next((finding["text"] for finding in one_sided_findings if finding["level"] != "note"), ""),
+        next(one_sided_texts, ""),
         run.read_json("excitation.json"),
     )
 
@@ -97,6 +98,22 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
 def verdict_level(run: RunFiles) -> str:
     """Return the level of the verdict on the selected model, empty where it has no free runs."""
     return judged_level(collect_evidence(run, run.main_model))
+
+
+class _OpeningRow(NamedTuple):
+    """A line of the first table.
+
+    Attributes:
+        model: name of the model; None for the integrated measured velocities.
+        errors: pose errors at the end of the free runs by name.
+        intervals: their confidence intervals by name.
+        divergence: number of diverged windows in words; empty if there are none.
+    """
+
+    model: str | None
+    errors: Mapping[str, float]
+    intervals: Mapping[str, Interval | None]
+    divergence: str
 
 
 def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
@@ -112,100 +129,99 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     }
     if run.main_model not in rows or not run.pose_errors:
         return None
-    selection_by_model = {
-        entry["model"]: entry for entry in run.read_json("selection.json").get("models") or []
+    faults_by_model = {
+        entry.model: entry.faults for entry in (run.selection.models if run.selection else ())
     }
-    limits = (run.limits.get("splits") or {}).get(run.report_split, {}).get(run.main_protocol, {})
+    limits = run.find_limits(run.main_protocol)
     leading_models = [run.main_model, run.selected, run.baseline, CONSTANT_VELOCITY]
-    table: list[JsonObject] = [
-        rows[model_name] for model_name in dict.fromkeys(leading_models) if model_name in rows
-    ]
-    kinematic_floor = limits.get("kinematics") or {}
-    end_errors = {
-        f"{pose_error}_error_end": kinematic_floor[f"{pose_error}_mean"]
-        for pose_error in run.pose_errors
-        if kinematic_floor
+    lines = {
+        model_name: _OpeningRow(
+            model_name,
+            row.final_pose_errors,
+            row.final_pose_intervals,
+            describe_divergence(row),
+        )
+        for model_name, row in rows.items()
     }
+    table = [
+        lines[model_name]
+        for model_name in dict.fromkeys(leading_models)
+        if model_name is not None and model_name in lines
+    ]
+    kinematic_errors = {} if limits is None else limits.kinematics.means
     # a pose that was integrated from the velocities has no floor but rounding
-    if measured := any(end_error > 1e-9 for end_error in end_errors.values()):
-        table.append({"model": _MEASUREMENT_ROW, "diverged": 0, **end_errors})
+    if measured := any(error > 1e-9 for error in kinematic_errors.values()):
+        table.append(_OpeningRow(None, kinematic_errors, {}, ""))
     table += sorted(
-        (row for model_name, row in rows.items() if model_name not in leading_models),
-        key=lambda row: float(row[f"{run.pose_errors[0]}_error_end"]),
+        (line for model_name, line in lines.items() if model_name not in leading_models),
+        key=lambda line: line.errors[run.pose_errors[0]],
     )
-
-    def error_cell(row: JsonObject, key: str, factor: float) -> Cell:
-        confidence_interval = row.get(f"{key}_ci95")
-        minimum = min(rows[name][key] for name in rows if name != run.plant)
-        note = (
-            "–".join(format_number(factor * bound, 2) for bound in confidence_interval)
-            if confidence_interval
-            else ""
+    smallest_errors = {
+        pose_error: min(
+            line.errors[pose_error] for model, line in lines.items() if model != run.plant
         )
-        return Cell(
-            format_number(factor * row[key], 2), note, "best" if row[key] == minimum else ""
-        )
+        for pose_error in run.pose_errors
+    }
 
-    def fault_text(row: JsonObject) -> str:
-        return next(iter((selection_by_model.get(row["model"]) or {}).get("faults") or []), "")
+    def error_cell(line: _OpeningRow, pose_error: str, factor: float) -> Cell:
+        error = line.errors[pose_error]
+        interval = line.intervals.get(pose_error)
+        note = "–".join(format_number(factor * bound, 2) for bound in interval) if interval else ""
+        is_smallest = error == smallest_errors[pose_error]
+        return Cell(format_number(factor * error, 2), note, "best" if is_smallest else "")
 
-    def soundness_cell(row: JsonObject) -> Cell:
-        if fault_text(row) or describe_divergence(row):
-            return Cell("✗", describe_divergence(row), "text")
-        return Cell("✓" if row["model"] in selection_by_model else DASH, mark="text")
+    def model_name(line: _OpeningRow) -> str:
+        return _MEASUREMENT_ROW if line.model is None else run.model_label(line.model)
+
+    def fault_text(line: _OpeningRow) -> str:
+        return next(iter(faults_by_model.get(line.model or "", ())), "")
+
+    def soundness_cell(line: _OpeningRow) -> Cell:
+        if fault_text(line) or line.divergence:
+            return Cell("✗", line.divergence, "text")
+        return Cell("✓" if line.model in faults_by_model else DASH, mark="text")
 
     is_other_protocol = run.main_protocol != run.protocols[0]
     notes = [
-        f"Mean of {format_count(rows[run.main_model]['windows'], 'free run')} on"
+        f"Mean of {format_count(rows[run.main_model].windows, 'free run')} on"
         f" {run.report_split} data"
         f" ({run.main_protocol}"
         + f", which start elsewhere than those of {run.protocols[0]} above" * is_other_protocol
         + ")"
         + (
             "; small: 95 % interval of this mean (above: of as many new runs)."
-            if rows[run.main_model].get(f"{run.pose_errors[0]}_error_end_ci95")
+            if rows[run.main_model].final_pose_intervals[run.pose_errors[0]]
             else "."
         ),
         "" if run.report_split in UNSEEN_SPLITS else "These data are not unseen: read with care.",
         "constant_velocity: the initial velocities are held." if CONSTANT_VELOCITY in rows else "",
         "Measurements: where the measured velocities themselves lead." if measured else "",
-        *(
-            f"✗ {run.model_label(row['model'])}: {reason}."
-            for row in table
-            if (reason := fault_text(row))
-        ),
+        *(f"✗ {model_name(line)}: {reason}." for line in table if (reason := fault_text(line))),
     ]
     error_table = build_table(
         table,
         [
-            (
-                "model",
-                lambda row: (
-                    _MEASUREMENT_ROW
-                    if row["model"] == _MEASUREMENT_ROW
-                    else run.model_label(row["model"])
-                ),
-            ),
+            ("model", model_name),
             *(
                 (
                     f"{name} [{unit}]",
-                    lambda row, of=pose_error, f=f: error_cell(row, f"{of}_error_end", f),
+                    lambda line, of=pose_error, factor=factor: error_cell(line, of, factor),
                 )
-                for pose_error, (name, unit, f) in (
+                for pose_error, (name, unit, factor) in (
                     (pose_error, run.pose_error_unit(pose_error)) for pose_error in run.pose_errors
                 )
             ),
             ("sound", soundness_cell),
         ],
         groups=[(f"error {run.horizon_text}", len(run.pose_errors))],
-        is_selected=lambda row: row["model"] == run.main_model,
+        is_selected=lambda line: line.model == run.main_model,
     )
     return Section(
         "", [*figures, error_table, Text(" ".join(filter(None, notes)), is_secondary=True)]
     )
 
 
-def cautions_section(run: RunFiles, findings: Sequence[SanityFinding]) -> Section | None:
+def cautions_section(run: RunFiles) -> Section | None:
     """Return the objections to using the main model; None if there are none."""
     sentences = []
     main_model = run.predictor
@@ -220,7 +236,7 @@ def cautions_section(run: RunFiles, findings: Sequence[SanityFinding]) -> Sectio
             for c in run.channels
             if baseline_row is not None
             and main_model != run.baseline
-            and row["rmse"][c] > 1.005 * baseline_row["rmse"][c]
+            and row.rmse[c] > 1.005 * baseline_row.rmse[c]
         ]
         if worse_channels:
             sentences.append(
@@ -230,12 +246,9 @@ def cautions_section(run: RunFiles, findings: Sequence[SanityFinding]) -> Sectio
         if (
             training_row is not None
             and training_row is not row
-            and row["nrmse"]["mean"] > 1.5 * training_row["nrmse"]["mean"]
+            and row.mean_nrmse > 1.5 * training_row.mean_nrmse
         ):
-            ratio_text = (
-                f"{row['nrmse']['mean'] / training_row['nrmse']['mean']:.1f} times its"
-                f" training error"
-            )
+            ratio_text = f"{row.mean_nrmse / training_row.mean_nrmse:.1f} times its training error"
             sentences.append(
                 f"Protocol {protocol}: the {run.report_split} error of {main_model} is"
                 f" {ratio_text}; it may be"
@@ -248,7 +261,9 @@ def cautions_section(run: RunFiles, findings: Sequence[SanityFinding]) -> Sectio
     ]
     # the first sentence; the figures stand in the section on sanity
     failed_findings = [
-        finding for finding in findings if finding.ok is False and finding.model == main_model
+        finding
+        for finding in run.sanity_findings
+        if finding.ok is False and finding.model == main_model
     ]
     sentences += [
         f"{finding.model}, {finding.check}: {finding.text.partition('. ')[0].rstrip('.')}."
@@ -271,20 +286,18 @@ def worse_than_reference_sentence(run: RunFiles, protocol: str) -> str:
             if (row := run.find_row(model, run.report_split, protocol, manoeuvre_kind))
         ]
         worse_rows = [
-            row
+            (row.manoeuvre.replace("_", " "), row.difference)
             for row in rows
-            if (row.get("difference") or {}).get("worse")
+            if row.difference is not None
+            and row.difference.worse
             and run.model_kinds[model] in ("head", "ensemble")
         ]
         if worse_rows:
             kinds_text = ", ".join(
-                f"{row['manoeuvre'].replace('_', ' ')}"
-                f" {format_percent_change(100 * (row['difference']['ratio'] - 1))}"
-                for row in worse_rows
+                f"{manoeuvre} {format_percent_change(100 * ((difference.ratio or 1.0) - 1))}"
+                for manoeuvre, difference in worse_rows
             )
-            model_texts.append(
-                f"{model} against {worse_rows[0]['difference']['to']} ({kinds_text})"
-            )
+            model_texts.append(f"{model} against {worse_rows[0][1].to} ({kinds_text})")
     return (
         f"Protocol {protocol}: worse by more than 5 % in NRMSE on {run.report_split} data:"
         f" {'; '.join(model_texts)}."
@@ -293,12 +306,12 @@ def worse_than_reference_sentence(run: RunFiles, protocol: str) -> str:
     )
 
 
-def sanity_section(run: RunFiles, findings: Sequence[SanityFinding]) -> Section | None:
+def sanity_section(run: RunFiles) -> Section | None:
     """Return a table of all checks and what each found, None where no model was checked."""
-    if not findings:
+    if not run.sanity_findings:
         return None
-    findings_by_model: dict[str, dict[str, SanityFinding]] = {}
-    for finding in findings:
+    findings_by_model: dict[str, dict[str, SanityRow]] = {}
+    for finding in run.sanity_findings:
         findings_by_model.setdefault(finding.model, {})[finding.check] = finding
     result_cells = {
         None: Cell("n/a", mark="weak"),
@@ -311,7 +324,7 @@ def sanity_section(run: RunFiles, findings: Sequence[SanityFinding]) -> Section 
             ("model", str),
             *(
                 (check, lambda model, check=check: result_cells[findings_by_model[model][check].ok])
-                for check in CHECKS
+                for check in SANITY_CHECKS
             ),
         ],
         is_selected=lambda model: model == run.selected,

@@ -690,7 +690,8 @@ def _evaluate_models(
             for model, fitted_set in evaluated_models
         }
         rows_by_set[name] = [
-            row | dict(zip(("model", "on"), keys[row["model"]], strict=True))
+            row.model_dump(mode="json", exclude_unset=True)
+            | dict(zip(("model", "on"), keys[row.model], strict=True))
             for row in goodness_table(steps, [a[p] for p in segments], trial.step)
         ]
     return rows_by_set

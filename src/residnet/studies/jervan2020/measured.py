@@ -322,7 +322,9 @@ def run_force_study(config: ForceResidualConfig) -> tuple[dict[str, Any], list[F
         "used": int(measured.usable.sum()),
         "masked": measured.masked_shares,
         "folds": {"of": measured.fold_unit, "count": int(measured.fold_index.max()) + 1},
-        "intervals": None if resampling_blocks is None else resampling_blocks.to_row(),
+        "intervals": None
+        if resampling_blocks is None
+        else resampling_blocks.to_record().model_dump(),
         "forces": compare_forces(measured),
         "acceleration": measured.acceleration_comparison,
         "rows": rows,

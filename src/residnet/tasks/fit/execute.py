@@ -49,13 +49,11 @@ from residnet.tasks.fit.outcome import (
     write_evaluation,
     write_inspection,
 )
+from residnet.training.records import CurrentsFile
 
 if TYPE_CHECKING:
     from residnet.tasks.fit.config import FitConfig
     from residnet.tasks.fit.service import MonitoredLog, NextTrials, RefitResult
-
-_MODEL_ALIASES = ("predictor", "selected")
-"""Names that stand for a model: the model reported first, and the single model chosen."""
 
 
 def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
@@ -73,7 +71,7 @@ def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
     log_message("  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items()))
     logs, currents = convert_to_motion_through_water(logs, config)
     if config.current is not None:
-        folder.write_json(folder.path / "currents.json", currents)
+        folder.write_record(folder.currents, CurrentsFile(tuple(currents)))
     identified_models = fit_models(logs, config, store=RunModelStore(folder))
     begin_stage("free runs")
     fitted_models = list(identified_models.values())
@@ -185,9 +183,7 @@ def evaluate_on_logs(
             if source_path.is_file():
                 folder.write(target_path, source_path.read_text(encoding="utf-8"))
         fit_metrics = run.read_metrics()
-        selected = str(fit_metrics["selected"])
-        predictor = str(fit_metrics.get("predictor", selected))
-        names = (selected, fit_metrics.get("selected_ensemble"), predictor)
+        names = (fit_metrics.selected, fit_metrics.selected_ensemble, fit_metrics.predictor)
         write_evaluation(folder, config, evaluations, names, {EXTERNAL_SPLIT: prepared})
         return build_fit_outcome(folder, EXTERNAL_SPLIT)
 
@@ -201,17 +197,15 @@ def export_model(config: FitConfig, request: ExportRequest) -> Path:
     run = request.run
     name = request.model
     metrics = request.run.read_metrics()
-    model_name = str(metrics.get(name, metrics["selected"])) if name in _MODEL_ALIASES else name
+    aliases = {"predictor": metrics.predictor, "selected": metrics.selected}
+    model_name = aliases.get(name, name)
     available_models = model_names(run.models)
     if model_name not in available_models:
         raise UsageError(
-            f"{run.path}: no model"
-            f" '{name}'{suggest_name(name, [*_MODEL_ALIASES, *available_models])}"
+            f"{run.path}: no model '{name}'{suggest_name(name, [*aliases, *available_models])}"
         )
     spec, model = load_model(run.models / model_name)
-    rows = [
-        row for row in metrics["rows"] if row["model"] == model_name and row["manoeuvre"] == "all"
-    ]
+    rows = [row for row in metrics.rows if row.model == model_name and row.manoeuvre == "all"]
     found = collect_evidence(RunFiles(run.path), model_name)
     # a model without free runs on the reported split has no verdict
     sentences = write_verdict(found) if model_name in found.rows_by_model else []

@@ -15,7 +15,7 @@ from residnet.core.progress import begin_stage, log_message
 from residnet.dynamics.store import ModelSpec
 from residnet.evaluation.goodness import assess_repeatability
 from residnet.evaluation.metrics import LIMITS_SCHEMA, build_metrics_file, write_rollouts
-from residnet.evaluation.records import LimitsFile
+from residnet.evaluation.records import DataQualityFile, LimitsFile, LogQuality
 from residnet.identification.identified import SplitEvaluation
 from residnet.identification.prepared import compute_velocity_limits
 from residnet.io.drafting.reading import find_log_files
@@ -48,7 +48,6 @@ def write_inspection(
         build_inspection,
         inspect_log,
         inspect_log_set,
-        summarize_inspection,
     )
     from residnet.quality.compatibility import analyse_compatibility
 
@@ -66,11 +65,11 @@ def write_inspection(
         # instruments of simulated logs have the declared noise and no errors
         rows = [analyse_compatibility(log).model_dump() for log in logs[:_MAX_ANALYSED_LOGS]]
         folder.write_json(folder.path / "compatibility.json", rows)
-    inspection_json = build_inspection(reports, joint_report)
-    folder.write_json(folder.path / "doctor.json", inspection_json)
+    inspection = build_inspection(reports, joint_report)
+    folder.write_record(folder.inspection, inspection)
     # a correctable error is reported before the fit takes its time; the verdict counts all findings
-    if first_finding := summarize_inspection(inspection_json).first_action:
-        log_message(f"  {first_finding}")
+    if inspection.first:
+        log_message(f"  {inspection.first}")
 
 
 def write_evaluation(
@@ -111,38 +110,35 @@ def write_evaluation(
     n_commands = len(config.signals.inputs)
     step = config.prepare.grid.step
     evaluated_logs = [log for evaluation in evaluations.values() for log in evaluation.logs]
-    limits = {
-        "schema": LIMITS_SCHEMA,
-        "run": config.name,
-        "splits": {
-            split: evaluation.limits_by_protocol for split, evaluation in evaluations.items()
-        },
-        "repeatability": {
+    limits = LimitsFile(
+        schema=LIMITS_SCHEMA,
+        run=config.name,
+        splits={split: evaluation.limits_by_protocol for split, evaluation in evaluations.items()},
+        repeatability={
             name: assess_repeatability(protocol, evaluated_logs, n_commands, scales, step)
             for name, protocol in config.evaluation.protocols.items()
         },
+    )
+    folder.write_record(folder.limits, limits)
+    quality = [_summarize_log(log, split) for split, members in logs.items() for log in members]
+    folder.write_record(folder.data_quality, DataQualityFile(tuple(quality)))
+
+
+def _summarize_log(log: PreparedLog, split: str) -> LogQuality:
+    """Return the row of data_quality.json of a prepared log."""
+    row = {
+        **log.to_table_row(split),
+        "masked": {
+            reason: float(np.mean(mask)) for reason, mask in log.log.masks.items() if mask.any()
+        },
+        "largest": {
+            name: float(np.abs(log.y[log.usable, log.dof.state_names.index(name)]).max())
+            for name in log.dof.active_states
+        },
     }
-    folder.write_record(folder.limits, LimitsFile.model_validate(limits))
-    quality = [
-        {
-            **log.to_table_row(split),
-            "masked": {
-                reason: float(np.mean(mask)) for reason, mask in log.log.masks.items() if mask.any()
-            },
-            "largest": {
-                name: float(np.abs(log.y[log.usable, log.dof.state_names.index(name)]).max())
-                for name in log.dof.active_states
-            },
-            **(
-                {"integrated": integrated_channels}
-                if (integrated_channels := log.log.meta.get("integrated"))
-                else {}
-            ),
-        }
-        for split, members in logs.items()
-        for log in members
-    ]
-    folder.write_json(folder.data_quality, quality)
+    if integrated_channels := log.log.meta.get("integrated"):
+        row["integrated"] = integrated_channels
+    return LogQuality.model_validate(row)
 
 
 def build_fit_outcome(
@@ -161,16 +157,14 @@ def build_fit_outcome(
     summary_metrics: dict[str, SummaryMetric] = {}
     if row is not None:
         summary_metrics = {
-            "nrmse": SummaryMetric(row["nrmse"]["mean"]),
+            "nrmse": SummaryMetric(row.mean_nrmse),
             **{
-                f"rmse_{name}": SummaryMetric(row["rmse"][name], CHANNEL_UNITS[name])
+                f"rmse_{name}": SummaryMetric(row.rmse[name], CHANNEL_UNITS[name])
                 for name in files.channels
             },
             **{
-                f"{pose_name}_error_end": SummaryMetric(
-                    row[f"{pose_name}_error_end"], POSE_ERROR_UNITS[pose_name]
-                )
-                for pose_name in files.pose_errors
+                f"{name}_error_end": SummaryMetric(error, POSE_ERROR_UNITS[name])
+                for name, error in row.final_pose_errors.items()
             },
         }
     sentences = [sentence for sentence in verdict_sentences(files) if sentence]

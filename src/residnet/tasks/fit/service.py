@@ -62,6 +62,13 @@ from residnet.report.figure import (
 )
 from residnet.report.figure_files import write_figure
 from residnet.report.page import write_page
+from residnet.report.records import (
+    MonitoredLogRow,
+    ParameterChangeRow,
+    RefitRow,
+    RefitSummary,
+    SuspectRow,
+)
 from residnet.runs.folder import Provenance, RunFolder
 from residnet.runs.model_store import RunModelStore
 from residnet.runs.task import TaskOutcome
@@ -108,26 +115,26 @@ class MonitoredLog:
         """Number of windows."""
         return len(self.scores)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the result as JSON."""
-        return {
-            "log": self.name,
-            "windows": self.n_windows,
-            "alarm_after": self.alarm_time,
-            "threshold": self.final_verdict.threshold,
-            "innovation": self.final_verdict.innovation_rms,
-            "suspects": [
-                {
-                    "cause": suspect.change.name,
-                    "score": suspect.test_statistic,
-                    "size": suspect.estimated_size,
-                    "standard_error": suspect.standard_error,
-                    "unit": suspect.change.unit,
-                    "explains": suspect.explained_square,
-                }
+    def to_record(self) -> MonitoredLogRow:
+        """Return the entry of monitor.json."""
+        return MonitoredLogRow(
+            log=self.name,
+            windows=self.n_windows,
+            alarm_after=self.alarm_time,
+            threshold=self.final_verdict.threshold,
+            innovation=self.final_verdict.innovation_rms,
+            suspects=tuple(
+                SuspectRow(
+                    cause=suspect.change.name,
+                    score=suspect.test_statistic,
+                    size=suspect.estimated_size,
+                    standard_error=suspect.standard_error,
+                    unit=suspect.change.unit,
+                    explains=suspect.explained_square,
+                )
                 for suspect in self.final_verdict.hypotheses
-            ],
-        }
+            ),
+        )
 
     def to_lines(self) -> list[str]:
         """Return the result as lines for the terminal."""
@@ -172,7 +179,7 @@ class FittedModelService:
     ) -> None:
         monitor_config = validate_config(dict(settings), MonitorConfig, "monitor")
         store = RunModelStore(run)
-        name = str(run.read_metrics()["selected"]) if model == "selected" else model
+        name = run.read_metrics().selected if model == "selected" else model
         if name not in store.names():
             valid_names = ["selected", *store.names()]
             raise UsageError(f"{run.path}: no model '{name}'{suggest_name(name, valid_names)}")
@@ -342,26 +349,27 @@ class RefitResult:
         )
         return [*lines, f"refit: on the logs held out: {error_text}", f"refit: {conclusion}"]
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the result as JSON."""
+    def to_record(self) -> RefitRow:
+        """Return the entry of monitor.json."""
         has_run = self.folder is not None
-        return {
-            "changes": [
-                {
-                    "cause": changed_parameter.change.name,
-                    "size": changed_parameter.estimated_size,
-                    "standard_error": changed_parameter.standard_error,
-                    "unit": changed_parameter.change.unit,
-                    "after_each_log": list(changed_parameter.size_by_log),
-                }
+        summary = RefitSummary(
+            changes=tuple(
+                ParameterChangeRow(
+                    cause=changed_parameter.change.name,
+                    size=changed_parameter.estimated_size,
+                    standard_error=changed_parameter.standard_error,
+                    unit=changed_parameter.change.unit,
+                    after_each_log=tuple(changed_parameter.size_by_log),
+                )
                 for changed_parameter in self.recursive_refit.identified_changes
-            ],
-            "ended": self.recursive_refit.stopping_reason,
-            "run": str(self.folder) if has_run else None,
-            "nrmse_old": self.old if has_run else None,
-            "nrmse_new": self.new if has_run else None,
-            "worth_taking": self.worth,
-        }
+            ),
+            ended=self.recursive_refit.stopping_reason,
+            run=str(self.folder) if has_run else None,
+            nrmse_old=self.old if has_run else None,
+            nrmse_new=self.new if has_run else None,
+            worth_taking=self.worth,
+        )
+        return RefitRow(refit=summary)
 
 
 def require_refit_folder(run: RunFolder, output_folder: Path, config: FitConfig) -> None:
@@ -415,17 +423,13 @@ def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
     if not recursive_result.identified_changes:
         return RefitResult(recursive_result)
     refitted_model = make_refitted_model(original_model, recursive_result)
-    row_filter = {
-        "split": EXTERNAL_SPLIT,
-        "protocol": config.evaluation.selection,
-        "manoeuvre": "all",
-    }
     provenance = Provenance(
         service.run.resolved_config, (), config.seed, service.input_paths, time.time()
     )
-    errors: dict[str, Any] = {}
+    result = RefitResult(recursive_result, output_folder)
 
     def evaluate_refit(folder: RunFolder) -> TaskOutcome:
+        nonlocal result
         store = RunModelStore(folder)
         models = service.run.models
         reference_names = [
@@ -450,19 +454,21 @@ def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
             config.prepare.grid.step,
             divergence_limit(original_model.spec, config),
         )
-        refitted_row = find_row(
-            evaluations[EXTERNAL_SPLIT].rows, model=refitted_model.name, **row_filter
-        )
-        difference = refitted_row["difference"]
-        upper_bound = (
-            difference["nrmse_mean"] if difference["ci95"] is None else difference["ci95"][1]
-        )
-        is_better = bool(refitted_row["diverged"] == 0 and upper_bound < 0.0)
-        original_row = find_row(
-            evaluations[EXTERNAL_SPLIT].rows, model=original_model.name, **row_filter
-        )
-        errors.update(
-            old=original_row["nrmse"]["mean"], new=refitted_row["nrmse"]["mean"], worth=is_better
+        rows = [
+            row
+            for row in evaluations[EXTERNAL_SPLIT].rows
+            if row.protocol == config.evaluation.selection
+        ]
+        refitted_row = find_row(rows, model=refitted_model.name)
+        difference = refitted_row.difference
+        assert difference is not None, "the original model is the reference of the refitted one"
+        upper_bound = difference.nrmse_mean if difference.ci95 is None else difference.ci95[1]
+        is_better = refitted_row.diverged == 0 and upper_bound < 0.0
+        result = replace(
+            result,
+            old=find_row(rows, model=original_model.name).mean_nrmse,
+            new=refitted_row.mean_nrmse,
+            worth=is_better,
         )
         selected_name = refitted_model.name if is_better else original_model.name
         write_evaluation(
@@ -488,7 +494,7 @@ def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
         config.run_in_folder(
             RunFolder.create(output_folder, dump_config(config)), provenance, evaluate_refit
         )
-    return RefitResult(recursive_result, output_folder, **errors)
+    return result
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from residnet.core.files import make_file_stem
 from residnet.core.progress import log_message
 from residnet.dynamics.store import load_model
 from residnet.engine.recorded_plant import RecordedPlantDynamics
-from residnet.evaluation.booklet import build_index_rows, build_index_table
+from residnet.evaluation.booklet import build_index_rows, build_indices_file
 from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators, PlantActuators
 from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.trials import (
@@ -84,12 +84,12 @@ def execute(config: SimulateConfig, folder: RunFolder) -> TaskOutcome:
         for craft, flights in flights_by_craft
         for row in build_index_rows(craft, flights, length)
     ]
-    content = build_index_table(config.name, length, rows)
-    folder.write_json(folder.path / "indices.json", content)
+    indices = build_indices_file(config.name, length, rows)
+    folder.write_record(folder.indices, indices)
     figures = trial_figures({craft.name: flights for craft, flights in flights_by_craft})
     write_figures(folder.figures, figures)
     n_flights = len(flights_by_folder)
-    faulty_rows = [row for row in rows if row["fault"]]
+    faulty_rows = [row for row in rows if row.fault]
     completion_text = (
         f"{len(faulty_rows)} of {n_flights} manoeuvres did NOT end as they should"
         if faulty_rows
@@ -100,7 +100,7 @@ def execute(config: SimulateConfig, folder: RunFolder) -> TaskOutcome:
         f" {' and '.join(craft.name for craft, _ in flights_by_craft)}, and"
         " their logs are in the folder logs."
     ]
-    verdict += [f"{row['craft']}, {row['log']}: {row['fault']}." for row in faulty_rows[:5]]
+    verdict += [f"{row.craft}, {row.log}: {row.fault}." for row in faulty_rows[:5]]
     fault_messages = [
         (f"{craft.name}, {flight.measured_log.name}: {flight.fault_text}", number < n_listed)
         for craft, flights in flights_by_craft
@@ -121,7 +121,7 @@ def execute(config: SimulateConfig, folder: RunFolder) -> TaskOutcome:
             "logs": SummaryMetric(n_flights),
             "flights_with_a_fault": SummaryMetric(len(faulty_rows)),
         },
-        indices_text(content) if len(rows) <= _MAX_SHOWN_ROWS else "",
+        indices_text(indices) if len(rows) <= _MAX_SHOWN_ROWS else "",
         failure_message or "",
     )
 

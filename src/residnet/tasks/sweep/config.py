@@ -245,10 +245,10 @@ class FreeRunObjective(Config):
         """
         files = RunFiles(run.path)
         model = files.selected if self.model == "selected" else self.model
-        row = files.find_row(model, "validation", files.evaluation["selection"])
+        row = files.find_row(model, "validation", files.selection_protocol)
         if row is None:
             raise DataError(f"{run.metrics}: has no validation error of model '{model}'")
-        return float(row["nrmse"]["mean"])
+        return row.mean_nrmse
 
 
 class FigureObjective(Config):
@@ -295,14 +295,13 @@ class FigureObjective(Config):
         Raises:
             DataError: if the run has no such figure.
         """
-        summary_figures = run.read_summary()["figures"]
+        summary_figures = run.read_summary().figures
         if self.name not in summary_figures:
             raise DataError(
                 f"{run.summary}: has no main figure"
                 f" '{self.name}'{suggest_name(self.name, summary_figures)}"
             )
-        figure_value: float | None = summary_figures[self.name]["value"]
-        return figure_value
+        return summary_figures[self.name].value
 
 
 class ProcessesConfig(Config):

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from residnet.core.config import dump_config
 from residnet.core.errors import ResidnetError, UsageError
-from residnet.core.files import read_json
 from residnet.core.progress import Progress, log_message, on_progress, report_progress
+from residnet.core.run_records import ProvenanceFile
+from residnet.report.records import SweepFile, SweepTrial, TrialState
 from residnet.report.sections.sweep import trials_table
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import SummaryMetric, TaskOutcome
@@ -39,7 +40,11 @@ _SEED_STRIDE = 7_919
 """Factor that makes the trial seeds of neighbouring search seeds different."""
 JOURNAL_FILE = "journal.log"
 BEST_CONFIG_FILE = "best.yaml"
-_STATE_NAMES = {"COMPLETE": "finished", "PRUNED": "ended early", "FAIL": "failed"}
+_STATE_NAMES: dict[str, TrialState] = {
+    "COMPLETE": "finished",
+    "PRUNED": "ended early",
+    "FAIL": "failed",
+}
 
 
 def execute(config: SweepConfig, folder: RunFolder) -> TaskOutcome:
@@ -267,8 +272,8 @@ def run_sweep_trial(
                 error_message = f"{run.path}: the objective is not finite"
         except ResidnetError as error:
             error_message = str(error)
-    has_provenance = run.provenance.is_file()
-    seconds = float(read_json(run.provenance)["seconds"]) if has_provenance else 0.0
+    provenance = ProvenanceFile.read_optional(run.path, run.provenance.name)
+    seconds = 0.0 if provenance is None else provenance.seconds
     return TrialResult(value, is_pruned, error_message, seconds)
 
 
@@ -297,74 +302,78 @@ def _write_results(config: SweepConfig, study: optuna.Study, folder: RunFolder) 
     """Write sweep.json and best.yaml; returns the outcome of the sweep."""
     rows = [_trial_row(config, trial) for trial in study.get_trials(deepcopy=False)]
     by_state = {
-        state: [row for row in rows if row["state"] == state] for state in _STATE_NAMES.values()
+        state: [row for row in rows if row.state == state] for state in _STATE_NAMES.values()
     }
-    finished_rows = by_state["finished"]
-    direction_sign = 1.0 if config.objective.is_minimized else -1.0
-    best_row = min(
-        finished_rows, key=lambda row: (direction_sign * row["value"], row["number"]), default=None
+    n_finished = len(by_state["finished"])
+    content = SweepFile(
+        schema="residnet.sweep/1",
+        run=config.name,
+        objective=config.objective.description,
+        minimized=config.objective.is_minimized,
+        search=config.search.kind,
+        keys=tuple(config.space),
+        log=tuple(key for key, values in config.space.items() if values.log),
+        best=None,
+        importance=_parameter_importance(study, n_finished),
+        trials=tuple(rows),
     )
-    content = {
-        "schema": "residnet.sweep/1",
-        "run": config.name,
-        "objective": config.objective.description,
-        "minimized": config.objective.is_minimized,
-        "search": config.search.kind,
-        "keys": list(config.space),
-        "log": [key for key, values in config.space.items() if values.log],
-        "best": None if best_row is None else best_row["number"],
-        "importance": _parameter_importance(study, len(finished_rows)),
-        "trials": rows,
-    }
-    folder.write_json(folder.path / "sweep.json", content)
+    direction_sign = 1.0 if content.minimized else -1.0
+    best_row, best_value = min(
+        content.completed,
+        key=lambda pair: (direction_sign * pair[1], pair[0].number),
+        default=(None, math.nan),
+    )
+    if best_row is not None:
+        content = content.model_copy(update={"best": best_row.number})
+    folder.write_record(folder.path / "sweep.json", content)
     summary_metrics = {
         state_name.replace(" ", "_"): SummaryMetric(len(state_rows))
         for state_name, state_rows in by_state.items()
     }
     if best_row is None:
-        first_error = next((row["fault"] for row in rows if row["fault"]), "no trial was completed")
+        first_error = next((row.fault for row in rows if row.fault), "no trial was completed")
         return TaskOutcome(
             ["No trial of the sweep has a value."],
             summary_metrics,
             failure=f"{config.name}: no trial has a value; the first fault: {first_error}",
         )
-    texts = {key: json.dumps(value) for key, value in best_row["values"].items()}
+    texts = {key: json.dumps(value) for key, value in best_row.values.items()}
     folder.write(
         folder.path / BEST_CONFIG_FILE,
         dump_config(config.build_trial(texts, f"{config.name}.best")[0]),
     )
     verdict = [
-        f"Trial {best_row['number']} of {len(rows)} is the best:"
-        f" {config.objective.description.removesuffix(' [-]')} {best_row['value']:.5g}, with"
+        f"Trial {best_row.number} of {len(rows)} is the best:"
+        f" {config.objective.description.removesuffix(' [-]')} {best_value:.5g}, with"
         f" {', '.join(f'{key} = {text}' for key, text in texts.items())}.",
-        f"Its run is {_trial_folder_path(Path(), best_row['number'])} in the sweep's folder, and"
+        f"Its run is {_trial_folder_path(Path(), best_row.number)} in the sweep's folder, and"
         f" the config"
         f" {BEST_CONFIG_FILE} there repeats it.",
     ]
     if by_state["ended early"]:
         verdict.append(f"{len(by_state['ended early'])} trials were ended early.")
     if failed_rows := by_state["failed"]:
-        verdict.append(f"{len(failed_rows)} trials failed; the first: {failed_rows[0]['fault']}.")
-    if len(finished_rows) > 1:
+        verdict.append(f"{len(failed_rows)} trials failed; the first: {failed_rows[0].fault}.")
+    if n_finished > 1:
         verdict.append(
-            f"The best of {len(finished_rows)} validation errors is biased by the selection:"
+            f"The best of {n_finished} validation errors is biased by the selection:"
             f" evaluate it"
             " on other data, such as the test split of its run."
         )
-    summary_metrics = {"best": SummaryMetric(best_row["value"]), **summary_metrics}
+    summary_metrics = {"best": SummaryMetric(best_value), **summary_metrics}
     return TaskOutcome(verdict, summary_metrics, trials_table(content).to_text())
 
 
-def _trial_row(config: SweepConfig, trial: Any) -> dict[str, Any]:
+def _trial_row(config: SweepConfig, trial: optuna.trial.FrozenTrial) -> SweepTrial:
     trial_values = {key: trial.params[key] for key in config.space}
-    return {
-        "number": trial.number,
-        "state": _STATE_NAMES[trial.state.name],
-        "value": trial.value if trial.state.name == "COMPLETE" else None,
-        "seconds": trial.user_attrs.get("seconds", 0.0),
-        "fault": trial.user_attrs.get("fault", ""),
-        "values": {k: json.loads(v) if isinstance(v, str) else v for k, v in trial_values.items()},
-    }
+    return SweepTrial(
+        number=trial.number,
+        state=_STATE_NAMES[trial.state.name],
+        value=trial.value if trial.state.name == "COMPLETE" else None,
+        seconds=trial.user_attrs.get("seconds", 0.0),
+        fault=trial.user_attrs.get("fault", ""),
+        values={k: json.loads(v) if isinstance(v, str) else v for k, v in trial_values.items()},
+    )
 
 
 def _parameter_importance(study: optuna.Study, n_finished: int) -> dict[str, float]:

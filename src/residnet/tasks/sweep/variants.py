@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from residnet.core.errors import DataError
-from residnet.core.files import read_json
 from residnet.core.processes import process_pool
 from residnet.core.progress import report_progress
+from residnet.core.run_records import ProvenanceFile
 from residnet.evaluation.metrics import bootstrap_intervals, make_resampling_blocks
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.variants import VARIANTS_FILE, tabulate_variants
@@ -132,7 +132,7 @@ def _run_variant(config: SweepConfig, variant: str, seed: int, folder_path: Path
             resume=True,
             report=False,
         )
-    return float(read_json(RunFolder(folder_path).provenance)["seconds"])
+    return ProvenanceFile.read(RunFolder(folder_path).provenance).seconds
 
 
 def compute_window_errors(run: Path, model: str, split: str) -> pd.DataFrame:
@@ -155,9 +155,9 @@ def compute_window_errors(run: Path, model: str, split: str) -> pd.DataFrame:
     windows = files.read_split_windows(split)
     if not windows:
         raise DataError(f"{run}: no rollouts of the split '{split}'")
-    if name is None or name not in windows[0].predicted:
+    if name not in windows[0].predicted:
         raise DataError(f"{run}: no model '{name}' among {', '.join(windows[0].predicted)}")
-    scales = {name: float(files.metrics["scales"][name]) for name in files.dof.active_states}
+    scales = {name: files.metrics.scales[name] for name in files.dof.active_states}
     return pd.DataFrame(
         {
             "protocol": window.protocol,

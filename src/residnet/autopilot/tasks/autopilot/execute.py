@@ -62,6 +62,7 @@ from residnet.autopilot.report.heading import (
 )
 from residnet.autopilot.training.fit import train_policy
 from residnet.autopilot.training.predictor import train_or_resume_controller
+from residnet.core.files import read_json
 from residnet.core.progress import begin_stage, log_message, report_progress
 from residnet.dynamics.store import rebuild_module
 from residnet.engine.compiled import CompiledRollout
@@ -467,7 +468,7 @@ def export_model(config: AutopilotConfig, request: ExportRequest) -> Path:
         ExportError: where the file does not reproduce the policy.
     """
     name = request.resolve_model_name(config.policies)
-    rows = request.run.read_metrics()["rows"]
+    rows = read_json(request.run.metrics)["rows"]
     scaled_config = config.with_scaled_times()
     card_fields = {
         "vessel": config.vessel,

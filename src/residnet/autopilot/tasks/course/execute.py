@@ -517,7 +517,7 @@ def export_model(
     planned_course, guidance = existing_plan or _replan_and_verify(
         config, autopilot_run, run, protocol
     )
-    rows = [row for row in run.read_metrics()["rows"] if row["model"] == config.policy]
+    rows = [row for row in read_json(run.metrics)["rows"] if row["model"] == config.policy]
     exported = ExportedCoursePolicy(
         config.policy,
         load_policy(autopilot_run, config.policy),

@@ -1,0 +1,182 @@
+"""Typed contents of the result files of tasks that are read by their own report page."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from residnet.core.records import FileRecord, FileRows, Record
+
+TrialState = Literal["finished", "ended early", "failed", "unfinished"]
+"""How a trial of a sweep ended."""
+
+
+class SweepTrial(Record):
+    """One trial of a sweep.
+
+    Attributes:
+        number: number of the trial, from 0 on.
+        state: how it ended.
+        value: its objective; None if it has none.
+        seconds: duration of its run in s.
+        fault: error message; empty without an error.
+        values: value of each varied key.
+    """
+
+    number: int
+    state: TrialState
+    value: float | None
+    seconds: float
+    fault: str
+    values: dict[str, object]
+
+
+class SweepFile(FileRecord):
+    """sweep.json: the trials of a sweep.
+
+    Attributes:
+        run: name of the sweep.
+        objective: name and unit of the objective.
+        minimized: whether the smallest objective is sought.
+        search: kind of search.
+        keys: the varied keys.
+        log: keys that vary on a logarithmic scale.
+        best: number of the best trial; None if no trial has an objective.
+        importance: share of each key in the variance of the objective; empty for few trials.
+        trials: all trials.
+    """
+
+    schema_name: Literal["residnet.sweep/1"] = Field(alias="schema")
+    run: str
+    objective: str
+    minimized: bool
+    search: str
+    keys: tuple[str, ...]
+    log: tuple[str, ...]
+    best: int | None
+    importance: dict[str, float]
+    trials: tuple[SweepTrial, ...]
+
+    @property
+    def completed(self) -> list[tuple[SweepTrial, float]]:
+        """The trials that have an objective, with its value."""
+        return [(trial, trial.value) for trial in self.trials if trial.value is not None]
+
+
+class SuspectRow(Record):
+    """The score test of one possible change of a vessel or a sensor.
+
+    Attributes:
+        cause: name of the change.
+        score: statistic of the test.
+        size: estimated size of the change.
+        standard_error: standard error of the size.
+        unit: unit of the size.
+        explains: square of the innovations that the change explains.
+    """
+
+    cause: str
+    score: float
+    size: float
+    standard_error: float
+    unit: str
+    explains: float
+
+
+class MonitoredLogRow(Record):
+    """The change detection over one log.
+
+    Attributes:
+        log: name of the log.
+        windows: number of windows.
+        alarm_after: time in s to the first alarm; None without alarm.
+        threshold: score above which a change raises an alarm.
+        innovation: root mean square of the whitened innovations of each channel.
+        suspects: possible changes at the end of the log, the likeliest first.
+    """
+
+    log: str
+    windows: int
+    alarm_after: float | None
+    threshold: float
+    innovation: dict[str, float]
+    suspects: tuple[SuspectRow, ...]
+
+
+class ParameterChangeRow(Record):
+    """A change of a parameter that a recursive refit identified.
+
+    Attributes:
+        cause: name of the change.
+        size: its size.
+        standard_error: standard error of the size.
+        unit: unit of the size.
+        after_each_log: estimate after each log.
+    """
+
+    cause: str
+    size: float
+    standard_error: float
+    unit: str
+    after_each_log: tuple[float, ...]
+
+
+class RefitSummary(Record):
+    """The result of a recursive refit.
+
+    Attributes:
+        changes: identified changes.
+        ended: why the search for changes ended.
+        run: folder of the new run; None if no change was identified.
+        nrmse_old: mean free-run error of the old model on held-out logs; None without a run.
+        nrmse_new: the same of the new model.
+        worth_taking: whether the new model is significantly better.
+    """
+
+    changes: tuple[ParameterChangeRow, ...]
+    ended: str
+    run: str | None
+    nrmse_old: float | None
+    nrmse_new: float | None
+    worth_taking: bool
+
+
+class RefitRow(Record):
+    """The last entry of monitor.json after a refit.
+
+    Attributes:
+        refit: its result.
+    """
+
+    refit: RefitSummary
+
+
+class MonitorFile(FileRows[MonitoredLogRow | RefitRow]):
+    """monitor.json: the change detection over logs in the order of time, and the refit."""
+
+
+class RunFigure(Record):
+    """The first main figure of a run; its value is None if it is not finite."""
+
+    name: str
+    value: float | None
+    unit: str
+
+
+class RunRow(Record):
+    """A run in the list of runs.
+
+    Attributes:
+        run: the run folder.
+        task: name of the task; `unknown` if the config does not tell.
+        state: whether the run is complete and readable.
+        best: first main figure; None without one.
+        age: time since the start of the run in s.
+    """
+
+    run: str
+    task: str = "unknown"
+    state: Literal["finished", "unfinished", "damaged"] = "unfinished"
+    best: RunFigure | None = None
+    age: float
