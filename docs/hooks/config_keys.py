@@ -165,7 +165,7 @@ def _named_type(annotation: Any) -> str:
             return "path"
         if issubclass(annotation, enum.Enum):
             return ", ".join(f"`{member.value}`" for member in annotation)
-    return "any value" if annotation is Any else f"`{annotation}`"
+    return "any value" if annotation in (Any, object) else f"`{annotation}`"
 
 
 def limits(field: FieldInfo) -> str:
