@@ -9,6 +9,7 @@ import pytest
 
 from residnet.evaluation.records import (
     BlockCount,
+    ExcitationFile,
     HorizonRow,
     KinematicErrors,
     MetricsRow,
@@ -341,14 +342,19 @@ def test_a_split_that_is_too_short_is_judged_by_a_shorter_protocol() -> None:
     assert order_protocols(short, "validation", "T100")[0] == "T100"
 
 
-def excitation(state: str, **change: Any) -> dict[str, Any]:
+def excitation(state: str, **change: Any) -> ExcitationFile:
     """Contents of excitation.json for a rudder in a state."""
-    rudder = {"name": "delta", "state": state, "text": f"delta was {state}"}
-    return {"inputs": [rudder], "directions": [], "closed_loop_test_inputs": [], **change}
+    rudder: dict[str, Any] = {"name": "delta", "low": -0.3, "high": 0.3, "std": 0.1}
+    rudder |= {"bandwidth": None, "variance_inflation": 1.0, "feedback_source": None}
+    rudder |= {"feedback_share": None, "effect_share": None}
+    rudder |= {"state": state, "text": f"delta was {state}"}
+    content = {"schema": "residnet.excitation/1", "run": "made", "inputs": [rudder]}
+    empty = {"directions": [], "closed_loop_test_inputs": [], "domain": []}
+    return ExcitationFile.model_validate({**content, **empty, **change})
 
 
 def test_inputs_that_cannot_be_identified_make_no_good_model() -> None:
-    good = under({"horizons": [horizon(10.0, errors(0.5, 2.0))]})
+    good = under(horizons=[horizon(10.0, errors(0.5, 2.0))])
     for state, level in (
         ("excited", "good"),
         ("held", "good"),
@@ -363,10 +369,12 @@ def test_inputs_that_cannot_be_identified_make_no_good_model() -> None:
 
 
 def test_the_verdict_names_unexcited_directions_and_controlled_test_logs() -> None:
-    direction = {"text": "differential thrust: not excited", "is_excited": False}
+    direction = {"name": "", "inputs": ["n_port", "n_stbd"], "ratio": 0.0}
+    differential = {"text": "differential thrust: not excited", "is_excited": False}
+    common = {"text": "common thrust: excited", "is_excited": True}
     found = excitation(
         "excited",
-        directions=[direction, {"text": "common thrust: excited", "is_excited": True}],
+        directions=[direction | differential, direction | common],
         closed_loop_test_inputs=["delta"],
         domain=["n was held at 12 1/s."],
     )

@@ -327,7 +327,7 @@ class Models(dict[str, Model]):
             self.selection.to_record(),
             evaluation.limits_by_protocol,
             protocol=protocol,
-            excitation=self.excitation.to_content(),
+            excitation=self.excitation,
         )
 
     @cached_property

@@ -17,6 +17,7 @@ from residnet.core.format import (
 from residnet.core.model_names import CONSTANT_VELOCITY, PLANT
 from residnet.core.names import POSE_ERROR_UNITS
 from residnet.evaluation.records import (
+    ExcitationFile,
     HorizonRow,
     MetricsRow,
     PairedDifference,
@@ -65,7 +66,7 @@ class VerdictEvidence:
         protocol: protocol of the rows.
         one_sided_text: finding of the data checks on logs without turns to both sides; free runs on
             such logs cannot validate the turning motion.
-        excitation: contents of excitation.json; may be empty.
+        excitation: contents of excitation.json; None for runs of earlier versions.
     """
 
     selected: str
@@ -77,7 +78,7 @@ class VerdictEvidence:
     data_quality_text: str = ""
     protocol: str = ""
     one_sided_text: str = ""
-    excitation: JsonObject = field(default_factory=dict)
+    excitation: ExcitationFile | None = None
 
 
 LEVEL_TEXTS = {
@@ -157,9 +158,9 @@ def list_unidentifiable_inputs(evidence: VerdictEvidence) -> list[str]:
     relation of the input to the motion, and collinear inputs remain collinear.
     """
     return [
-        f"the effect of {row['name']} cannot be identified: {row['text']}"
-        for row in evidence.excitation.get("inputs") or []
-        if row["state"] in ("feedback", "collinear")
+        f"the effect of {row.name} cannot be identified: {row.text}"
+        for row in (() if evidence.excitation is None else evidence.excitation.inputs)
+        if row.state in ("feedback", "collinear")
     ]
 
 
@@ -170,13 +171,13 @@ def describe_unexcited(evidence: VerdictEvidence) -> str:
     controller steered.
     """
     excitation = evidence.excitation
-    directions = [
-        row["text"] for row in excitation.get("directions") or [] if not row["is_excited"]
-    ]
-    held_inputs = [row["text"] for row in excitation.get("inputs") or [] if row["state"] == "held"]
+    if excitation is None:
+        return ""
+    directions = [row.text for row in excitation.directions if not row.is_excited]
+    held_inputs = [row.text for row in excitation.inputs if row.state == "held"]
     sentences = [f"{text[0].upper()}{text[1:]}." for text in (*directions, *held_inputs)]
-    sentences += list(excitation.get("domain") or [])
-    if controlled := excitation.get("closed_loop_test_inputs"):
+    sentences += excitation.domain
+    if controlled := excitation.closed_loop_test_inputs:
         sentences.append(
             "Shown for operation under the same controller only: in the"
             f" {evidence.split} logs feedback sets {join_list(list(controlled))}."

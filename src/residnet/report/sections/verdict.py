@@ -14,7 +14,7 @@ from residnet.core.format import (
     format_percent_change,
 )
 from residnet.core.model_names import CONSTANT_VELOCITY
-from residnet.evaluation.records import SANITY_CHECKS, Interval, SanityRow
+from residnet.evaluation.records import SANITY_CHECKS, ExcitationFile, Interval, SanityRow
 from residnet.evaluation.verdict import UNSEEN_SPLITS, VerdictEvidence, describe_divergence
 from residnet.evaluation.verdict import rate_model as judged_level
 from residnet.evaluation.verdict import write_verdict as judged
@@ -91,7 +91,7 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
         quality_summary,
         protocol,
         next(one_sided_texts, ""),
-        run.read_json("excitation.json"),
+        run.read_record(ExcitationFile, "excitation.json"),
     )
 
 
