@@ -13,12 +13,8 @@ import torch
 from kinds import of_kind
 
 import residnet
-from residnet.autopilot.motion import (
-    ActuatorLag,
-    PoseDerivatives,
-    required_force,
-    sample_filtered_course,
-)
+from residnet.autopilot.motion import PoseDerivatives, required_force, sample_filtered_course
+from residnet.autopilot.motion_config import ActuatorLag
 from residnet.baselines.given_config import BelievedConfig
 from residnet.core.config import load_config
 from residnet.core.errors import FitError

@@ -12,7 +12,7 @@ from typing import ClassVar, Literal, final
 from pydantic import Field, model_validator
 
 from residnet.autopilot.guidance import CrossingConfig
-from residnet.autopilot.motion import ReferenceFilterConfig
+from residnet.autopilot.motion_config import ReferenceFilterConfig
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import suggest_name

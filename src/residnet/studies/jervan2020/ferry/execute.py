@@ -18,7 +18,7 @@ from torch import Tensor
 
 from residnet.autopilot.evaluation import mean_squares_by_axis
 from residnet.autopilot.guidance import CrossingConfig
-from residnet.autopilot.motion import ReferenceFilterConfig
+from residnet.autopilot.motion_config import ReferenceFilterConfig
 from residnet.baselines.given_config import BelievedConfig, HullEquations
 from residnet.core.errors import ConfigError, FitError, UsageError
 from residnet.core.files import read_json
