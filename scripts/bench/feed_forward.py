@@ -26,8 +26,8 @@ from residnet.physics.force_model import ForceModel
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
-from residnet.studies.jervan2020.ferry import (
-    FerryStudyConfig,
+from residnet.studies.jervan2020.ferry.config import FerryStudyConfig
+from residnet.studies.jervan2020.ferry.execute import (
     list_feed_forward_objections,
     run_ferry_study,
     write_results,

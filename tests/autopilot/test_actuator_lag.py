@@ -8,7 +8,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from residnet.autopilot.actuator_lag import fit_lag, simulate_lagged_force
-from residnet.autopilot.motion import ActuatorLag
+from residnet.autopilot.motion_config import ActuatorLag
 from residnet.core.errors import FitError
 
 DT = 0.1

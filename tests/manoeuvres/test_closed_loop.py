@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from residnet.autopilot.manoeuvres import SEGMENTS, FourCorner
-from residnet.autopilot.motion import MotionPIDConfig
+from residnet.autopilot.motion_config import MotionPIDConfig
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.dynamics.base import Dynamics

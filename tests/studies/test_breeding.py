@@ -11,7 +11,11 @@ from read_page import plain
 from scipy.integrate import solve_ivp
 from tiny import Command, read_json, write_yaml
 
-from residnet.studies.halvorsen2019.breeding import TRUE_COEFFICIENTS, NoiseConfig, RecordConfig
+from residnet.studies.halvorsen2019.breeding.config import (
+    TRUE_COEFFICIENTS,
+    NoiseConfig,
+    RecordConfig,
+)
 
 SMALL: dict[str, Any] = {
     "task": "breeding",

@@ -19,10 +19,13 @@ from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
 from residnet.physics.force_terms import FERRY_TERMS
 from residnet.studies.jervan2020.force_logs import compare_accelerations
-from residnet.studies.jervan2020.measured import (
-    ForceResidualConfig,
+from residnet.studies.jervan2020.measured.config import ForceResidualConfig
+from residnet.studies.jervan2020.measured.execute import (
+    build_sections,
     is_significantly_better,
+    read_logs,
     run_force_study,
+    summarize,
 )
 
 CONFIG = Path(residnet.__file__).parents[2] / "configs" / "studies" / "jervan2020" / "measured.yaml"
@@ -105,8 +108,8 @@ def test_what_the_hull_lacks_is_found_and_said(tmp_path: Path) -> None:
     coefficients = dict(zip(FERRY_TERMS, results["models"]["ridge"]["coefficients"], strict=True))
     assert coefficients["u_dot"][0] == pytest.approx(500, rel=0.05)
     assert coefficients["r_dot"][2] == pytest.approx(400, rel=0.05)
-    assert "in the mean over the axes: plsr and ridge." in " ".join(settings.summarize(results))
-    titles = [section.title for section in settings.build_sections(results, tmp_path / "run")]
+    assert "in the mean over the axes: plsr and ridge." in " ".join(summarize(settings, results))
+    titles = [section.title for section in build_sections(settings, results, tmp_path / "run")]
     # the first picture has no title
     assert titles[:3] == ["", "Data and cross-validation", "Commanded and actual force"]
     assert "Residual of the actual force" in titles
@@ -122,7 +125,7 @@ def test_a_residual_of_noise_is_said_to_be_none(tmp_path: Path) -> None:
         any(is_significantly_better(rows[name], "believed")) for name in ("ols", "surface")
     )
     assert is_significantly_better(rows["believed"], "zero")[3]
-    said = settings.summarize(results)
+    said = summarize(settings, results)
     assert "None of the 2 regressions is better" in " ".join(said)
     assert "Recommended: the believed model alone in surge, sway and yaw." in said
 
@@ -140,7 +143,7 @@ def test_a_believed_model_that_is_worse_than_no_force_is_no_yardstick(tmp_path: 
     assert is_significantly_better(rows["ridge"], "believed") == [True] * 4
     assert not any(is_significantly_better(rows["ridge"], "reference"))
     assert rows["believed"]["minus_zero"]["ci95"][3][0] > 0
-    said = " ".join(settings.summarize(results))
+    said = " ".join(summarize(settings, results))
     for words in (
         "worse than no force in surge, sway and yaw",
         "None of the 1 regressions is better than the better of no force",
@@ -151,7 +154,7 @@ def test_a_believed_model_that_is_worse_than_no_force_is_no_yardstick(tmp_path: 
 
 def test_folds_are_stretches_of_one_log_with_a_gap_and_whole_logs_of_three(tmp_path: Path) -> None:
     log(tmp_path)
-    measured = config(tmp_path).read_logs()
+    measured = read_logs(config(tmp_path))
     # the sensor that is off is calibrated
     surge, sway = (measured.acceleration_comparison[name] for name in ("surge", "sway"))
     assert surge["offset"] == pytest.approx(OFFSET, abs=1e-4)
@@ -164,7 +167,7 @@ def test_folds_are_stretches_of_one_log_with_a_gap_and_whole_logs_of_three(tmp_p
     assert int((~near & ~record.is_training).sum()) == int((~measured.usable & ~near).sum())
     for number, name in enumerate(("two", "three")):
         log(tmp_path, name, seed=number + 1, seconds=100.0)
-    measured = config(tmp_path).read_logs()
+    measured = read_logs(config(tmp_path))
     record, test = measured.split_fold(0, 5.0)
     assert (measured.names, measured.fold_unit) == (("one", "three", "two"), "logs")
     first = slice(record.run_lengths[0])
@@ -176,7 +179,7 @@ def test_folds_are_stretches_of_one_log_with_a_gap_and_whole_logs_of_three(tmp_p
     assert bool((record.fold[ends] != record.fold[ends - 1]).all())
     log(tmp_path, "copy")
     with pytest.raises(DataError, match="identical rows"):
-        config(tmp_path).read_logs()
+        read_logs(config(tmp_path))
 
 
 def test_outliers_and_gaps_are_left_out(tmp_path: Path) -> None:
@@ -184,7 +187,7 @@ def test_outliers_and_gaps_are_left_out(tmp_path: Path) -> None:
     u[700] += 3.0
     v[1500:1600] = np.nan
     log(tmp_path, u=u, v=v)
-    measured = config(tmp_path).read_logs()
+    measured = read_logs(config(tmp_path))
     assert not bool(measured.usable[700])
     assert not bool(measured.usable[1500:1600].any())
     assert measured.masked_shares["one"]["outlier"] > 0
@@ -213,7 +216,7 @@ def test_a_model_that_is_not_determined_is_set_aside_and_said(tmp_path: Path) ->
     assert list(results["models"]) == ["ridge"]
     said = "model earth: a constant force in earth axes is not identifiable"
     assert results["failed"]["earth"].startswith(said)
-    titles = [section.title for section in settings.build_sections(results, tmp_path / "run")]
+    titles = [section.title for section in build_sections(settings, results, tmp_path / "run")]
     assert "Not determined by these logs" in titles
 
 

@@ -13,12 +13,8 @@ import torch
 from kinds import of_kind
 
 import residnet
-from residnet.autopilot.motion import (
-    ActuatorLag,
-    PoseDerivatives,
-    required_force,
-    sample_filtered_course,
-)
+from residnet.autopilot.motion import PoseDerivatives, required_force, sample_filtered_course
+from residnet.autopilot.motion_config import ActuatorLag
 from residnet.baselines.given_config import BelievedConfig
 from residnet.core.config import load_config
 from residnet.core.errors import FitError
@@ -29,15 +25,16 @@ from residnet.physics.force_terms import FERRY_TERMS
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
-from residnet.studies.jervan2020.ferry import (
-    FerryModelConfig,
+from residnet.studies.jervan2020.ferry.config import FerryModelConfig, FerryStudyConfig
+from residnet.studies.jervan2020.ferry.execute import (
     FerryStudy,
-    FerryStudyConfig,
     build_record,
+    build_sections,
     compare_residuals,
     identify_model,
     list_feed_forward_objections,
     run_ferry_study,
+    summarize,
     write_results,
 )
 from residnet.studies.jervan2020.residual import (
@@ -229,8 +226,8 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
     results, figures = write_results(wanted, found, folder)
     assert results["models"]["case"]["not_forward"].startswith("model case: its mass matrix")
     told = "With lag_ridge as feed-forward, the mean position error in the course"
-    assert any(sentence.startswith(told) for sentence in wanted.summarize(results))
-    titles = {section.title for section in wanted.build_sections(results, folder.path)}
+    assert any(sentence.startswith(told) for sentence in summarize(wanted, results))
+    titles = {section.title for section in build_sections(wanted, results, folder.path)}
     assert titles >= {"Models that cannot run forward in time", "Feed-forward without feedback"}
     left = {path.name for path in (tmp_path / "run" / "models").glob("*.yaml")}
     assert left == {"lag_ridge_forward.yaml"}

@@ -14,13 +14,8 @@ from tiny import read_json
 from residnet.core.errors import FitError
 from residnet.core.log import Log
 from residnet.studies import load_published
-from residnet.studies.halvorsen2019.sea_trial import (
-    CHANNELS,
-    SET_NAMES,
-    PreparationConfig,
-    load_odin,
-    prepare_logs,
-)
+from residnet.studies.halvorsen2019.sea_trial.config import CHANNELS, PreparationConfig, load_odin
+from residnet.studies.halvorsen2019.sea_trial.execute import SET_NAMES, prepare_logs
 from residnet.studies.halvorsen2019.standard_model import (
     LOWER,
     SCALE,

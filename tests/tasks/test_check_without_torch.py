@@ -19,6 +19,13 @@ from residnet.tasks.registry import TaskConfig
 QUICKSTART = Path(residnet.__file__).parents[2] / "configs" / "quickstart.yaml"
 """Shipped config of a fit of simulated trials, with a baseline and three heads."""
 
+IMPORT_WITHOUT_TORCH = """
+import importlib, sys
+for module in sys.argv[1:]:
+    importlib.import_module(module)
+    assert "torch" not in sys.modules, module
+"""
+
 
 def run_python(program: str, *arguments: str) -> str:
     """Run a program in a process of its own; return its standard output."""
@@ -65,13 +72,11 @@ def test_config_classes_of_parts_import_no_torch(union: object) -> None:
     modules = {object_path.partition(":")[0] for object_path in core_kinds.values()}
     # a module of the user is PyTorch code by definition
     modules.discard("residnet.heads.module")
-    program = """
-import importlib, sys
-for module in sys.argv[1:]:
-    importlib.import_module(module)
-    assert "torch" not in sys.modules, module
-"""
-    run_python(program, *sorted(modules))
+    run_python(IMPORT_WITHOUT_TORCH, *sorted(modules))
+
+
+def test_manoeuvres_of_the_autopilot_wing_import_no_torch() -> None:
+    run_python(IMPORT_WITHOUT_TORCH, "residnet.autopilot.manoeuvres")
 
 
 @pytest.mark.parametrize("name", sorted(find_vessel_files()))

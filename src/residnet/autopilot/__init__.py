@@ -17,11 +17,10 @@ if TYPE_CHECKING:
         FeedForward,
         HullFeedForward,
         MotionPID,
-        MotionPIDConfig,
         NoFeedForward,
         ReferenceFilter,
-        ReferenceFilterConfig,
     )
+    from residnet.autopilot.motion_config import MotionPIDConfig, ReferenceFilterConfig
 
 __all__ = [
     "AllocatedPolicy",
@@ -43,9 +42,9 @@ __all__ = [
 _MODULE_OF_NAME = {
     **dict.fromkeys(("ClosedLoop", "Policy", "RecordedReference", "Reference"), "base"),
     **dict.fromkeys(("BangBangHeading", "HeadingPD"), "heading.classical"),
-    **dict.fromkeys(("AllocatedPolicy", "MotionPID", "MotionPIDConfig"), "motion"),
+    **dict.fromkeys(("AllocatedPolicy", "MotionPID", "ReferenceFilter"), "motion"),
     **dict.fromkeys(("FeedForward", "HullFeedForward", "NoFeedForward"), "motion"),
-    **dict.fromkeys(("ReferenceFilter", "ReferenceFilterConfig"), "motion"),
+    **dict.fromkeys(("MotionPIDConfig", "ReferenceFilterConfig"), "motion_config"),
 }
 
 

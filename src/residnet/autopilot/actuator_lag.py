@@ -13,7 +13,7 @@ import scipy
 import torch
 from torch import Tensor
 
-from residnet.autopilot.motion import ActuatorLag
+from residnet.autopilot.motion_config import ActuatorLag
 from residnet.core.errors import FitError
 
 _LOWER_BOUNDS = np.array([0.1, 0.1, 0.0])

@@ -19,13 +19,12 @@ from residnet.autopilot.base import Policy, Reference
 from residnet.autopilot.courses.course_plan import Course
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.motion import (
-    ActuatorLag,
     PoseDerivatives,
-    ReferenceFilterConfig,
     filter_derivatives,
     required_force,
     stack_reference,
 )
+from residnet.autopilot.motion_config import ActuatorLag, ReferenceFilterConfig
 from residnet.core.columns import dynamic_states, heading, motion_accelerations, pose, position
 from residnet.core.config import Config, Metres, MetresPerSecond, RadiansPerSecond, Seconds
 from residnet.core.errors import ConfigError

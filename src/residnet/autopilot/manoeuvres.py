@@ -4,30 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-import torch
 from pydantic import Field
-from torch import Tensor
 
-from residnet.autopilot.base import ClosedLoop
-from residnet.autopilot.guidance import LookAheadLineOfSight, WaypointGuidance
-from residnet.autopilot.heading.classical import HeadingPD
-from residnet.autopilot.motion import (
-    AllocatedPolicy,
-    MotionPIDConfig,
-    ReferenceFilterConfig,
-    Waypoint,
-)
+from residnet.autopilot.motion_config import MotionPIDConfig, ReferenceFilterConfig, Waypoint
 from residnet.core.config import Metres, RadiansPerSecond, Seconds
 from residnet.core.errors import UsageError
 from residnet.core.frames import wrap_angle_array
 from residnet.core.layout import HEADING, MOTION, PLANAR_LAYOUT, POSE
 from residnet.core.log import Log
-from residnet.engine.rollout import Source
 from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.manoeuvres.sources import StackedSource
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from residnet.autopilot.base import ClosedLoop
+    from residnet.autopilot.guidance import WaypointGuidance
+    from residnet.engine.rollout import Source
 
 _POSE = PLANAR_LAYOUT.pose
 
@@ -56,6 +51,8 @@ class Waypoints(Manoeuvre):
 
     def build_guidance(self, state: tuple[str, ...]) -> WaypointGuidance:
         """Return the guidance over states with these names."""
+        from residnet.autopilot.guidance import LookAheadLineOfSight, WaypointGuidance
+
         return WaypointGuidance(
             self.points, self.acceptance, LookAheadLineOfSight(self.lookahead), state
         )
@@ -63,12 +60,20 @@ class Waypoints(Manoeuvre):
     @classmethod
     def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """Return the closed loop on position and heading, with a separate course for each row."""
+        from residnet.manoeuvres.sources import StackedSource
+
         for name in (*_POSE, "r"):
             helm.state_column(name)
         sources = [m._build_loop(helm) for m in manoeuvres if isinstance(m, Waypoints)]
         return StackedSource(sources, [1] * len(sources))
 
     def _build_loop(self, helm: Helm) -> ClosedLoop:
+        import torch
+
+        from residnet.autopilot.base import ClosedLoop
+        from residnet.autopilot.heading.classical import HeadingPD
+        from residnet.autopilot.motion import AllocatedPolicy
+
         autopilot = HeadingPD(helm.state, kp=self.gain, kd=self.rate_gain, limit=1.0)
 
         def to_commands(steer: Tensor) -> Tensor:
@@ -86,6 +91,8 @@ class Waypoints(Manoeuvre):
 
     def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
         """Return cross-track errors relative to the active legs, and the duration of the course."""
+        import torch
+
         x = torch.from_numpy(np.nan_to_num(log.stack(_POSE)))
         guidance = self.build_guidance(_POSE)
         s = guidance.initial_state(x[:1])
@@ -164,6 +171,10 @@ class FourCorner(Manoeuvre):
         Raises:
             UsageError: if the vessel lacks a command for one of the three forces.
         """
+        from residnet.autopilot.base import ClosedLoop
+        from residnet.autopilot.motion import AllocatedPolicy
+        from residnet.manoeuvres.sources import StackedSource
+
         if helm.forces is None or helm.state[MOTION] != PLANAR_LAYOUT.state_names:
             raise UsageError(
                 "a four-corner course needs a vessel in surge, sway and yaw with commands for"
@@ -181,6 +192,8 @@ class FourCorner(Manoeuvre):
 
     def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
         """Return the mean distance from the reference, and mean absolute error of the heading."""
+        import torch
+
         reference = self.filter_config.build(float(log.t[1] - log.t[0]))
         x = torch.from_numpy(log.stack(_POSE))
         s = reference.initial_state(x[:1])

@@ -7,57 +7,21 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Annotated, Literal, NamedTuple, final
+from typing import TYPE_CHECKING, NamedTuple, final
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.autopilot.base import Policy, Reference
 from residnet.core import columns
 from residnet.core.columns import dynamic_states, motion_accelerations, pose
-from residnet.core.config import Config, Metres, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body, wrap_angle
 from residnet.physics.force_model import ForceModel
 from residnet.physics.plant import Hull
 
-Waypoint = tuple[Metres, Metres, Radians]
-"""North, east and heading; headings are followed as they are written: from 0 to 180 deg clockwise,
-from 135 to -45 deg the other way.
-"""
-Frequency = Annotated[RadiansPerSecond, Field(gt=0)]
-Damping = Annotated[float, Field(gt=0)]
-
-
-class ReferenceFilterConfig(Config):
-    """A sequence of way-points at equal time intervals, smoothed by a reference filter.
-
-    Attributes:
-        waypoints: (north, east, heading); the first one is set at the start.
-        interval: time in s between way-points; the last one is held.
-        frequency: natural frequency Omega of x, y and psi.
-        damping: damping ratio Delta of x, y and psi.
-    """
-
-    kind: Literal["reference_filter"] = "reference_filter"
-    waypoints: Annotated[tuple[Waypoint, ...], Field(min_length=1)]
-    interval: Seconds = Field(default=60.0, gt=0)
-    frequency: tuple[Frequency, Frequency, Frequency] = (0.5, 0.5, 0.5)
-    damping: tuple[Damping, Damping, Damping] = (0.7, 0.7, 0.7)
-
-    @property
-    def duration(self) -> float:
-        """Time in s until the end of the last interval."""
-        return self.interval * len(self.waypoints)
-
-    def build(self, dt: float) -> ReferenceFilter:
-        """Build the reference filter for a time step of dt seconds.
-
-        Raises:
-            ConfigError: if the interval is not a multiple of the time step.
-        """
-        return ReferenceFilter([self], dt)
+if TYPE_CHECKING:
+    from residnet.autopilot.motion_config import ActuatorLag, MotionPIDConfig, ReferenceFilterConfig
 
 
 @final
@@ -172,10 +136,6 @@ def to_body_derivatives(
     )
 
 
-Gain = Annotated[float, Field(ge=0)]
-Gains = tuple[Gain, Gain, Gain]
-
-
 class FeedForward(nn.Module, ABC):
     """The forces that a model of the vessel needs for the desired motion."""
 
@@ -202,25 +162,6 @@ class HullFeedForward(FeedForward):
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
         return self.hull.required_force(nu_dot, nu)
-
-
-class MotionPIDConfig(Config):
-    """PID gains of surge, sway and yaw; with zero gains only the feed-forward acts.
-
-    Attributes:
-        proportional: gains in N/m, N/m, N m/rad.
-        integral: gains in N/(m s), N/(m s), N m/(rad s).
-        derivative: gains in N s/m, N s/m, N m s/rad.
-    """
-
-    kind: Literal["motion_pid"] = "motion_pid"
-    proportional: Gains
-    integral: Gains = (0.0, 0.0, 0.0)
-    derivative: Gains = (0.0, 0.0, 0.0)
-
-    def build(self, dt: float, feed_forward: FeedForward | None = None) -> MotionPID:
-        """Return the controller for a loop with steps of dt seconds."""
-        return MotionPID([self], dt, NoFeedForward() if feed_forward is None else feed_forward)
 
 
 @final
@@ -296,22 +237,6 @@ _RECOVERY_RATIO = 0.7
 """Rate at which an error of the force is corrected, relative to the frequency of the lag; peaks of
 the command increase with it.
 """
-
-
-class ActuatorLag(Config):
-    """Second-order lag of forces: tau'' + 2 zeta omega tau' + omega^2 tau = omega^2 tau_c.
-
-    tau_c is taken at t - delay (document 002 eq. (4.3)).
-
-    Attributes:
-        frequency: omega in rad/s.
-        damping: zeta, dimensionless.
-        delay: dead time in s.
-    """
-
-    frequency: RadiansPerSecond = Field(gt=0)
-    damping: float = Field(gt=0)
-    delay: Seconds = Field(default=0.0, ge=0)
 
 
 class PoseDerivatives(NamedTuple):
@@ -414,14 +339,9 @@ class LagCompensatedPID(Policy):
         self.dt = dt
         self.has_lag = any(lag is not None for lag in lags)
         # rows without lag get any stable lag, since `forward` discards its result for them
-        effective_lags = [lag or ActuatorLag(frequency=2.0, damping=1.0) for lag in lags]
-        lag_table = [
-            [float(lag is not None), effective_lag.frequency, effective_lag.damping]
-            for lag, effective_lag in zip(lags, effective_lags, strict=True)
-        ]
+        lag_table = [[1.0, lag.frequency, lag.damping] if lag else [0.0, 2.0, 1.0] for lag in lags]
         lag_matrices = [
-            [[0.0, 1.0, 0.0], [-(w**2), -2 * z * w, w**2], [0.0, 0.0, 0.0]]
-            for w, z in ((lag.frequency, lag.damping) for lag in effective_lags)
+            [[0.0, 1.0, 0.0], [-(w**2), -2 * z * w, w**2], [0.0, 0.0, 0.0]] for _, w, z in lag_table
         ]
         # exact discretisation of the lag for a command that is constant over a step
         step_matrix = torch.linalg.matrix_exp(torch.tensor(lag_matrices, dtype=torch.float64) * dt)

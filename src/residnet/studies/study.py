@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, final
@@ -16,60 +15,46 @@ from residnet.report.blocks import Cell, Column, Section
 from residnet.report.figure import Case, Curve, Figure, GlyphStyle, Panel
 from residnet.report.figure_files import read_figures, write_figure
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ExportWriters, SummaryMetric, Task, TaskOutcome
+from residnet.runs.task import ExportWriters, PackageTask, SummaryMetric, TaskOutcome
 
 StudyResults = Mapping[str, Any]
 """Results of a study, as in its file in the run folder."""
 
 
-class StudyTask(Task):
-    """A computational experiment of a document, with its results in one JSON file."""
+class StudyTask(PackageTask):
+    """A computational experiment of a document, with its results in one JSON file.
+
+    The module `execute` beside the config has the functions `compute_results(config, folder)`,
+    which returns the results for JSON and the figures, `summarize(config, results)`,
+    `main_figures(config, results)` and `build_sections(config, results, run)`, and optionally
+    `exports(config, folder)`.
+    """
 
     results_file: ClassVar[str] = "study.json"
 
-    @abstractmethod
-    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
-        """Run the study; return its results as JSON values, and its figures.
-
-        Raises:
-            ResidnetError: if the input is unsuitable.
-        """
-
-    @abstractmethod
-    def summarize(self, results: StudyResults) -> list[str]:
-        """Return sentences that summarise the results."""
-
-    @abstractmethod
-    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
-        """Return the main results as numbers by name."""
-
-    @abstractmethod
-    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
-        """Return the sections of the report, with published figures next to the computed ones."""
-
-    def exports(self, folder: RunFolder) -> ExportWriters:
-        """Return the functions that write the exports of the study by name; empty by default."""
-        return {}
-
     @final
     def execute(self, folder: RunFolder) -> TaskOutcome:
-        results, figures = self.compute_results(folder)
+        results: dict[str, Any]
+        figures: Iterable[Figure]
+        results, figures = self.call_executor("compute_results", folder)
         folder.write_json(folder.path / self.results_file, results)
         for figure in figures:
             write_figure(folder.figures, figure)
-        # read back, so that summary and report use identical values
-        stored_results = read_json(folder.path / self.results_file)
-        return TaskOutcome(
-            self.summarize(stored_results),
-            self.main_figures(stored_results),
-            exports=self.exports(folder),
-        )
+        # as a reader of the file sees them
+        stored_results: StudyResults = read_json(folder.path / self.results_file)
+        sentences: list[str] = self.call_executor("summarize", stored_results)
+        metrics: dict[str, SummaryMetric] = self.call_executor("main_figures", stored_results)
+        has_exports = hasattr(self.executor(), "exports")
+        exports: ExportWriters = self.call_executor("exports", folder) if has_exports else {}
+        return TaskOutcome(sentences, metrics, exports=exports)
 
     @classmethod
     @final
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         results = read_json(run.path / cls.results_file)
-        return load_config(run.resolved_config, [], cls).build_sections(results, run.path)
+        config = load_config(run.resolved_config, [], cls)
+        sections: Sequence[Section] = config.call_executor("build_sections", results, run.path)
+        return sections
 
 
 def published_cell(value: float | None, published: float | None, digits: int = 4) -> Cell:

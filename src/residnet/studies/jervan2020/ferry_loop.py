@@ -19,16 +19,18 @@ from residnet.autopilot.evaluation import TrackingMetrics, compute_tracking_metr
 from residnet.autopilot.guidance import Crossing, CrossingConfig
 from residnet.autopilot.heading.conditions import compile_or_fallback
 from residnet.autopilot.motion import (
-    ActuatorLag,
     AllocatedPolicy,
-    Gain,
     LagCompensatedPID,
     MotionPID,
-    MotionPIDConfig,
-    ReferenceFilterConfig,
     required_force,
     sample_filtered_course,
     stack_reference,
+)
+from residnet.autopilot.motion_config import (
+    ActuatorLag,
+    Gain,
+    MotionPIDConfig,
+    ReferenceFilterConfig,
 )
 from residnet.core.config import (
     Config,

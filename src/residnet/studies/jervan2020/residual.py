@@ -21,7 +21,7 @@ from torch import Tensor
 
 from residnet.autopilot.actuator_lag import fit_lag, simulate_lagged_force
 from residnet.autopilot.evaluation import mean_squares_by_axis
-from residnet.autopilot.motion import ActuatorLag
+from residnet.autopilot.motion_config import ActuatorLag
 from residnet.baselines.given_config import BelievedConfig, HullEquations
 from residnet.core.config import Config
 from residnet.core.errors import FitError

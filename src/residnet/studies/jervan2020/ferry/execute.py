@@ -10,18 +10,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal, final
+from typing import Any
 
 import numpy as np
 import torch
-from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.autopilot.evaluation import mean_squares_by_axis
 from residnet.autopilot.guidance import CrossingConfig
-from residnet.autopilot.motion import ReferenceFilterConfig
+from residnet.autopilot.motion_config import ReferenceFilterConfig
 from residnet.baselines.given_config import BelievedConfig, HullEquations
-from residnet.core.config import Config
 from residnet.core.errors import ConfigError, FitError, UsageError
 from residnet.core.files import read_json
 from residnet.core.format import DEGREES_PER_RADIAN, format_number
@@ -40,13 +38,16 @@ from residnet.physics.signals_config import SignalsConfig
 from residnet.report.blocks import Block, Cell, Section, Table, build_table
 from residnet.report.figure import DASHED_STYLE, SOLID_STYLE, Case, Figure, Panel, style_family
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, ExportRequest, ExportWriters, PartName, SummaryMetric
+from residnet.runs.task import ExportRequest, ExportWriters, SummaryMetric
+from residnet.studies.jervan2020.ferry.config import (
+    BELIEVED_NAME,
+    FerryModelConfig,
+    FerryStudyConfig,
+)
 from residnet.studies.jervan2020.ferry_loop import (
-    Disturbance,
     FeedForwardModel,
     FerryRun,
     FerrySimulation,
-    LoopConfig,
     MotionNoise,
     load_force_vessel,
 )
@@ -54,7 +55,6 @@ from residnet.studies.jervan2020.residual import (
     AXES,
     ForceRecord,
     ResidualForceModel,
-    ResidualModelConfig,
     derive_forward_equations,
     fit_model,
     fit_to_json,
@@ -66,7 +66,6 @@ from residnet.studies.jervan2020.residual import (
 )
 from residnet.studies.study import (
     StudyResults,
-    StudyTask,
     comparison_columns,
     find_figures,
     format_notes,
@@ -82,6 +81,136 @@ Growth of the mean square residual, smallest share of the variance of the force,
 segments in which both are exceeded. The share of segments excludes a single event such as a gust or
 a wake.
 """
+_DIVERGENCE_FACTOR = 3.0
+"""A free run has diverged above this multiple of the largest velocities of the true ferry."""
+
+
+_FREE_RUN_TRIALS: Mapping[str, Any] = {
+    "trials": (
+        ZigzagFamily(count=6, drive=(0.03, 0.07), steer=(0.01, 0.03), heading=(0.17, 0.35)),
+    ),
+    "duration": 60.0,
+    "step": 0.1,
+    "seed": 0,
+    "identification": {},
+    "validation": {},
+}
+"""Manoeuvres of the plant for the free runs of the models."""
+
+
+def compute_results(
+    config: FerryStudyConfig, folder: RunFolder
+) -> tuple[dict[str, Any], Iterable[Figure]]:
+    return write_results(config, run_ferry_study(config), folder)
+
+
+def exports(config: FerryStudyConfig, folder: RunFolder) -> ExportWriters:
+    return {
+        name: partial(config.export_model, ExportRequest(folder, name)) for name in config.models
+    }
+
+
+def export_model(config: FerryStudyConfig, request: ExportRequest) -> Path:
+    """Write the feed-forward of a model; `selected` is the model with the smallest residual."""
+    run = request.run
+    results = read_json(request.run.path / config.results_file)
+    name = find_best_model(results) if request.model == "selected" else request.model
+    if name not in config.models:
+        raise UsageError(f"{run.path}: no model '{name}'{suggest_name(name, config.models)}")
+    chain = [name]
+    while base_name := config.models[chain[0]].on:
+        chain.insert(0, base_name)
+    chain_rows = [results["models"][name_in_chain]["exported"] for name_in_chain in chain]
+    force = ForceModel(load_force_vessel(config.believed)[0].hull)
+    for row in chain_rows:
+        tensors = (torch.tensor(row[key]).double() for key in ("coefficients", "intercept"))
+        force = force.with_correction(ForceCorrection(row["terms"], *tensors))
+    ranges = [(lower, upper) for lower, upper in chain_rows[-1]["range"]]
+    required_force = RequiredForce(*force.split_corrections(), is_mirrored=True)
+    exported = ExportedForce(name, required_force, ranges, chain_rows[-1]["notes"].get("lag"))
+    return request.write(
+        exported, list_feed_forward_objections(name, results), f"{name}_feed_forward"
+    )
+
+
+def summarize(config: FerryStudyConfig, results: StudyResults) -> list[str]:
+    models = results["models"]
+    best_name = find_best_model(results)
+    remaining_text = join_numbers([100 * share for share in models[best_name]["share_left"]])
+    sentences = [
+        f"Of {len(models)} residual models, {best_name} leaves the least of the residual"
+        f" force on"
+        f" the unseen half of the course: {remaining_text} % of its mean square in surge,"
+        f" sway and yaw."
+    ]
+    for run_kind in ("course", "crossing"):
+        position_errors = {name: run["position_mae"] for name, run in results[run_kind].items()}
+        believed_error = position_errors.pop(BELIEVED_NAME, None)
+        if position_errors:
+            closest_model = min(position_errors, key=position_errors.__getitem__)
+            change_text = (
+                "decreases"
+                if position_errors[closest_model] < believed_error
+                else "does NOT decrease: it changes"
+            )
+            sentences.append(
+                f"With {closest_model} as feed-forward, the mean position error in the"
+                f" {run_kind} {change_text}"
+                f" from {format_number(believed_error)} m to"
+                f" {format_number(position_errors[closest_model])} m."
+            )
+    return sentences + [
+        f"On the changed vessel, {name} {update['text']}."
+        for name, update in results["later"].items()
+    ]
+
+
+def main_figures(config: FerryStudyConfig, results: StudyResults) -> dict[str, SummaryMetric]:
+    best_name = find_best_model(results)
+    shares = zip(AXES, results["models"][best_name]["share_left"], strict=True)
+    return {
+        f"residual left by {best_name}, {axis}": SummaryMetric(share) for axis, share in shares
+    } | {
+        f"mean position error on the course with {name}": SummaryMetric(run["position_mae"], "m")
+        for name, run in results["course"].items()
+    }
+
+
+def build_sections(config: FerryStudyConfig, results: StudyResults, run: Path) -> list[Section]:
+    residual_table = _residual_table(config, results)
+    run_pictures = [
+        picture.preview() for picture in find_figures(run, "errors_course", "errors_crossing")
+    ]
+    sections_written = [
+        Section("", [*run_pictures[:1], residual_table.select_columns(3, 6)]),
+        Section("Residual force on the unseen half", [residual_table]),
+    ]
+    for run_kind, title in (
+        ("course", "Course in closed loop"),
+        ("crossing", "Operational crossing"),
+        ("feed_forward_alone", "Feed-forward without feedback"),
+    ):
+        if results[run_kind]:
+            run_pictures = find_figures(run, f"errors_{run_kind}", f"forces_{run_kind}")
+            sections_written.append(
+                Section(
+                    title, [*_tracking_tables(config, results[run_kind], run_kind), *run_pictures]
+                )
+            )
+    if results["later"]:
+        sections_written.append(Section("The changed vessel", [_update_table(results["later"])]))
+    sections_written.append(Section("Forward in time", [_free_run_table(results["forward"])]))
+    # Table 4.11
+    comparisons = {
+        name: {
+            "true": {} if model.on else results["true_coefficients"],
+            "published": model.published.coefficients,
+        }
+        for name, model in config.models.items()
+    }
+    return sections_written + model_sections(
+        "Coefficients", results["models"], run, "notes", comparisons
+    )
 
 
 def compare_residuals(
@@ -130,279 +259,6 @@ def _verdict_text(comparison: StudyResults) -> str:
         f"{sentence} (residual {growth} times the previous one, {share} % of the force's variance;"
         " surge/sway/yaw)"
     )
-
-
-_BELIEVED_NAME = "believed"
-_DIVERGENCE_FACTOR = 3.0
-"""A free run has diverged above this multiple of the largest velocities of the true ferry."""
-
-
-class PublishedFigures(Config):
-    """Published figures of document 002 for one model.
-
-    Numbers are as printed, unless a correction of the document applies. Null if the document has
-    none.
-
-    Attributes:
-        mse: mean square residual on the test half in N^2, N^2, (N m)^2 (Tables 4.2, 4.5,
-            4.7, 4.15); surge, sway and yaw.
-        position_mae: mean position error on the course in m (Tables 4.4, 4.10).
-        position_mse: mean square position error on the course in m^2 (Tables 4.4, 4.10).
-        heading_mae: mean heading error on the course in deg (Tables 4.4, 4.10).
-        tau: mean absolute commanded force in N, N, N m (Tables 4.3, 4.9).
-        feedback: mean absolute feedback force in N, N, N m (Tables 4.3, 4.9).
-        crossing_position_mae: mean position error in the operational crossing in m (Table 4.12).
-        crossing_position_mse: mean square position error in the crossing in m^2 (Table 4.12).
-        crossing_heading_mae: mean heading error in the crossing in deg (Table 4.12).
-        alone: mean square error of u, v, r and of their derivatives against the desired motion
-            without feedback, in (m/s)^2, (m/s)^2, (rad/s)^2 and the same per second squared
-            (Table 4.8, correction J21).
-        crossing_power: mean power in W for position and heading control in the crossing (Table
-            4.13).
-        coefficients: coefficients of the basis functions in surge, sway and yaw in SI units
-            (Table 4.11), by basis function.
-    """
-
-    mse: tuple[float, float, float] | None = None
-    position_mae: float | None = None
-    position_mse: float | None = None
-    heading_mae: float | None = None
-    tau: tuple[float, float, float] | None = None
-    feedback: tuple[float, float, float] | None = None
-    crossing_position_mae: float | None = None
-    crossing_position_mse: float | None = None
-    crossing_heading_mae: float | None = None
-    alone: tuple[float, float, float, float, float, float] | None = None
-    crossing_power: tuple[float, float] | None = None
-    coefficients: dict[str, tuple[float, float, float]] = Field(default_factory=dict)
-
-
-_FREE_RUN_TRIALS: Mapping[str, Any] = {
-    "trials": (
-        ZigzagFamily(count=6, drive=(0.03, 0.07), steer=(0.01, 0.03), heading=(0.17, 0.35)),
-    ),
-    "duration": 60.0,
-    "step": 0.1,
-    "seed": 0,
-    "identification": {},
-    "validation": {},
-}
-"""Manoeuvres of the plant for the free runs of the models."""
-
-
-class FerryModelConfig(ResidualModelConfig):
-    """One model of the residual force; with `lag`, its feed-forward compensates the thruster lag.
-
-    Attributes:
-        smooth: estimate the motion from all noisy measurements together before the fit
-            (`residnet.preprocessing.motion`). Null for yes if the noise is known and the model
-            searches its settings.
-        on: name of the model whose remaining residual this one explains (3.26); empty for the
-            believed hull.
-        fly: simulate the course, and the crossing if there is one, with this feed-forward.
-        published: published figures of this model.
-    """
-
-    smooth: bool | None = None
-    on: str = ""
-    fly: bool = False
-    published: PublishedFigures = PublishedFigures()
-
-
-@final
-class FerryStudyConfig(StudyTask, ComputingTask):
-    """A course with the believed model, residual models identified from it, and the course again.
-
-    Attributes:
-        task: `ferry_study`.
-        believed: vessel with the hull model of the controller, by name or file.
-        true: simulated vessel, by name or file.
-        course: waypoints and reference filter; the first half is for identification, the second
-            for tests.
-        loop: controller and sampling.
-        crossing: an operational crossing that is also simulated; null for none.
-        noise: measurement noise; null for none.
-        disturbance: constant force in earth axes.
-        feed_forward_alone: whether the course is also simulated without feedback (Table 4.8).
-        models: residual models by name; a model must follow the one given by `on`.
-        published: published figures of the believed model.
-        later: the true vessel after a change, by name or file; feed-forward models are checked on
-            its log and identified again if they are no longer valid. Null for none.
-        seed: seed of the noise.
-    """
-
-    results_file: ClassVar[str] = "ferry.json"
-
-    task: Literal["ferry_study"]
-    believed: str = "milliampere"
-    true: str = "milliampere_half"
-    course: ReferenceFilterConfig
-    loop: LoopConfig
-    crossing: CrossingConfig | None = None
-    noise: MotionNoise | None = None
-    disturbance: Disturbance = Disturbance()
-    feed_forward_alone: bool = False
-    models: dict[PartName, FerryModelConfig] = Field(min_length=1)
-    published: PublishedFigures = PublishedFigures()
-    later: str | None = None
-    seed: int = Field(default=0, ge=0)
-
-    supported_commands: ClassVar[tuple[str, ...]] = ("report", "export")
-
-    @model_validator(mode="after")
-    def _check_combination(self) -> FerryStudyConfig:
-        previous_names: list[str] = []
-        for name, model in self.models.items():
-            if name == _BELIEVED_NAME:
-                raise ValueError(
-                    "'believed' is reserved for the model of the controller; use another name"
-                )
-            if model.on and model.on not in previous_names:
-                raise ValueError(
-                    f"models.{name}.on: no preceding model is named"
-                    f" '{model.on}'{suggest_name(model.on, previous_names)}"
-                )
-            base_model = self.models.get(model.on)
-            if base_model and (
-                base_model.searches_settings or bool(base_model.lag) != bool(model.lag)
-            ):
-                raise ValueError(
-                    f"models.{name}.on: '{model.on}' and it must both have a lag or none; set 'lag'"
-                    " of both"
-                )
-            previous_names.append(name)
-        if len(self.course.waypoints) < 4:
-            raise ValueError(
-                "course: at least four waypoints, since half of the segments are for"
-                " identification and half for tests"
-            )
-        try:
-            for plant_name in (self.true, self.later or self.true):
-                self.build_loop(plant_name)
-            self.course.build(self.loop.step)
-        except ConfigError as error:
-            raise ValueError(str(error)) from None
-        return self
-
-    def provenance_seed(self) -> int:
-        return self.seed
-
-    def build_loop(self, true: str) -> FerrySimulation:
-        """Return the closed loop with the given true vessel."""
-        return FerrySimulation(
-            true, self.believed, self.loop, self.noise, self.disturbance, self.seed
-        )
-
-    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
-        return write_results(self, run_ferry_study(self), folder)
-
-    def exports(self, folder: RunFolder) -> ExportWriters:
-        return {
-            name: partial(self.export_model, ExportRequest(folder, name)) for name in self.models
-        }
-
-    def export_model(self, request: ExportRequest) -> Path:
-        """Write the feed-forward of a model; `selected` is the model with the smallest residual."""
-        run = request.run
-        results = read_json(request.run.path / self.results_file)
-        name = find_best_model(results) if request.model == "selected" else request.model
-        if name not in self.models:
-            raise UsageError(f"{run.path}: no model '{name}'{suggest_name(name, self.models)}")
-        chain = [name]
-        while base_name := self.models[chain[0]].on:
-            chain.insert(0, base_name)
-        chain_rows = [results["models"][name_in_chain]["exported"] for name_in_chain in chain]
-        force = ForceModel(load_force_vessel(self.believed)[0].hull)
-        for row in chain_rows:
-            tensors = (torch.tensor(row[key]).double() for key in ("coefficients", "intercept"))
-            force = force.with_correction(ForceCorrection(row["terms"], *tensors))
-        ranges = [(lower, upper) for lower, upper in chain_rows[-1]["range"]]
-        required_force = RequiredForce(*force.split_corrections(), is_mirrored=True)
-        exported = ExportedForce(name, required_force, ranges, chain_rows[-1]["notes"].get("lag"))
-        return request.write(
-            exported, list_feed_forward_objections(name, results), f"{name}_feed_forward"
-        )
-
-    def summarize(self, results: StudyResults) -> list[str]:
-        models = results["models"]
-        best_name = find_best_model(results)
-        remaining_text = join_numbers([100 * share for share in models[best_name]["share_left"]])
-        sentences = [
-            f"Of {len(models)} residual models, {best_name} leaves the least of the residual"
-            f" force on"
-            f" the unseen half of the course: {remaining_text} % of its mean square in surge,"
-            f" sway and yaw."
-        ]
-        for run_kind in ("course", "crossing"):
-            position_errors = {name: run["position_mae"] for name, run in results[run_kind].items()}
-            believed_error = position_errors.pop(_BELIEVED_NAME, None)
-            if position_errors:
-                closest_model = min(position_errors, key=position_errors.__getitem__)
-                change_text = (
-                    "decreases"
-                    if position_errors[closest_model] < believed_error
-                    else "does NOT decrease: it changes"
-                )
-                sentences.append(
-                    f"With {closest_model} as feed-forward, the mean position error in the"
-                    f" {run_kind} {change_text}"
-                    f" from {format_number(believed_error)} m to"
-                    f" {format_number(position_errors[closest_model])} m."
-                )
-        return sentences + [
-            f"On the changed vessel, {name} {update['text']}."
-            for name, update in results["later"].items()
-        ]
-
-    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
-        best_name = find_best_model(results)
-        shares = zip(AXES, results["models"][best_name]["share_left"], strict=True)
-        return {
-            f"residual left by {best_name}, {axis}": SummaryMetric(share) for axis, share in shares
-        } | {
-            f"mean position error on the course with {name}": SummaryMetric(
-                run["position_mae"], "m"
-            )
-            for name, run in results["course"].items()
-        }
-
-    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
-        residual_table = _residual_table(self, results)
-        run_pictures = [
-            picture.preview() for picture in find_figures(run, "errors_course", "errors_crossing")
-        ]
-        sections_written = [
-            Section("", [*run_pictures[:1], residual_table.select_columns(3, 6)]),
-            Section("Residual force on the unseen half", [residual_table]),
-        ]
-        for run_kind, title in (
-            ("course", "Course in closed loop"),
-            ("crossing", "Operational crossing"),
-            ("feed_forward_alone", "Feed-forward without feedback"),
-        ):
-            if results[run_kind]:
-                run_pictures = find_figures(run, f"errors_{run_kind}", f"forces_{run_kind}")
-                sections_written.append(
-                    Section(
-                        title, [*_tracking_tables(self, results[run_kind], run_kind), *run_pictures]
-                    )
-                )
-        if results["later"]:
-            sections_written.append(
-                Section("The changed vessel", [_update_table(results["later"])])
-            )
-        sections_written.append(Section("Forward in time", [_free_run_table(results["forward"])]))
-        # Table 4.11
-        comparisons = {
-            name: {
-                "true": {} if model.on else results["true_coefficients"],
-                "published": model.published.coefficients,
-            }
-            for name, model in self.models.items()
-        }
-        return sections_written + model_sections(
-            "Coefficients", results["models"], run, "notes", comparisons
-        )
 
 
 def identify_model(
@@ -499,7 +355,7 @@ def run_ferry_study(config: FerryStudyConfig) -> FerryStudy:
         if model.searches_settings and not model.on and models[name].fit.notes["order"] > 0
     }
     feed_forward_models = {name: models[name] for name, model in config.models.items() if model.fly}
-    feeds_by_name: dict[str, FeedForwardModel] = {_BELIEVED_NAME: (believed, None)}
+    feeds_by_name: dict[str, FeedForwardModel] = {BELIEVED_NAME: (believed, None)}
     feeds_by_name |= {name: (model.force, model.lag) for name, model in feed_forward_models.items()}
 
     def simulate_runs(
@@ -545,7 +401,7 @@ def run_ferry_study(config: FerryStudyConfig) -> FerryStudy:
         whole_course_models,
         {
             "course": {
-                _BELIEVED_NAME: believed_run,
+                BELIEVED_NAME: believed_run,
                 **simulate_runs(ferry, config.course, feed_forward_models),
             },
             "crossing": simulate_runs(ferry, config.crossing, feeds_by_name)
@@ -591,7 +447,7 @@ def forward_runs(
     believed_equations = BelievedConfig(vessel=config.believed).hull_equations()
     signals = SignalsConfig(inputs=FORCE_CHANNELS).build()
     rows = {}
-    for name, equations in {_BELIEVED_NAME: believed_equations, **models}.items():
+    for name, equations in {BELIEVED_NAME: believed_equations, **models}.items():
         baseline = BelievedConfig(vessel=equations).build(signals.names)
         model = HybridDynamics(signals, baseline, ZeroHead(), trials.step).double()
         with torch.no_grad():
@@ -758,7 +614,7 @@ def list_feed_forward_objections(name: str, results: StudyResults) -> list[str]:
     for run_kind in ("course", "crossing", "feed_forward_alone"):
         if name in (runs := results[run_kind]):
             model_error, believed_error = (
-                runs[model_name]["position_mae"] for model_name in (name, _BELIEVED_NAME)
+                runs[model_name]["position_mae"] for model_name in (name, BELIEVED_NAME)
             )
             if model_error > believed_error:
                 reasons.append(
@@ -781,9 +637,9 @@ def _residual_table(config: FerryStudyConfig, results: StudyResults) -> Table:
     published_base = config.published.mse
     rows = []
     believed_row = {"test_mse": unmodelled, "notes": {}}
-    for name, model in {_BELIEVED_NAME: believed_row, **results["models"]}.items():
+    for name, model in {BELIEVED_NAME: believed_row, **results["models"]}.items():
         published_figures = (
-            config.published if name == _BELIEVED_NAME else config.models[name].published
+            config.published if name == BELIEVED_NAME else config.models[name].published
         )
         compared_values = {
             "ours": (model["test_mse"], unmodelled),
@@ -828,7 +684,7 @@ def _tracking_tables(
     rows = []
     for name, metrics in runs.items():
         published_figures = (
-            config.published if name == _BELIEVED_NAME else config.models[name].published
+            config.published if name == BELIEVED_NAME else config.models[name].published
         )
         published_values = published_figures.model_dump()
         if run_kind == "crossing":

@@ -8,11 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, final
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.errors import ConfigError, FitError
@@ -28,10 +27,6 @@ from residnet.core.layout import HEADING
 from residnet.core.stretches import find_runs
 from residnet.evaluation.metrics import bootstrap_intervals
 from residnet.physics.force_model import ForceModel
-from residnet.physics.hull import HullConfig
-from residnet.physics.plant import Hull, HullPlant
-from residnet.physics.vessel import load_vessel
-from residnet.preprocessing.prepare import PrepareConfig
 from residnet.report.blocks import Bullets, Cell, Section, Table, Text, build_table
 from residnet.report.figure import (
     BLUE,
@@ -48,19 +43,20 @@ from residnet.report.figure import (
     tick_labels,
 )
 from residnet.runs.folder import RunFolder
-from residnet.runs.task import ComputingTask, PartName, SummaryMetric
+from residnet.runs.task import SummaryMetric
 from residnet.studies.jervan2020.force_logs import (
-    FoldsConfig,
-    ForceChannelsConfig,
-    ForceLogsConfig,
     MeasuredForceLogs,
     compare_forces,
     read_force_logs,
 )
+from residnet.studies.jervan2020.measured.config import (
+    REFERENCE_MODELS,
+    ForceResidualConfig,
+    MeasuredModelConfig,
+)
 from residnet.studies.jervan2020.residual import (
     AXES,
     RegressionFit,
-    ResidualModelConfig,
     derive_forward_equations,
     fit_model,
     fit_to_json,
@@ -69,203 +65,104 @@ from residnet.studies.jervan2020.residual import (
 )
 from residnet.studies.study import (
     StudyResults,
-    StudyTask,
     comparison_columns,
     find_figures,
     format_notes,
     plot_time_series,
 )
 
-_REFERENCE_MODELS = {"zero": "no force at all", "believed": "the believed model alone"}
-"""Models without a regression, with which all others are compared."""
 _FORCE_UNITS = tuple((label, 1.0) for label in ("surge [N]", "sway [N]", "yaw [N m]"))
 _ACCELERATION_UNITS = tuple(
     (label, 1.0) for label in ("surge [m/s²]", "sway [m/s²]", "yaw [rad/s²]")
 )
 
 
-class MeasuredModelConfig(ResidualModelConfig):
-    """One regression of the residual of measured forces.
-
-    Attributes:
-        lag: as in the base class, but not searched, since an actual force has no lag.
-        force: force that the model explains: the actual or the commanded one.
-        published: published mean square residuals on the test half of the document, without and
-            with this model, in N^2, N^2, (N m)^2; from other trials.
-    """
-
-    lag: bool = False
-    force: Literal["actual", "commanded"] = "actual"
-    published: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
-
-    @property
-    def evaluation_force(self) -> Literal["actual", "commanded"]:
-        """The force on which the model is evaluated.
-
-        A model with lag is evaluated on the actual force, because a fitted lag alone could make the
-        residual of the command small.
-        """
-        return "actual" if self.lag else self.force
-
-    @model_validator(mode="after")
-    def _check_combination(self) -> MeasuredModelConfig:
-        if self.lag and self.force != "commanded":
-            raise ValueError(
-                "lag: only commanded forces have a lag; set force to 'commanded', or remove lag"
-            )
-        if self.fit.choose == "test":
-            raise ValueError(
-                "fit.choose: with 'test' a model is selected on the samples of its evaluation; use"
-                " simplest or least"
-            )
-        return self
+def check(config: ForceResidualConfig) -> None:
+    measured = read_logs(config)
+    for part in measured.fold_index.unique().tolist():
+        measured.split_fold(part, config.validation.gap)
 
 
-@final
-class ForceResidualConfig(StudyTask, ComputingTask):
-    """Regressions of the residual force of a believed hull on measured logs, cross-validated.
+def read_logs(config: ForceResidualConfig) -> MeasuredForceLogs:
+    """Return the contents of the logs."""
+    return read_force_logs(config.data, config.channels, config.prepare, config.validation)
 
-    Attributes:
-        task: `force_residual`.
-        believed: vessel with the known hull, by name or file.
-        data: the measured logs.
-        prepare: time grid, masks, smoothing and differentiation of the velocities.
-        channels: names of the channels of force and acceleration.
-        validation: settings of the cross-validation.
-        models: regressions by name.
-    """
 
-    results_file: ClassVar[str] = "force_residual.json"
+def compute_results(
+    config: ForceResidualConfig, folder: RunFolder
+) -> tuple[dict[str, Any], Iterable[Figure]]:
+    return run_force_study(config)
 
-    task: Literal["force_residual"]
-    believed: str
-    data: ForceLogsConfig
-    prepare: PrepareConfig
-    channels: ForceChannelsConfig
-    validation: FoldsConfig = FoldsConfig()
-    models: dict[PartName, MeasuredModelConfig] = Field(min_length=1)
 
-    @model_validator(mode="after")
-    def _check_combination(self) -> ForceResidualConfig:
-        if reserved_names := sorted(set(_REFERENCE_MODELS) & set(self.models)):
-            raise ValueError(
-                f"'{reserved_names[0]}' is reserved for a reference model; use another name"
-            )
-        if self.prepare.hold != "start":
-            raise ValueError("prepare.hold: not used here, because nothing is simulated; remove it")
-        if (
-            self.validation.gap < self.prepare.grid.step
-            or self.validation.segment < 10 * self.prepare.grid.step
-        ):
-            raise ValueError(
-                "validation: gap must be at least one step of the grid, segment at least ten"
-            )
-        try:
-            self.believed_hull()
-        except ConfigError as error:
-            raise ValueError(str(error)) from None
-        return self
-
-    def believed_hull(self) -> Hull:
-        """Return the known hull.
-
-        Raises:
-            ConfigError: if the vessel has no hull model with matrices.
-        """
-        config = load_vessel(self.believed)
-        vessel = config.build() if isinstance(config, HullConfig) else None
-        if not isinstance(vessel, HullPlant):
-            raise ConfigError(
-                f"believed: '{self.believed}' is of kind '{config.kind}'; a believed hull needs one"
-                " of kind fossen or mass_matrix"
-            )
-        return vessel.hull
-
-    def check(self) -> None:
-        measured = self.read_logs()
-        for part in measured.fold_index.unique().tolist():
-            measured.split_fold(part, self.validation.gap)
-
-    def input_files(self) -> Sequence[Path]:
-        return self.data.find_paths()
-
-    def read_logs(self) -> MeasuredForceLogs:
-        """Return the contents of the logs."""
-        return read_force_logs(self.data, self.channels, self.prepare, self.validation)
-
-    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
-        return run_force_study(self)
-
-    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
-        figures: dict[str, SummaryMetric] = {}
-        for force, rows in _rows_by_force(results).items():
-            best_row = min(rows.values(), key=lambda row: sum(row["of_zero"]))
-            for row in (rows["believed"], best_row):
-                name = f"share of the {force} force left by {row['model']}"
-                figures[name] = SummaryMetric(sum(row["of_zero"]) / 3)
-        return figures
-
-    def summarize(self, results: StudyResults) -> list[str]:
-        """Return sentences on the improvement by regressions for each force."""
-        sentences: list[str] = []
-        for force, rows in _rows_by_force(results).items():
-            if results["intervals"] is None:
-                sentences.append(
-                    f"{force.capitalize()} force: there are too few segments to compare models."
-                )
-                continue
-            believed = rows["believed"]
-            bounds = believed["minus_zero"]["ci95"][:3]
-            worse_axes = [axis for axis, limits in zip(AXES, bounds, strict=True) if limits[0] > 0]
+def summarize(config: ForceResidualConfig, results: StudyResults) -> list[str]:
+    """Return sentences on the improvement by regressions for each force."""
+    sentences: list[str] = []
+    for force, rows in _rows_by_force(results).items():
+        if results["intervals"] is None:
             sentences.append(
-                f"{force.capitalize()} force: the believed model is better than no force"
-                f" {_axes_text(is_significantly_better(believed, 'zero'))}"
-                + (f", and worse than no force in {join_list(worse_axes)}." if worse_axes else ".")
+                f"{force.capitalize()} force: there are too few segments to compare models."
             )
-            sentences += _gain_sentences(
-                [row for name, row in rows.items() if name not in _REFERENCE_MODELS]
-            )
-        thrusters = results["forces"]["lag"]
-        lags = {name: model["all"].get("lag") for name, model in results["models"].items()}
-        lag_texts = [
-            f"{format_number(lag['frequency'])} rad/s and {format_number(lag['delay'], 2)} s for"
-            f" {name}"
-            for name, lag in lags.items()
-            if lag
-        ]
-        if lag_texts and not isinstance(thrusters, str):
-            sentences.append(
-                f"The lag fitted together with the residual is {join_list(lag_texts)}; the actual"
-                f" forces"
-                f" follow the commands with {format_number(thrusters['frequency'])} rad/s and"
-                f" {format_number(thrusters['delay'], 2)} s."
-            )
-        return sentences
-
-    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
-        previews = [picture.preview() for picture in find_figures(run, "scores")]
-        first_group = next(iter(_rows_by_force(results).values()))
-        sections_written = [
-            Section("", [*previews, _model_table(self, results, first_group).select_columns(3, 6)]),
-            _data_section(self, results),
-            _force_section(results, run),
-        ]
-        if results["acceleration"]:
-            sections_written.append(_acceleration_section(results, run))
-        for force, rows in _rows_by_force(results).items():
-            sections_written.append(
-                Section(f"Residual of the {force} force", [_model_table(self, results, rows)])
-            )
-        sections_written.append(
-            Section("Errors and residuals", find_figures(run, "scores", "residual_"))
+            continue
+        believed = rows["believed"]
+        bounds = believed["minus_zero"]["ci95"][:3]
+        worse_axes = [axis for axis, limits in zip(AXES, bounds, strict=True) if limits[0] > 0]
+        sentences.append(
+            f"{force.capitalize()} force: the believed model is better than no force"
+            f" {_axes_text(is_significantly_better(believed, 'zero'))}"
+            + (f", and worse than no force in {join_list(worse_axes)}." if worse_axes else ".")
         )
-        if results["failed"]:
-            failure_reasons = list(results["failed"].values())
-            sections_written.append(
-                Section("Not determined by these logs", [Bullets(failure_reasons)])
-            )
-        title = "Coefficients of models fitted to all samples"
-        return sections_written + model_sections(title, results["models"], run, "all", {})
+        sentences += _gain_sentences(
+            [row for name, row in rows.items() if name not in REFERENCE_MODELS]
+        )
+    thrusters = results["forces"]["lag"]
+    lags = {name: model["all"].get("lag") for name, model in results["models"].items()}
+    lag_texts = [
+        f"{format_number(lag['frequency'])} rad/s and {format_number(lag['delay'], 2)} s for {name}"
+        for name, lag in lags.items()
+        if lag
+    ]
+    if lag_texts and not isinstance(thrusters, str):
+        sentences.append(
+            f"The lag fitted together with the residual is {join_list(lag_texts)}; the actual"
+            f" forces"
+            f" follow the commands with {format_number(thrusters['frequency'])} rad/s and"
+            f" {format_number(thrusters['delay'], 2)} s."
+        )
+    return sentences
+
+
+def main_figures(config: ForceResidualConfig, results: StudyResults) -> dict[str, SummaryMetric]:
+    figures: dict[str, SummaryMetric] = {}
+    for force, rows in _rows_by_force(results).items():
+        best_row = min(rows.values(), key=lambda row: sum(row["of_zero"]))
+        for row in (rows["believed"], best_row):
+            name = f"share of the {force} force left by {row['model']}"
+            figures[name] = SummaryMetric(sum(row["of_zero"]) / 3)
+    return figures
+
+
+def build_sections(config: ForceResidualConfig, results: StudyResults, run: Path) -> list[Section]:
+    previews = [picture.preview() for picture in find_figures(run, "scores")]
+    first_group = next(iter(_rows_by_force(results).values()))
+    sections_written = [
+        Section("", [*previews, _model_table(config, results, first_group).select_columns(3, 6)]),
+        _data_section(config, results),
+        _force_section(results, run),
+    ]
+    if results["acceleration"]:
+        sections_written.append(_acceleration_section(results, run))
+    for force, rows in _rows_by_force(results).items():
+        sections_written.append(
+            Section(f"Residual of the {force} force", [_model_table(config, results, rows)])
+        )
+    sections_written.append(
+        Section("Errors and residuals", find_figures(run, "scores", "residual_"))
+    )
+    if results["failed"]:
+        failure_reasons = list(results["failed"].values())
+        sections_written.append(Section("Not determined by these logs", [Bullets(failure_reasons)]))
+    title = "Coefficients of models fitted to all samples"
+    return sections_written + model_sections(title, results["models"], run, "all", {})
 
 
 class CrossValidatedModel(NamedTuple):
@@ -292,7 +189,7 @@ def run_force_study(config: ForceResidualConfig) -> tuple[dict[str, Any], list[F
     Raises:
         ResidnetError: if a log cannot be used or no model is determined.
     """
-    measured = config.read_logs()
+    measured = read_logs(config)
     believed = ForceModel(config.believed_hull())
     models = dict[str, CrossValidatedModel]()
     failures = dict[str, str]()
@@ -436,10 +333,10 @@ def _evaluation_rows(
             for name, error in residuals.items()
         }
         best_reference = [
-            min(_REFERENCE_MODELS, key=lambda name: float(errors[name][:, a].mean()))
+            min(REFERENCE_MODELS, key=lambda name: float(errors[name][:, a].mean()))
             for a in range(3)
         ]
-        reference_errors = {name: errors[name] for name in _REFERENCE_MODELS}
+        reference_errors = {name: errors[name] for name in REFERENCE_MODELS}
         reference_errors["reference"] = np.stack(
             [errors[name][:, a] for a, name in enumerate(best_reference)], axis=1
         )
@@ -620,7 +517,7 @@ def _gain_sentences(regression_rows: Sequence[StudyResults]) -> list[str]:
     axes_by_model: dict[str, list[str]] = {}
     for axis, name in enumerate(AXES):
         better_rows = [row for row in regression_rows if flags_by_model[row["model"]][axis]]
-        recommended = _REFERENCE_MODELS[regression_rows[0]["reference"][axis]]
+        recommended = REFERENCE_MODELS[regression_rows[0]["reference"][axis]]
         if better_rows:
             recommended = min(better_rows, key=lambda row: float(row["mse"][axis]))["model"]
         axes_by_model.setdefault(recommended, []).append(name)
@@ -808,8 +705,8 @@ def _recommended_model(rows: Sequence[Any]) -> str:
     better_rows = [
         row
         for row in rows
-        if row["model"] not in _REFERENCE_MODELS and is_significantly_better(row, "reference")[3]
+        if row["model"] not in REFERENCE_MODELS and is_significantly_better(row, "reference")[3]
     ]
-    reference_rows = [row for row in rows if row["model"] in _REFERENCE_MODELS]
+    reference_rows = [row for row in rows if row["model"] in REFERENCE_MODELS]
     best_row = min(better_rows or reference_rows or rows, key=lambda row: sum(row["of_zero"]))
     return str(best_row["model"])
