@@ -457,9 +457,9 @@ def learning_figure(run: RunFiles) -> Figure | None:
                 np.zeros(len(stage_starts)),
             )
         training = notes.training or run.fit_settings.training.get(model)
-        stages = () if training is None else training.multi_step
+        horizons = [] if training is None else [stage.horizon for stage in training.multi_step]
         stage_labels = {0: "one-step"} | {
-            k + 1: f"{stage_settings.horizon:g} s" for k, stage_settings in enumerate(stages)
+            k + 1: f"{horizon:g} s" for k, horizon in enumerate(horizons)
         }
         texts = [
             (
