@@ -727,6 +727,8 @@ def _resolve_settings(
         settings.evaluation,
         settings.prepare.grid.step,
     )
+    for pair in summary.asymmetric_pairs:
+        log_message(f"  {pair.description}; training windows are not mirrored")
     if settings.recipe is not None:
         settings = settings.with_parts(summary)
     has_enough_logs = has_enough_logs_for_networks(summary)
