@@ -22,6 +22,7 @@ __all__ = [
     "STATE_NAMES",
     "VELOCITY_NAMES",
     "WIND_INPUTS",
+    "get_pair_parity",
     "get_si_unit",
     "port_starboard_pairs",
     "require_plain_name",
@@ -32,6 +33,7 @@ __all__ = [
     "unit_names",
 ]
 
+_ANGLE_PREFIXES = ("delta", "rudder", "azimuth")
 _BREAKS_A_COMMENT = ("*/", "/*", "//", "\\", '"')
 
 
@@ -135,6 +137,11 @@ def port_starboard_pairs(names: Iterable[str]) -> dict[str, str]:
         name: f"{name[:-4]}stbd" for name in known_names if name[:-5] and name.endswith("_port")
     }
     return {port: stbd for port, stbd in starboard_names.items() if stbd in known_names}
+
+
+def get_pair_parity(name: str) -> int:
+    """Return the sign of a paired channel after the exchange: -1 for angles, otherwise +1."""
+    return -1 if name.removeprefix("cmd_").startswith(_ANGLE_PREFIXES) else 1
 
 
 def truncate(text: object, max_length: int = 60) -> str:

@@ -25,7 +25,7 @@ from torch import Tensor
 from residnet.core.columns import all_but_pose
 from residnet.core.format import display_unit, format_interval, format_number
 from residnet.core.layout import LATERAL, POSE, SURGE, SWAY
-from residnet.core.names import WIND_INPUTS
+from residnet.core.names import WIND_INPUTS, get_pair_parity
 from residnet.core.stretches import find_runs
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
@@ -37,7 +37,6 @@ from residnet.physics.symmetry import (
     find_heeling_propellers,
     get_axis_parities,
     get_channel_parity,
-    get_pair_parity,
     get_partners,
 )
 from residnet.preprocessing.prepare import PreparedLog

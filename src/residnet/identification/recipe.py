@@ -38,6 +38,7 @@ from residnet.preprocessing.prepare import TAIL_SHARE, PrepareConfig, PreparedLo
 
 if TYPE_CHECKING:
     from residnet.core.samples import Samples
+    from residnet.regression.pair_symmetry import PairSymmetry
 
 _MIN_RELATIVE_SPREAD = 1e-3
 """Smallest spread of a varying channel, as a share of its magnitude."""
@@ -64,6 +65,8 @@ class TrainingDataSummary:
             this duration, s.
         n_samples: number of training samples.
         roll_time_per_radian: natural period of roll over 2 pi, s; infinite without roll.
+        asymmetric_pairs: pairs of inputs whose effects are not mirror images of each other; with
+            any of them, models and training windows are not mirrored.
     """
 
     channel_names: tuple[str, ...]
@@ -75,6 +78,7 @@ class TrainingDataSummary:
     median_segment_duration: float
     n_samples: int
     roll_time_per_radian: float = math.inf
+    asymmetric_pairs: tuple[PairSymmetry, ...] = ()
 
     @classmethod
     def from_channel_names(cls, channel_names: tuple[str, ...]) -> TrainingDataSummary:
@@ -102,6 +106,9 @@ class TrainingDataSummary:
             evaluation: protocols.
             dt: time step of the grid, s.
         """
+        # the import of the test takes longer than the rest of a config
+        from residnet.identification.symmetry import find_asymmetric_pairs
+
         channel_values = samples.z
         channel_names = samples.names
         std = channel_values.std(0, correction=0)
@@ -142,6 +149,7 @@ class TrainingDataSummary:
             median_segment_duration,
             len(samples),
             roll_time_per_radian,
+            tuple(find_asymmetric_pairs(samples)),
         )
 
     @property
@@ -353,7 +361,7 @@ def make_refit_settings(data_summary: TrainingDataSummary) -> dict[str, Any]:
         "prior": 1e-2
         if has_long_logs(data_summary) or get_dof(data_summary.channel_names).is_six_dof
         else 1.0,
-        "asymmetric": 0.05,
+        "asymmetric": 0.0 if data_summary.asymmetric_pairs else 0.05,
     }
 
 

@@ -31,21 +31,23 @@ def resolve_training(
     """Return the settings of a training with the stages and keys that follow from the logs.
 
     Args:
-        config: settings as set by the user; its keys take precedence. A config with a stage is
-            returned as it is.
+        config: settings as set by the user; its keys take precedence, except that an asymmetric
+            pair of inputs prevents mirrored windows. A config with a stage is otherwise returned
+            as it is.
         head: the network.
         summary: properties of the training logs and of the selection protocol.
         effort: factor of the number of batches.
     """
-    if not config.is_derived:
-        return config
-    if isinstance(head, GRUEnsembleHead):
-        derived_settings = _schedule_coarse_ensemble(head, summary, effort)
-    else:
-        derived_settings = _schedule_network(head, summary, effort)
-    return validate_config(
-        derived_settings | config.model_dump(mode="json"), TrainingConfig, "training"
-    )
+    if config.is_derived:
+        if isinstance(head, GRUEnsembleHead):
+            derived_settings = _schedule_coarse_ensemble(head, summary, effort)
+        else:
+            derived_settings = _schedule_network(head, summary, effort)
+        config = validate_config(
+            derived_settings | config.model_dump(mode="json"), TrainingConfig, "training"
+        )
+    # mirrored windows of an asymmetric vessel are wrong, whoever asked for them
+    return config.model_copy(update={"mirror": False}) if summary.asymmetric_pairs else config
 
 
 def _schedule_coarse_ensemble(

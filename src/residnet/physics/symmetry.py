@@ -7,7 +7,7 @@ from typing import final
 
 from residnet.core.errors import ConfigError
 from residnet.core.layout import SURGE_SWAY_YAW, DegreesOfFreedom
-from residnet.core.names import port_starboard_pairs
+from residnet.core.names import get_pair_parity, port_starboard_pairs
 from residnet.physics.terms import EVEN_FUNCTIONS, Factor, parse_term
 
 # mirroring at the centre plane changes the sign of motions and forces to the side, and of roll and
@@ -16,7 +16,6 @@ _CHANNEL_PARITY = dict.fromkeys(
     ("v", "r", "p", "phi", "delta", "tau_y", "tau_n", "wind_v"), -1
 ) | dict.fromkeys(("u", "w", "q", "z", "theta", "n", "delta_s", "tau_x", "wind_u", "wind_mag"), 1)
 _CHANNEL_PARITY |= {f"{name}_dot": _CHANNEL_PARITY[name] for name in ("u", "v", "w", "p", "q", "r")}
-_ANGLE_PREFIXES = ("delta", "rudder", "azimuth")
 
 
 @final
@@ -76,11 +75,6 @@ def get_channel_parity(name: str) -> int | None:
     The result is None if the parity is unknown, for example of a user-defined channel.
     """
     return _CHANNEL_PARITY.get(name)
-
-
-def get_pair_parity(name: str) -> int:
-    """Return the sign of a paired channel after the exchange: -1 for angles, otherwise +1."""
-    return -1 if name.removeprefix("cmd_").startswith(_ANGLE_PREFIXES) else 1
 
 
 def find_heeling_propellers(names: Sequence[str]) -> tuple[str, ...]:
