@@ -602,23 +602,23 @@ class Fitter:
         if not self.validation_in_training:
             retained_members = self._add_candidates(name, retained_members, candidates)
         selection = self._select_by_evidence(name, retained_members)
-        is_member = selection.is_used.any(axis=1)
+        has_any_weight: list[bool] = np.any(selection.is_used, axis=1).tolist()
         excluded_names += [
             member.name
-            for member, is_retained in zip(retained_members, is_member, strict=True)
+            for member, is_retained in zip(retained_members, has_any_weight, strict=True)
             if not is_retained
         ]
         retained_members = [
             member
-            for member, is_retained in zip(retained_members, is_member, strict=True)
+            for member, is_retained in zip(retained_members, has_any_weight, strict=True)
             if is_retained
         ]
         if len(retained_members) < 2:
             raise FitError(
                 f"on validation logs no mean has a smaller error than {retained_members[0].name}"
             )
-        is_used = selection.is_used[is_member]
-        weights = () if is_used.all() else tuple(map(tuple, selection.weights[is_member].tolist()))
+        is_used = selection.is_used[has_any_weight]
+        weights = () if is_used.all() else tuple(map(tuple, selection.weights[has_any_weight].tolist()))
         ensemble = self._build_ensemble(name, retained_members, weights=weights)
         ensemble.notes["left_out"] = excluded_names
         return self._save_and_reload(ensemble)
