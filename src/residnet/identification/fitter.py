@@ -618,7 +618,9 @@ class Fitter:
                 f"on validation logs no mean has a smaller error than {retained_members[0].name}"
             )
         is_used = selection.is_used[has_any_weight]
-        weights = () if is_used.all() else tuple(map(tuple, selection.weights[has_any_weight].tolist()))
+        weights = (
+            () if is_used.all() else tuple(map(tuple, selection.weights[has_any_weight].tolist()))
+        )
         ensemble = self._build_ensemble(name, retained_members, weights=weights)
         ensemble.notes["left_out"] = excluded_names
         return self._save_and_reload(ensemble)

@@ -96,7 +96,7 @@ def _build_canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataS
         sizing_mode="stretch_width",
         toolbar_location=None,
         tools=[],
-        # so that time axes stand under each other
+        # so that time axes are aligned
         min_border_left=68,
         min_border_right=12,
         output_backend="canvas",
@@ -153,7 +153,7 @@ def _build_canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataS
             axis.ticker = models.BasicTicker(desired_num_ticks=count, min_interval=step)
     lines = [line for name in panel.x_names.values() for line in name.splitlines() or [""]]
     if _LETTER_WIDTH * max(map(len, lines), default=0) * len(panel.x_names) > _MIN_PANEL_WIDTH:
-        # long names stand upright, and on a phone those that have room
+        # long names are vertical, on a phone only those with enough room
         policy = models.NoOverlap(min_distance=2)
         canvas.xaxis[0].update(major_label_orientation="vertical", major_label_policy=policy)
     return canvas

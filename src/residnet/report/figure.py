@@ -163,7 +163,7 @@ class Figure:
     Attributes:
         name: stem of its files and of its HTML identifiers.
         title: a few words.
-        caption: sentences that explain what the figure shows.
+        caption: sentences that explain the figure.
         styles: by name, in the order of the legend.
         panels: from top to bottom; row by row if there are several columns.
         cases: at least one.

@@ -183,5 +183,5 @@ def _still_path(figure: Path, name: object) -> Path:
     """
     still = resolve_name(figure.parent, name, figure)
     if still.parent != figure.parent or still.suffix != ".png":
-        raise UsageError(f"{figure}: {name!r} is not the name of a picture beside it")
+        raise UsageError(f"{figure}: {name!r} is not the name of a picture in the same folder")
     return still

@@ -39,7 +39,7 @@ _MIN_BREAKABLE_LENGTH = 20
 
 
 def render_figures(sections: Sequence[Section]) -> InteractiveFigures | None:
-    """Render the interactive figures of the sections; None if there are none.
+    """Render the interactive figures of the sections; None without figures.
 
     Rendering takes most of the time of a page. A page that is written twice renders once.
     """
@@ -129,7 +129,7 @@ def _collect_figures(blocks: Sequence[Block]) -> list[Figure]:
 
 
 def exports_section(run: Path) -> Section | None:
-    """Return the section on exported models and failed exports; None if there are none.
+    """Return the section on exported models and failed exports; None without exports.
 
     Raises:
         DataError: if exports.json is not readable.

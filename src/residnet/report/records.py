@@ -169,7 +169,7 @@ class RunRow(Record):
 
     Attributes:
         run: the run folder.
-        task: name of the task; `unknown` if the config does not tell.
+        task: name of the task; `unknown` if the config has none.
         state: whether the run is complete and readable.
         best: first main figure; None without one.
         age: time since the start of the run in s.

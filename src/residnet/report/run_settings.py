@@ -180,7 +180,7 @@ class ModelSettings(ShownSettings):
     """The description of a model in its model.json.
 
     Attributes:
-        role: what the model is.
+        role: kind of the model.
         signals: inputs of the model.
         head: residual head; None without one.
         dt: step in s; None if it is not recorded.

@@ -142,7 +142,7 @@ def errors_table(run: RunFiles, split: str) -> Table:
 
     def cell(row: MetricsRow, key: str) -> Cell:
         quantity_cell = _quantity_cell(run, key, row)
-        # a terminal has no room for what stands in small print, but for what diverged
+        # a terminal has no room for notes, except for the number of divergences
         note = describe_divergence(row) if key == "nrmse" else ""
         return Cell(quantity_cell.text, note, "" if key in run.channels else quantity_cell.mark)
 
@@ -176,7 +176,7 @@ def errors_by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | Non
     ]
 
     def label(row: MetricsRow) -> str:
-        # the kind stands once, before its first model
+        # the kind is printed once, before its first model
         prefix = f"{row.manoeuvre.replace('_', ' ')}: " if row.model == models[0] else ""
         return prefix + run.model_label(row.model)
 
@@ -274,7 +274,7 @@ class _BreakdownRow(NamedTuple):
     """The error of a model over the windows of one kind of manoeuvre, speed or wind speed.
 
     Attributes:
-        group: what the windows have in common: `kind`, `speed` or `wind`.
+        group: common property of the windows: `kind`, `speed` or `wind`.
         label: the kind, or the range of speeds.
         windows: number of windows.
         nrmse: mean error.

@@ -57,7 +57,7 @@ def _baseline_section(run: RunFiles) -> Section | None:
     blocks: list[Block] = [
         Text(
             "u′, v′, r′ are the accelerations du/dt, dv/dt, dr/dt. Each is the sum of its terms. A"
-            " value below twice its standard error (grey) cannot be told from 0.",
+            " value below twice its standard error (grey) is not significantly different from 0.",
             is_secondary=True,
         )
     ]
@@ -101,7 +101,7 @@ def _coefficient_table(notes: FitNotes) -> Table:
     def value(row: CoefficientRow) -> str:
         error = row.standard_error
         decimals = max(1 - math.floor(math.log10(error)), 0) if error > 0 else 7
-        # an exact one has no error to tell its digits by
+        # an exact coefficient has no standard error that determines its digits
         return format_fixed(row.value, decimals) if decimals <= 6 else format_number(row.value, 4)
 
     def ratio(row: CoefficientRow) -> Cell:

@@ -183,7 +183,7 @@ def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | 
         + " the reversals, and for levels that stay apart once the motion has settled. Where the"
         " ground is grey, samples are masked and u and v are not scored. Of every kind of"
         " manoeuvre and protocol, the runs with the least, the median and the largest error of"
-        f" {run.main_model} are here, in print those of the median.",
+        f" {run.main_model} are here; in print only the median.",
         styles,
         panels,
         cases,
@@ -292,7 +292,7 @@ def _select_windows(
         for rank, index in enumerate(((len(members) - 1) // 2, len(members) - 1, 0)):
             if all(members[index] is not entry[2] for entry in ranked_windows):
                 ranked_windows.append((rank, group_index, members[index]))
-    # where there is not room for all, medians come before worst and best runs
+    # if there is not room for all, medians come before worst and best runs
     selected = sorted(ranked_windows, key=lambda entry: entry[:2])[:_MAX_CASES]
     selected.sort(key=lambda entry: (entry[1], entry[0]))
     return [(window, _RANK_NAMES[rank]) for rank, _, window in selected]

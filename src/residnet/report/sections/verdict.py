@@ -107,7 +107,7 @@ class _OpeningRow(NamedTuple):
         model: name of the model; None for the integrated measured velocities.
         errors: pose errors at the end of the free runs by name.
         intervals: their confidence intervals by name.
-        divergence: number of diverged windows in words; empty if there are none.
+        divergence: number of diverged windows in words; empty without divergence.
     """
 
     model: str | None
@@ -186,7 +186,8 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         f"Mean of {format_count(rows[run.main_model].windows, 'free run')} on"
         f" {run.report_split} data"
         f" ({run.main_protocol}"
-        + f", which start elsewhere than those of {run.protocols[0]} above" * is_other_protocol
+        + f", which have other starts than the windows of {run.protocols[0]} above"
+        * is_other_protocol
         + ")"
         + (
             "; small: 95 % interval of this mean (above: of as many new runs)."
@@ -259,7 +260,7 @@ def cautions_section(run: RunFiles) -> Section | None:
         for text in (worse_than_reference_sentence(run, protocol) for protocol in run.protocols)
         if text
     ]
-    # the first sentence; the figures stand in the section on sanity
+    # only the first sentence; the section on sanity has the figures
     failed_findings = [
         finding
         for finding in run.sanity_findings
