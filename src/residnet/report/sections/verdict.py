@@ -186,8 +186,7 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         f"Mean of {format_count(rows[run.main_model].windows, 'free run')} on"
         f" {run.report_split} data"
         f" ({run.main_protocol}"
-        + f", which have other starts than the windows of {run.protocols[0]} above"
-        * is_other_protocol
+        + f", whose starts differ from those of {run.protocols[0]} above" * is_other_protocol
         + ")"
         + (
             "; small: 95 % interval of this mean (above: of as many new runs)."
