@@ -456,10 +456,15 @@ def learning_figure(run: RunFiles) -> Figure | None:
                 epoch[stage_starts] - 0.5,
                 np.zeros(len(stage_starts)),
             )
-        training = notes.training or run.fit_settings.training.get(model)
-        stages = () if training is None else training.multi_step
+        # runs of earlier versions have the settings in their config only
+        settings = run.fit_settings.training.get(model)
+        horizons: list[float] = []
+        if notes.training is not None:
+            horizons = [stage.horizon for stage in notes.training.multi_step]
+        elif settings is not None:
+            horizons = [stage.horizon for stage in settings.multi_step]
         stage_labels = {0: "one-step"} | {
-            k + 1: f"{stage_settings.horizon:g} s" for k, stage_settings in enumerate(stages)
+            k + 1: f"{horizon:g} s" for k, horizon in enumerate(horizons)
         }
         texts = [
             (
