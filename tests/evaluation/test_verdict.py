@@ -386,9 +386,9 @@ def test_the_verdict_names_unexcited_directions_and_controlled_test_logs() -> No
 
 def test_velocities_that_leave_the_positions_make_no_model_good() -> None:
     good = horizon(30.0, errors(1.0, 1.0))
-    assert rate_model(evidence(limits_by_protocol=under({"horizons": [good]}))) == "good"
-    contradicting = {**good, "floor": errors(12.6, 1.0)}
-    limits = under({"horizons": [contradicting]})
+    assert rate_model(evidence(limits_by_protocol=under(horizons=[good]))) == "good"
+    contradicting = good.model_copy(update={"floor": errors(12.6, 1.0)})
+    limits = under(horizons=[contradicting])
     assert rate_model(evidence(limits_by_protocol=limits)) == "limited"
     sentences = " ".join(write_verdict(evidence(limits_by_protocol=limits)))
     assert "integrated, leave the measured positions by 21 % of the way" in sentences

@@ -57,7 +57,7 @@ def _baseline_section(run: RunFiles) -> Section | None:
     blocks: list[Block] = [
         Text(
             "u′, v′, r′ are the accelerations du/dt, dv/dt, dr/dt. Each is the sum of its terms. A"
-            " value below twice its standard error (grey) is not significantly different from 0.",
+            " value below twice its standard error (grey) cannot be told from 0.",
             is_secondary=True,
         )
     ]
@@ -101,7 +101,7 @@ def _coefficient_table(notes: FitNotes) -> Table:
     def value(row: CoefficientRow) -> str:
         error = row.standard_error
         decimals = max(1 - math.floor(math.log10(error)), 0) if error > 0 else 7
-        # an exact coefficient has no standard error that determines its digits
+        # an exact one has no error to tell its digits by
         return format_fixed(row.value, decimals) if decimals <= 6 else format_number(row.value, 4)
 
     def ratio(row: CoefficientRow) -> Cell:
@@ -456,8 +456,13 @@ def learning_figure(run: RunFiles) -> Figure | None:
                 epoch[stage_starts] - 0.5,
                 np.zeros(len(stage_starts)),
             )
-        training = notes.training or run.fit_settings.training.get(model)
-        horizons = [] if training is None else [stage.horizon for stage in training.multi_step]
+        # runs of earlier versions have the settings in their config only
+        settings = run.fit_settings.training.get(model)
+        horizons: list[float] = []
+        if notes.training is not None:
+            horizons = [stage.horizon for stage in notes.training.multi_step]
+        elif settings is not None:
+            horizons = [stage.horizon for stage in settings.multi_step]
         stage_labels = {0: "one-step"} | {
             k + 1: f"{horizon:g} s" for k, horizon in enumerate(horizons)
         }
