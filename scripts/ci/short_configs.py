@@ -175,10 +175,10 @@ OWN: dict[str, tuple[str, ...]] = {
         "policies.on_model.learned.run={runs}/patrol_identified",
     ),
     "studies/esso_osaka/ablation": (
-        "variants={recipe: [], no_mirror: ['heads.mlp.mirror=false']}",
+        "search.variants={recipe: [], no_mirror: ['heads.mlp.mirror=false']}",
         f"common={[PHYSICS, 'refit={}', HEAD, 'base_of={mlp: hull}', 'ensembles={}', *STEPS]}",
-        "seeds=[0]",
-        "workers=1",
+        "search.seeds=[0]",
+        "runner.workers=1",
     ),
     "studies/gouletas2020/heading_nomoto": (
         f"predictive={{mlp_printed: {{horizon: 0.01 s, {HORIZON}}},"

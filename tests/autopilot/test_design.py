@@ -142,5 +142,5 @@ def test_the_pace_of_a_vessel_is_measured_and_belongs_to_conditions() -> None:
     assert slow.test.duration == pytest.approx(14.0 * 8.7, rel=0.05)
     without = CONFIG | {"pace": 2.0, "conditions": None, "policies": {}, "peers": {}}
     without |= {"predictive": {"document": {"horizon": 2.0}}}
-    with pytest.raises(ValidationError, match="pace: give 'conditions'"):
+    with pytest.raises(ValidationError, match="pace: it scales the times of 'conditions'"):
         AutopilotConfig.model_validate(without)

@@ -74,7 +74,7 @@ def test_broken_part_raises_only_where_it_is_used() -> None:
     ("target", "fault"),
     [
         (
-            "residnet.heads.linear:PlsrConfig",
+            "residnet.baselines.regressors_config:RegressorsConfig",
             "not a subclass of residnet.heads.config.BaseHeadConfig",
         ),
         ("residnet.heads.config:BaseHeadConfig", "BaseHeadConfig lacks build"),

@@ -29,6 +29,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import BandTable, ModelSpec
 from residnet.engine.c_code import find_compiler
 from residnet.engine.trace import lower
+from residnet.evaluation.records import MetricsRow
 from residnet.export import EXPORT_FORMATS as REGISTERED
 from residnet.export import base, get_exporter, torchscript, vessel
 from residnet.export.base import LoadedExport, RoundingError, require_releasable
@@ -58,7 +59,10 @@ from residnet.testing.checks import (
 )
 
 pytestmark = pytest.mark.usefixtures("short_parity")
-ROW = {"model": "mine", "split": "test", "protocol": "T30", "nrmse": {"mean": 0.1}}
+# the figures that the guard and the card read
+ROW = MetricsRow.model_construct(
+    model="mine", split="test", protocol="T30", manoeuvre="all", nrmse={"mean": 0.1}
+)
 
 
 def exported(variant: str) -> ExportedVessel:
@@ -169,7 +173,7 @@ def test_the_card_says_what_a_controller_needs() -> None:
     assert (card["dt"], card["integrator"], card["model"]) == (0.1, "rk4", "mine")
     ranges = zip(names, zip(LOW, HIGH, strict=True), strict=True)
     assert card["training_range"] == {name: list(limits) for name, limits in ranges}
-    assert card["metrics"] == [ROW]
+    assert card["metrics"] == [ROW.model_dump(exclude_unset=True)]
     assert (card["memory"], card["members"], card["band"]) == (made.model.n_state, [], None)
     assert (card["head"]["kind"], card["baseline"]["kind"]) == ("lstm", "regressors")
     mean = ExportedVessel(*built("mean")).build_card()

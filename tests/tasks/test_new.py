@@ -14,6 +14,7 @@ import written_recorders
 import yaml
 from foreign_tables import Style
 from kinds import of_kind
+from scipy.integrate import cumulative_trapezoid
 
 import residnet
 from residnet.core.config import validate_config
@@ -162,12 +163,20 @@ WRITERS: dict[str, Callable[[Log, Path], Path]] = {
 }
 
 
+def along_its_velocities(log: Log) -> Log:
+    """Return the log with positions that are the integral of its velocities."""
+    way = cumulative_trapezoid(
+        (log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"]), log.t, initial=0.0
+    )
+    return log.replace(channels={**log.channels, "x": way.real, "y": way.imag})
+
+
 @pytest.mark.parametrize("write", WRITERS)
 def test_logs_of_a_simulated_boat_as_recorders_write_them(write: str, tmp_path: Path) -> None:
     needs = {"mcap": "rosbags", "bag2": "rosbags", "nmea": "pynmea2", "ulog": "pyulog"}
     if write in needs:
         pytest.importorskip(needs[write])
-    log = written_logs.trial(60.0)
+    log = along_its_velocities(written_logs.trial(60.0))
     path = WRITERS[write](log, tmp_path)
     draft = residnet.draft_config(path, folder=tmp_path)
     told = {"csv", "mat5", "mcap", "bag2"}

@@ -215,7 +215,9 @@ def detect_feedback(
                 for effect, table in zip(effects, tables, strict=True)
             ]
             unexplained = 1.0 - cross_validated_r2(both, responses)
-            share = 1.0 - unexplained / max(1.0 - effect_share, 1e-12)
+            # effects that predict worse than the mean of the other logs are no reference: feedback
+            # must then explain a share of the variance itself
+            share = 1.0 - unexplained / max(1.0 - max(effect_share, 0.0), 1e-12)
             candidates.append(InputFeedback(name, source, share, effect_share, relay_share))
         if candidates:
             results.append(max(candidates, key=lambda candidate: candidate.share))
