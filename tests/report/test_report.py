@@ -95,7 +95,7 @@ def test_the_first_screen_answers_how_far_off_and_which_model(page: str) -> None
     labels = [line[0] for line in table[2:]]
     assert labels == ["plsr (selected)", "baseline", "constant_velocity", "plant", "mlp"]
     assert table[2][1:3] == ["0.40", format_number(DEG * LEVEL["plsr"][2], 2)]
-    assert "Mean of 6 free runs on test data (T30, which start elsewhere than those of" in first
+    assert "Mean of 6 free runs on test data (T30, whose starts differ from those of" in first
     # the run holds no errors after single times, so that nothing is known to be good
     text = html.unescape(page)
     verdict = re.search(r'<section class="verdict limited".*?</section>', text, re.DOTALL)
