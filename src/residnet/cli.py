@@ -781,10 +781,10 @@ def derivatives(
     ] = 0.25,
     density: Annotated[str, typer.Option(help="Density of the water.")] = "1000 kg/m^3",
     scale: Annotated[
-        float, typer.Option(help="Length of the full-scale vessel in units of that of the logs.")
+        float, typer.Option(help="Length at full scale divided by that in the logs.")
     ] = 1.0,
     density_ratio: Annotated[
-        float, typer.Option(help="Density at full scale in units of that of the logs.")
+        float, typer.Option(help="Density of the water at full scale divided by that in the logs.")
     ] = 1.0,
     order: Annotated[int, typer.Option(help="Highest order of the Taylor series, 1 to 3.")] = 1,
     output_file: Annotated[

@@ -204,7 +204,9 @@ def test_speed_outside_training_range_is_remarked() -> None:
     assert "outside the training range" in table.remarks[0]
 
 
-@pytest.mark.parametrize(("key", "value"), [("order", 4), ("scale", 0.0)])
+@pytest.mark.parametrize(
+    ("key", "value"), [("order", 4), ("scale", 0.0), ("density_ratio", float("nan"))]
+)
 def test_invalid_setting_is_refused_by_name(key: str, value: float) -> None:
     with pytest.raises(UsageError, match=key):
         derive(**{key: value})

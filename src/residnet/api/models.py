@@ -119,7 +119,7 @@ class Model:
 
         Args:
             order: highest order of the Taylor series about straight-ahead motion, 1 to 3.
-            scale: length of the vessel that the figures are for, in units of that of the logs
+            scale: length of the target vessel divided by that of the vessel in the logs
                 (Froude's law of similarity).
             density_ratio: ratio of the densities of the water.
             **particulars: `length` and `speed`, and as known `draught`, `beam`, `mass`,

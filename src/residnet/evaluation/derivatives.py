@@ -101,7 +101,7 @@ class DerivativesFile(FileRecord):
         mass_matrix: M [3][3] in SI; None if unknown.
         particulars: main particulars in SI.
         froude_number: U / sqrt(g L).
-        scale: length in units of that of the vessel in the logs.
+        scale: length of the target vessel divided by that of the vessel in the logs.
         operating_point: values of the inputs at the expansion point.
         surge_imbalance: surge acceleration there in m/s^2; zero at an equilibrium.
         rows: derivatives by order, axis and variables.
@@ -240,17 +240,14 @@ def compute_derivatives(
         covariance: covariance of the baseline's free parameters [P][P]; None if unknown.
         has_correlations: whether the covariance has the correlations of the parameters.
         order: highest order of the expansion, 1 to 3.
-        scale: length of the vessel that the figures are for, in units of the vessel in the logs, by
-            Froude's law of similarity.
-        density_ratio: density of that vessel's water in units of that of the logs.
+        scale: length of the target vessel divided by that of the vessel in the logs (Froude's law
+            of similarity).
+        density_ratio: density of the water at the target scale divided by that of the logs.
 
     Raises:
         UsageError: if the model has no baseline with free parameters in u, v and r.
     """
-    if not 1 <= order <= 3:
-        raise UsageError(f"order: expected 1, 2 or 3, got {order}")
-    if not 0.0 < scale < math.inf:
-        raise UsageError(f"scale: expected a positive number such as 50, got {scale:g}")
+    _validate_settings(order, scale, density_ratio)
     baseline = _require_planar_baseline(spec, model)
     input_names = list(spec.signals.input_columns)
     particulars = _complete_particulars(baseline, particulars)
@@ -274,12 +271,9 @@ def compute_derivatives(
     errors = None
     first_order_covariance = None
     if parameter_covariance is not None:
-        free_indices = baseline.free_indices()
-        jacobian = torch.func.jacfwd(coefficients)(theta).flatten(2)[..., free_indices]
-        variance = torch.einsum("kap,pq,kaq->ka", jacobian, parameter_covariance, jacobian)
-        errors = variance.clamp(min=0.0).sqrt()
-        first = jacobian[: len(variables)].reshape(-1, jacobian.shape[-1])
-        first_order_covariance = (first @ parameter_covariance @ first.T).numpy()
+        errors, first_order_covariance = _propagate_covariance(
+            coefficients, theta, baseline.free_indices(), parameter_covariance, len(variables)
+        )
     full_scale = particulars.scaled(scale, density_ratio)
     is_force = source != "unknown"
     rows: list[DerivativeRow] = []
@@ -329,6 +323,17 @@ def compute_derivatives(
             *_describe_errors(covariance is not None, has_correlations),
         ],
     )
+
+
+def _validate_settings(order: int, scale: float, density_ratio: float) -> None:
+    if not 1 <= order <= 3:
+        raise UsageError(f"order: expected 1, 2 or 3, got {order}")
+    if not 0.0 < scale < math.inf:
+        raise UsageError(f"scale: expected a positive number such as 50, got {scale:g}")
+    if not 0.0 < density_ratio < math.inf:
+        raise UsageError(
+            f"density_ratio: expected a positive number such as 1.025, got {density_ratio:g}"
+        )
 
 
 def _require_planar_baseline(spec: ModelSpec, model: HybridDynamics) -> ParametricBaseline:
@@ -517,6 +522,33 @@ def _taylor_coefficients(
     return torch.stack(rows)
 
 
+def _propagate_covariance(
+    coefficients: Callable[[Tensor], Tensor],
+    theta: Tensor,
+    free_indices: Tensor,
+    covariance: Tensor,
+    n_first_order: int,
+) -> tuple[Tensor, np.ndarray]:
+    """Carry the covariance of the parameters over to the coefficients (delta method).
+
+    Args:
+        coefficients: coefficients [K, 3] of the monomials as a function of theta.
+        theta: parameters of the baseline.
+        free_indices: indices of the free parameters in the flattened theta [P].
+        covariance: covariance of the free parameters [P, P].
+        n_first_order: number of monomials of first order, which come first.
+
+    Returns:
+        Standard errors [K, 3], and the covariance of the first-order coefficients, monomial by
+        monomial with its three axes.
+    """
+    jacobian = torch.func.jacfwd(coefficients)(theta).flatten(2)[..., free_indices]
+    variance = torch.einsum("kap,pq,kaq->ka", jacobian, covariance, jacobian)
+    first_order = jacobian[:n_first_order].reshape(-1, jacobian.shape[-1])
+    first_order_covariance: np.ndarray = (first_order @ covariance @ first_order.T).numpy()
+    return variance.clamp(min=0.0).sqrt(), first_order_covariance
+
+
 def _to_covariance(
     baseline: ParametricBaseline, covariance: Sequence[Sequence[float]] | None
 ) -> Tensor | None:
@@ -629,6 +661,11 @@ def _build_remarks(
             "The logs determine accelerations only: names with /m are forces divided by the mass"
             " including added mass (Y_v/m is Y_v / (m - Y_vdot) without sway-yaw coupling). Give"
             " mass, beam and draught for derivatives of forces."
+        )
+    elif source == "identified" and particulars.mass is None:
+        remarks.append(
+            "The logs determine the mass matrix but not the rigid body's share of it: coefficients"
+            " of r contain its centripetal terms (Y_r is Y_r - m U). Give mass to separate them."
         )
     elif source == "estimated":
         remarks.append(
