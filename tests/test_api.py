@@ -221,7 +221,7 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> No
         training=config["training"],
     )
     pd.testing.assert_frame_equal(models.metrics, table, rtol=1e-9)
-    assert models.selected_name == metrics["selected"]
+    assert models.selected_name == metrics.selected
     loaded = residnet.load(tiny_run, "ridge")
     assert loaded.coefficients.empty
     assert loaded.notes["validation"] == pytest.approx(models["ridge"].notes["validation"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -139,7 +140,7 @@ def test_scaled_simulation_agrees_with_scaled_derivatives() -> None:
     def force(table: DerivativesFile, by: dict[str, float]) -> np.ndarray:
         total = dict.fromkeys("XYN", 0.0)
         for row in table.rows:
-            total[row.axis] += row.value * np.prod([by[name] for name in row.variables])
+            total[row.axis] += row.value * math.prod(by[name] for name in row.variables)
         return np.array([*total.values()])
 
     scaled_motion = {name: value * factors[name] for name, value in motion.items()}
@@ -208,8 +209,9 @@ def test_speed_outside_training_range_is_remarked() -> None:
     ("key", "value"), [("order", 4), ("scale", 0.0), ("density_ratio", float("nan"))]
 )
 def test_invalid_setting_is_refused_by_name(key: str, value: float) -> None:
+    settings: dict[str, Any] = {key: value}
     with pytest.raises(UsageError, match=key):
-        derive(**{key: value})
+        derive(**settings)
 
 
 def test_covariance_of_another_size_is_refused() -> None:

@@ -74,9 +74,13 @@ def test_pairs_tell_correlated_models_apart_that_their_own_intervals_do_not() ->
         for name, one, size in (("better", better, 0), ("worse", worse, 9))
     ]
     rows = build_goodness_table(models, [shared[:, None].repeat(3, 1)], 0.1)
-    low, high = rows[0].mae_ci95
+    interval = rows[0].mae_ci95
+    independent_interval = rows[0].mae_ci95_independent
+    assert interval is not None
+    assert independent_interval is not None
+    low, high = interval
     assert low < rows[1].mae < high
-    assert low < rows[0].mae_ci95_independent[0]
+    assert low < independent_interval[0]
     assert rows[0].effective < 0.2 * rows[0].samples
     assert rows[0].white_p < 1e-3
     # the noise is that of the model which leaves the least

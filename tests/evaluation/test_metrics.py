@@ -26,7 +26,7 @@ from residnet.evaluation.metrics import (
     prediction_intervals,
 )
 from residnet.evaluation.protocol import Window, WindowProtocol
-from residnet.evaluation.records import BlockCount, OutsideRange, PairedDifference
+from residnet.evaluation.records import BlockCount, ModelKind, OutsideRange, PairedDifference
 from residnet.evaluation.selection import block_error_shares, make_selection_blocks
 from residnet.heads.base import ZeroHead
 from residnet.physics.signals_config import SignalsConfig
@@ -41,7 +41,7 @@ def window(log: int, start: int, stop: int) -> Window:
     return Window(log, start, stop, start, np.zeros(3))
 
 
-def candidate(name: str, reference: str | None = None, kind: str = "head") -> Candidate:
+def candidate(name: str, reference: str | None = None, kind: ModelKind = "head") -> Candidate:
     model = HybridDynamics(SIGNALS, ZeroBaselineConfig().build(()), ZeroHead(), 0.1, "euler")
     return Candidate(name, kind, model, reference=reference, training_ranges=RANGES)
 
@@ -105,9 +105,12 @@ def test_intervals_hold_the_mean_and_say_what_was_drawn() -> None:
     )
     # four logs of three windows: whole logs are too few, runs of two and one make eight
     assert row.ci95_blocks == BlockCount(of="windows", count=8)
+    assert row.rmse_ci95 is not None
+    assert row.nrmse_mean_ci95 is not None
     spans = [(row.rmse_ci95[c], row.rmse[c]) for c in "uvr"]
-    for (low, high), mean in (*spans, (row.nrmse_mean_ci95, row.nrmse["mean"])):
-        assert low < mean < high
+    for interval, mean in (*spans, (row.nrmse_mean_ci95, row.nrmse["mean"])):
+        assert interval is not None
+        assert interval[0] < mean < interval[1]
     alone = FreeRun("T3", "test", run.windows[:1], {"a": run.predictions["a"][:1]})
     single = find_row(
         ProtocolEvaluation(alone, [candidate("a")], logs, SCALES).build_rows({}), model="a"
@@ -316,8 +319,11 @@ def test_errors_of_the_pose_are_told_after_the_times_that_matter(
     own = first.models["mlp"]
     assert own.position == pytest.approx(5.0)
     # a turn too many is no error
+    assert own.heading is not None
     assert np.degrees(own.heading) == pytest.approx(160.0)
-    low, high = own.intervals["position"]
+    interval = own.intervals["position"]
+    assert interval is not None
+    low, high = interval
     assert low <= 5.0 <= high
     # velocities were made from the positions
     assert first.floor.position == pytest.approx(0.0, abs=1e-9)
@@ -328,7 +334,9 @@ def test_no_interval_of_a_heading_passes_half_a_turn(run: FreeRun, logs: list[Pr
     for window, prediction in zip(run.windows, run.predictions["mlp"], strict=True):
         prediction.states[20, 2] += 0.5 * (window.log_index + 1)
     entries = ProtocolEvaluation(run, CANDIDATES, logs, SCALES).evaluate_horizons(STEP)
-    assert entries[0].models["mlp"].intervals["heading"][1] == pytest.approx(np.pi)
+    interval = entries[0].models["mlp"].intervals["heading"]
+    assert interval is not None
+    assert interval[1] == pytest.approx(np.pi)
 
 
 def test_every_model_is_compared_with_zero_and_the_first_baseline(

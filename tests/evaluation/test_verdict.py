@@ -349,7 +349,7 @@ def excitation(state: str, **change: Any) -> ExcitationFile:
     rudder |= {"feedback_share": None, "effect_share": None}
     rudder |= {"state": state, "text": f"delta was {state}"}
     content = {"schema": "residnet.excitation/1", "run": "made", "inputs": [rudder]}
-    empty = {"directions": [], "closed_loop_test_inputs": [], "domain": []}
+    empty: dict[str, list[Any]] = {"directions": [], "closed_loop_test_inputs": [], "domain": []}
     return ExcitationFile.model_validate({**content, **empty, **change})
 
 

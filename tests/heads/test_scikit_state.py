@@ -80,7 +80,8 @@ def test_a_stored_pipeline_predicts_the_same_without_a_fit(
     save_model(tmp_path / "model", spec, model)
     no_fit()
     stored = load_model(tmp_path / "model")[1]
-    x = np.random.default_rng(0).normal(size=(50, model.head.features.n_features))
+    features: Any = model.head.features
+    x = np.random.default_rng(0).normal(size=(50, features.n_features))
     before = model.head.predict(torch.from_numpy(x))
     assert before.std() > 0
     assert torch.equal(stored.head.predict(torch.from_numpy(x)), before)
@@ -179,7 +180,8 @@ def test_other_classes_need_trust_at_the_fit_and_at_the_load(tmp_path: Path) -> 
         model = make_example_model(spec)
         save_model(tmp_path / "model", spec, model)
         stored = load_model(tmp_path / "model")[1]
-    x = torch.randn(9, model.head.features.n_features)
+    features: Any = model.head.features
+    x = torch.randn(9, features.n_features)
     assert torch.equal(stored.head.predict(x), model.head.predict(x))
     with pytest.raises(ConfigError, match=r"BaggingRegressor' is not among.*--trust"):
         load_model(tmp_path / "model")

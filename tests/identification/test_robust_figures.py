@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -37,7 +38,7 @@ def figures_of_clean_logs(splits: Splits) -> pd.DataFrame:
     return report_figures(splits)
 
 
-def report_figures(splits: Splits, **settings: object) -> pd.DataFrame:
+def report_figures(splits: Splits, **settings: Any) -> pd.DataFrame:
     """Return the errors of all models on validation and test logs."""
     data = residnet.prepare(splits, list(INPUTS), **settings)
     models = residnet.fit(data, "regressors")

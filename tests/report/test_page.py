@@ -6,6 +6,7 @@ import html
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,7 +122,7 @@ def test_a_table_for_the_terminal_has_its_columns_below_each_other() -> None:
 
 
 def test_a_table_is_columns_of_what_rows_hold() -> None:
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"model": "net", "time": {"mean": 1.25}, "rms": 0.5, "kind": "policy"},
         {"model": "pd", "time": {}, "rms": None, "kind": "law"},
         {"model": "lqr", "time": {"mean": 2.0}, "rms": 1.0, "kind": "law"},

@@ -42,7 +42,7 @@ SECONDS = 5.0
 """Time after which a folder counts as one that hangs a command."""
 BACKSTOP_SECONDS = 120.0
 """Time after which the process ends because code outside of Python does not return."""
-SKLEARN = {
+SKLEARN: dict[str, Any] = {
     "name": "boosted",
     "heads": {"trees": {"kind": "sklearn", "samples": 100}},
     "bands": None,
@@ -200,6 +200,7 @@ def limited(seconds: float = SECONDS) -> Iterator[None]:
 
     previous_handler = signal.signal(signal.SIGALRM, end_if_too_late)
     # an alarm is handled between two instructions of Python; a thread ends everything else
+    assert sys.__stderr__ is not None
     faulthandler.dump_traceback_later(BACKSTOP_SECONDS, exit=True, file=sys.__stderr__)
     signal.setitimer(signal.ITIMER_REAL, seconds * slowness)
     try:

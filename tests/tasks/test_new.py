@@ -165,10 +165,12 @@ WRITERS: dict[str, Callable[[Log, Path], Path]] = {
 
 def along_its_velocities(log: Log) -> Log:
     """Return the log with positions that are the integral of its velocities."""
-    way = cumulative_trapezoid(
-        (log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"]), log.t, initial=0.0
-    )
-    return log.replace(channels={**log.channels, "x": way.real, "y": way.imag})
+    velocity = (log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"])
+    positions = {
+        "x": cumulative_trapezoid(velocity.real, log.t, initial=0),
+        "y": cumulative_trapezoid(velocity.imag, log.t, initial=0),
+    }
+    return log.replace(channels={**log.channels, **positions})
 
 
 @pytest.mark.parametrize("write", WRITERS)

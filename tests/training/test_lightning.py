@@ -160,10 +160,11 @@ def test_callbacks_and_logger_of_the_user(data: residnet.Dataset, tmp_path: Path
     lines = (tmp_path / "mine" / "metrics.csv").read_text().splitlines()
     assert "validation" in lines[0].split(",")
     assert len(lines) == 8
+    callbacks: list[Any] = [print]
     with pytest.raises(
         UsageError, match=r"expected objects of lightning\.Callback, given a builtin"
     ):
-        residnet.fit(data, "regressors", "mlp", callbacks=[print])
+        residnet.fit(data, "regressors", "mlp", callbacks=callbacks)
 
 
 def test_a_closed_form_head_has_no_training(data: residnet.Dataset) -> None:
