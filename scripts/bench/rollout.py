@@ -111,7 +111,7 @@ def rollouts(repeats: int) -> None:
     """Print the share of the matrix products in a rollout."""
     x0, w = torch.zeros(_BATCH, 6), torch.randn(_BATCH, _STEPS, 2)
     for hidden in (100, 24):
-        model = model_of(LstmConfig(hidden_size=hidden))
+        model = model_of(LstmConfig(hidden_size=hidden, readout=0))
         sizes = ((_BATCH, 5), (_BATCH, hidden), (5, 4 * hidden), (hidden, 4 * hidden), (hidden, 3))
         factors = [torch.randn(size) for size in sizes]
         with torch.no_grad():
@@ -144,7 +144,7 @@ def by_rows(
 ) -> None:
     """Print free runs and gradients in several ways, each on its device."""
     for hidden in (24, 100):
-        model = model_of(LstmConfig(hidden_size=hidden))
+        model = model_of(LstmConfig(hidden_size=hidden, readout=0))
         for count in rows:
             told = []
             for name, device in ways.items():
