@@ -192,14 +192,66 @@ def test_a_step_is_that_of_pytorch_and_no_network_sees_another() -> None:
         torch.testing.assert_close(found[rows], rho)
 
 
-def test_short_steps_keep_what_a_long_one_does() -> None:
+def test_an_lstm_step_is_that_of_pytorch() -> None:
+    head = networks(members=2, cell="lstm", encoder="measurements")
+    z = torch.randn(6, 5, dtype=torch.float64)
+    s = torch.rand(6, 10, dtype=torch.float64)
+    _, next_memory = head(z, s)
+    # torch orders input, forget, candidate, output; ours is forget, input, output, candidate
+    order = torch.cat([torch.arange(5) + 5 * k for k in (1, 0, 3, 2)])
+    for k in range(2):
+        cell = nn.LSTMCell(5, 5, dtype=torch.float64)
+        rows = slice(3 * k, 3 * k + 3)
+        with torch.no_grad():
+            cell.weight_ih.copy_(head.input_weight[k].T[order])
+            cell.weight_hh.copy_(head.hidden_weight[k].T[order])
+            cell.bias_ih.copy_(head.bias[k, 0][order])
+            cell.bias_hh.zero_()
+            cell.bias_hh[10:15] = head.bias_hidden[k, 0]
+            expected = torch.cat(cell(z[rows], tuple(s[rows].split(5, dim=1))), dim=1)
+        torch.testing.assert_close(next_memory[rows], expected)
+
+
+@pytest.mark.parametrize("cell", ["gru", "lstm"])
+def test_the_encoder_reads_measured_states_and_the_decoder_predicted_ones(cell: str) -> None:
+    signals = SignalsConfig(inputs=("n", "delta")).build()
+    baseline = ZeroBaselineConfig().build(signals.names)
+    head = networks(cell=cell, encoder="measurements")
+    model = HybridDynamics(signals, baseline, head, 0.1, "semi_implicit_euler").double()
+    y = torch.randn(2, 8, 6, dtype=torch.float64)
+    w = torch.randn(2, 30, 2, dtype=torch.float64)
+    encoder = [parameter for name, parameter in head.named_parameters() if "encoder" in name]
+    decoder = [head.input_weight, head.hidden_weight, head.bias]
+
+    # the memory after measured states depends on the encoder only
+    memory = model.warmup(y, w[:, :8])
+    gradients = torch.autograd.grad(memory[:, : head.n_state].sum(), encoder, retain_graph=True)
+    assert all(gradient.abs().max() > 0.0 for gradient in gradients)
+    for gradient in torch.autograd.grad(memory[:, : head.n_state].sum(), decoder):
+        assert float(gradient.abs().max()) < 1e-4 * float(gradients[0].abs().max())
+
+    # from the second step of a free run on, the encoder has no influence
+    with torch.no_grad():
+        memory = model.warmup(y, w[:, :8])
+        x, s = model.step(y[:, -1] + 0.1, w[:, 8], memory)
+        states = Rollout(model)(x, w[:, 9:], s)[0]
+        for parameter in encoder:
+            parameter.add_(1.0)
+        torch.testing.assert_close(Rollout(model)(x, w[:, 9:], s)[0], states, rtol=0, atol=1e-12)
+        head.is_decoding_only = True
+        torch.testing.assert_close(Rollout(model)(x, w[:, 9:], s)[0], states, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("cell", ["gru", "lstm"])
+def test_short_steps_keep_what_a_long_one_does(cell: str) -> None:
     """The share of the memory that is kept over five short steps is that of a long one."""
-    head = networks()
+    head = networks(cell=cell)
     with torch.no_grad():
         # gates and new memory that depend on nothing but the biases
         for weight in (head.input_weight, head.hidden_weight):
             weight.zero_()
-    z, s = torch.randn(1, 5, dtype=torch.float64), torch.rand(1, 5, dtype=torch.float64)
+    z = torch.randn(1, 5, dtype=torch.float64)
+    s = torch.rand(1, head.n_state, dtype=torch.float64)
     long = head(z, s)[1]
     head.set_step(0.1)
     for _ in range(5):
@@ -207,8 +259,9 @@ def test_short_steps_keep_what_a_long_one_does() -> None:
     torch.testing.assert_close(s, long)
 
 
-def test_the_mean_is_that_of_networks_that_run_by_themselves() -> None:
-    mean = mean_of(members=3)
+@pytest.mark.parametrize("config", [{}, {"cell": "lstm"}, {"encoder": "measurements"}])
+def test_the_mean_is_that_of_networks_that_run_by_themselves(config: dict[str, str]) -> None:
+    mean = mean_of(members=3, **config)
     y = 0.1 * torch.randn(2, 8, 6, dtype=torch.float64)
     w = torch.randn(2, 30, 2, dtype=torch.float64)
     with torch.no_grad():

@@ -9,7 +9,7 @@ state is the prediction, so that the innovation is zero. One step therefore serv
 from __future__ import annotations
 
 import math
-from typing import final
+from typing import cast, final
 
 import torch
 from torch import Tensor, nn
@@ -90,12 +90,66 @@ class InnovationFilter(nn.Module):
         return lower, upper
 
 
+_MEASUREMENT_SHARE = 0.01
+"""Share of a typical change of the velocities in a step by which a measurement differs from the
+prediction. Prediction errors are larger, and rounding in float32 is smaller.
+"""
+
+
+@final
+class MeasurementIndicator(nn.Module):
+    """Whether the state at the start of a step is measured or predicted by the previous step.
+
+    In a free run the state equals the prediction. In the measured past it differs by the prediction
+    error. The indicator is a smooth function of the difference, so that the step is differentiable.
+
+    Args:
+        dt: step in s.
+        dof: the n dynamic states.
+
+    Attributes:
+        size: entries of the memory: whether there is a prediction, and the prediction.
+    """
+
+    def __init__(self, dt: float, dof: DegreesOfFreedom) -> None:
+        super().__init__()
+        self.dof = dof.n_dynamic
+        self.size = 1 + dof.n_dynamic
+        self.dt = dt
+
+    def forward(self, x: Tensor, s: Tensor, acceleration_scale: Tensor) -> Tensor:
+        """Return the indicator [B, 1]: 1 for a measured state, 0 for a predicted one.
+
+        Args:
+            x: states at the start of the step [B, nx].
+            s: memory of the previous step [B, 1 + n].
+            acceleration_scale: standard deviation of the residual accelerations [n].
+        """
+        has_prediction, prediction = s.split([1, self.dof], dim=-1)
+        tolerance = _MEASUREMENT_SHARE * self.dt * acceleration_scale.to(x.dtype)
+        scaled = (dynamic_states(x, self.dof) - prediction) / tolerance
+        return 1.0 - has_prediction / (1.0 + scaled.square().sum(dim=-1, keepdim=True))
+
+    def next_memory(self, next_state: Tensor, indicator: Tensor) -> Tensor:
+        """Return the memory [B, 1 + n] after a step to the predicted states [B, nx]."""
+        prediction = dynamic_states(next_state, self.dof)
+        return torch.cat((torch.ones_like(next_state[:, :1]), prediction), dim=-1)
+
+    def memory_bounds(self) -> tuple[Tensor, Tensor]:
+        """Return the lower and upper bounds of the memory [1 + n]."""
+        upper = torch.full((self.size,), MAX_MEMORY, dtype=torch.float64)
+        upper[0] = 1.0
+        lower = -upper
+        lower[0] = 0.0
+        return lower, upper
+
+
 class HybridDynamics(Dynamics):
     """A hybrid model with the state x [B, 3 + n]: x, y, psi, then the dynamic states u, v, r etc.
 
     The head is evaluated once per time step, and its residual is constant over the stages of the
     integrator. A head with an innovation time constant receives the filtered innovation as further
-    channels.
+    channels, and a head with an encoder whether the state is measured.
     """
 
     def __init__(
@@ -120,8 +174,10 @@ class HybridDynamics(Dynamics):
         self.active_mask = nn.Buffer(dof.active_mask(), persistent=False)
         self.angle_rate_matrix = nn.Buffer(dof.angle_rate_matrix(), persistent=False)
         head.set_step(dt)
-        self.innovation_filter: InnovationFilter | None = None
-        if head.innovation_time_constant > 0.0:
+        self.innovation_filter: InnovationFilter | MeasurementIndicator | None = None
+        if head.has_encoder:
+            self.innovation_filter = MeasurementIndicator(dt, dof)
+        elif head.innovation_time_constant > 0.0:
             self.innovation_filter = InnovationFilter(head.innovation_time_constant, dt, dof)
         self.head_memory_size = head.n_state
         self.n_state = head.n_state
@@ -200,12 +256,27 @@ class HybridDynamics(Dynamics):
         if self.innovation_filter is None:
             rho, head_memory = self.head(z, s)
             return self.advance(x, z, p, rho), head_memory
-        innovation = self.innovation_filter(x, s[:, self.head_memory_size :])
+        innovation = self.compare_with_prediction(x, s)
         head_memory = s[:, : self.head_memory_size]
         rho, head_memory = self.head(torch.cat((z, innovation), dim=-1), head_memory)
         next_state = self.advance(x, z, p, rho)
         filter_memory = self.innovation_filter.next_memory(next_state, innovation)
         return next_state, torch.cat((head_memory, filter_memory), dim=-1)
+
+    def compare_with_prediction(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return the channels that compare the states with the prediction of the previous step.
+
+        Args:
+            x: states at the start of the step [B, 3 + n].
+            s: memory [B, n_state].
+
+        Returns:
+            The filtered innovation [B, n], or whether the states are measured [B, 1].
+        """
+        memory = s[:, self.head_memory_size :]
+        if isinstance(self.innovation_filter, MeasurementIndicator):
+            return cast(Tensor, self.innovation_filter(x, memory, self.head.residual_scale()))
+        return cast(Tensor, self.innovation_filter(x, memory))  # type: ignore[misc]
 
     def advance(self, x: Tensor, z: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return the state [B, 3 + n] one step later.
@@ -240,7 +311,10 @@ class HybridDynamics(Dynamics):
         return self.total_acceleration(baseline, rho, z[..., : self.dof])
 
     def _accelerations_with_innovation(
-        self, z: Tensor, baseline: Tensor, innovation_filter: InnovationFilter
+        self,
+        z: Tensor,
+        baseline: Tensor,
+        innovation_filter: InnovationFilter | MeasurementIndicator,
     ) -> Tensor:
         """Return nu_dot [B, T, n] of a head that receives the innovation.
 
@@ -274,7 +348,7 @@ class HybridDynamics(Dynamics):
         s = z.new_zeros((len(z), self.n_state))
         accelerations = []
         for k in range(2 * length):
-            innovation = innovation_filter(x[:, k], s[:, self.head_memory_size :])
+            innovation = self.compare_with_prediction(x[:, k], s)
             head_input = torch.cat((z[:, k], innovation), dim=-1)
             rho, head_memory = self.head(head_input, s[:, : self.head_memory_size])
             nu_dot = self.total_acceleration(baseline[:, k], rho, z[:, k, :n])
@@ -292,7 +366,7 @@ class HybridDynamics(Dynamics):
         if self.innovation_filter is None:
             rho, _ = self.head(z, s)
         else:
-            innovation = self.innovation_filter(x, s[:, self.head_memory_size :])
+            innovation = self.compare_with_prediction(x, s)
             head_input = torch.cat((z, innovation), dim=-1)
             rho, _ = self.head(head_input, s[:, : self.head_memory_size])
         return self.total_acceleration(self.baseline(z), rho, dynamic_states(x, self.dof))

@@ -44,6 +44,8 @@ class ResidualHead(nn.Module, ABC):
         innovation_time_constant: time constant in s of the low-pass filter of the one-step
             prediction errors of the accelerations (innovations), which are appended to the
             channels as n further columns; 0 for a head without innovations.
+        has_encoder: whether the memory of the measured past comes from an encoder; a further column
+            of the channels is 1 at measured states and 0 at predicted ones.
         export_error: reason why no export format supports the head; empty if it can be exported.
 
     Args:
@@ -58,6 +60,7 @@ class ResidualHead(nn.Module, ABC):
         self.n_state = 0
         self.batch_ensemble_size = 1
         self.innovation_time_constant = 0.0
+        self.has_encoder = False
         self.export_error = ""
 
     def set_step(self, dt: float) -> None:

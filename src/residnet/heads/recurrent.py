@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
 _INNOVATION_CLIP_STD = 4.0
 """Bound of the innovations after smooth clipping, in standard deviations of the residual."""
+_MIN_FORGOTTEN_SHARE = 1e-4
+"""Lower bound of the share of a cell state that is forgotten in a step, for shorter steps."""
+_MAX_CELL_STATE = 1e4
+"""Largest cell state of a long short-term memory, one divided by the smallest forgotten share."""
 _MIN_GATE = 1e-13
 """Lower bound of the update gate, so that its logarithm is finite in float32."""
 
@@ -40,9 +44,14 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
     def __init__(self, config: GRUEnsembleConfig, names: Sequence[str]) -> None:
         super().__init__(names)
         self.batch_ensemble_size = config.members
-        self.n_state = config.hidden_size
+        self.hidden_size = config.hidden_size
+        self.is_lstm = config.cell == "lstm"
+        # a long short-term memory has a cell state besides its output
+        self.n_state = (2 if self.is_lstm else 1) * config.hidden_size
         self.training_step = config.step
-        self.innovation_time_constant = 2.0 * config.step
+        self.has_encoder = config.encoder == "measurements"
+        self.is_decoding_only = False
+        self.innovation_time_constant = 0.0 if self.has_encoder else 2.0 * config.step
         self.step_ratio = 1.0
         self.innovation_clip = _INNOVATION_CLIP_STD
         self.min_gate = _MIN_GATE
@@ -54,17 +63,24 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
             if config.restoring
             else None
         )
-        self.n_inputs = n_inputs = self.features.n_features + self.n_dof
+        n_innovations = 0 if self.has_encoder else self.n_dof
+        self.n_inputs = n_inputs = self.features.n_features + n_innovations
         hidden_size = config.hidden_size
+        n_gates = 4 if self.is_lstm else 3
 
         def uniform_parameter(*shape: int) -> nn.Parameter:
             bound = 1.0 / math.sqrt(hidden_size)
             return nn.Parameter(torch.empty(config.members, *shape).uniform_(-bound, bound))
 
-        self.input_weight = uniform_parameter(n_inputs, 3 * hidden_size)
-        self.hidden_weight = uniform_parameter(hidden_size, 3 * hidden_size)
-        self.bias = uniform_parameter(1, 3 * hidden_size)
+        self.input_weight = uniform_parameter(n_inputs, n_gates * hidden_size)
+        self.hidden_weight = uniform_parameter(hidden_size, n_gates * hidden_size)
+        self.bias = uniform_parameter(1, n_gates * hidden_size)
         self.bias_hidden = uniform_parameter(1, hidden_size)
+        if self.has_encoder:
+            self.encoder_input_weight = uniform_parameter(n_inputs, n_gates * hidden_size)
+            self.encoder_hidden_weight = uniform_parameter(hidden_size, n_gates * hidden_size)
+            self.encoder_bias = uniform_parameter(1, n_gates * hidden_size)
+            self.encoder_bias_hidden = uniform_parameter(1, hidden_size)
         self.output_weight = uniform_parameter(hidden_size, self.n_dof)
         self.skip_weight = uniform_parameter(n_inputs, self.n_dof)
         self.bias_out = nn.Parameter(torch.zeros(config.members, 1, self.n_dof))
@@ -80,40 +96,78 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
         return self.scale.std
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return residuals [K B, n] and the next memories at channels z [K B, nz (+ n)].
+        """Return residuals [K B, n] and the next memories at channels z [K B, nz (+ n or + 1)].
 
-        Innovations are zero if they are not appended to the channels.
+        Innovations are zero, and states are predicted, if they are not appended to the channels.
         """
-        if z.shape[-1] > self.n_channels:
-            # large innovations are outliers or faults: limit their effect smoothly
-            z, innovation = z.split([self.n_channels, self.n_dof], dim=-1)
-            innovation = self.innovation_clip * torch.tanh(
-                innovation / (self.innovation_clip * self.scale.std.to(z.dtype))
-            )
-        else:
-            innovation = torch.zeros_like(z[..., : self.n_dof])
-        network_inputs = torch.cat((self.features(z), innovation), dim=-1).view(
-            self.batch_ensemble_size, -1, self.n_inputs
+        z, appended = z.split([self.n_channels, z.shape[-1] - self.n_channels], dim=-1)
+        inputs = self.features(z)
+        if not self.has_encoder:
+            if appended.shape[-1] == 0:
+                innovation = torch.zeros_like(z[..., : self.n_dof])
+            else:
+                # large innovations are outliers or faults: limit their effect smoothly
+                innovation = self.innovation_clip * torch.tanh(
+                    appended / (self.innovation_clip * self.scale.std.to(z.dtype))
+                )
+            inputs = torch.cat((inputs, innovation), dim=-1)
+        inputs = inputs.view(self.batch_ensemble_size, -1, self.n_inputs)
+        memory = s.reshape(self.batch_ensemble_size, -1, self.n_state)
+        next_memory = self.update_memory(
+            torch.baddbmm(self.bias, inputs, self.input_weight),
+            memory,
+            self.hidden_weight,
+            self.bias_hidden,
         )
-        hidden = self.update_memory(torch.baddbmm(self.bias, network_inputs, self.input_weight), s)
+        if self.has_encoder and appended.shape[-1] > 0 and not self.is_decoding_only:
+            encoded = self.update_memory(
+                torch.baddbmm(self.encoder_bias, inputs, self.encoder_input_weight),
+                memory,
+                self.encoder_hidden_weight,
+                self.encoder_bias_hidden,
+            )
+            is_measured = appended.view(self.batch_ensemble_size, -1, 1)
+            next_memory = next_memory + is_measured * (encoded - next_memory)
         network_output = torch.baddbmm(
-            torch.baddbmm(self.bias_out, network_inputs, self.skip_weight),
-            hidden,
+            torch.baddbmm(self.bias_out, inputs, self.skip_weight),
+            next_memory[..., : self.hidden_size],
             self.output_weight,
         )
         rho: Tensor = self.scale(network_output.reshape(-1, self.n_dof))
         if self.restoring_acceleration is not None:
             rho = rho + self.restoring_acceleration(z)
-        return rho, hidden.reshape(-1, self.n_state)
+        return rho, next_memory.reshape(-1, self.n_state)
 
-    def update_memory(self, input_gates: Tensor, s: Tensor) -> Tensor:
-        """Return the next memories [K, B, H], given the input part of the gates [K, B, 3 H]."""
-        hidden_size = self.n_state
-        hidden = s.reshape(self.batch_ensemble_size, -1, hidden_size)
+    def update_memory(
+        self, input_gates: Tensor, memory: Tensor, hidden_weight: Tensor, bias_hidden: Tensor
+    ) -> Tensor:
+        """Return the next memories [K, B, n_state].
+
+        Args:
+            input_gates: input part of the gates [K, B, 3 H]; [K, B, 4 H] for `lstm`.
+            memory: memories [K, B, n_state].
+            hidden_weight: weights of the memory in the gates [K, H, 3 H or 4 H].
+            bias_hidden: bias of the memory in the candidate [K, 1, H].
+        """
+        size = self.hidden_size
         # split instead of slices, because gradients of slices are summed over full-size tensors
-        gates, candidate = input_gates.split([2 * hidden_size, hidden_size], dim=-1)
-        hidden_gates, hidden_candidate = torch.bmm(hidden, self.hidden_weight).split(
-            [2 * hidden_size, hidden_size], dim=-1
+        if self.is_lstm:
+            hidden, cell = memory.split([size, size], dim=-1)
+            all_gates = input_gates + torch.bmm(hidden, hidden_weight)
+            gates, candidate = all_gates.split([3 * size, size], dim=-1)
+            forget_gate, input_gate, output_gate = torch.sigmoid(gates).chunk(3, dim=-1)
+            target = input_gate * torch.tanh(candidate + bias_hidden)
+            if self.step_ratio == 1.0:
+                cell = forget_gate * cell + target
+            else:
+                # the cell relaxes towards target / (1 - forget_gate), for a step of another length
+                forgotten = (1.0 - forget_gate).clamp(min=_MIN_FORGOTTEN_SHARE)
+                retained = torch.exp(self.step_ratio * torch.log(1.0 - forgotten))
+                cell = retained * cell + (1.0 - retained) / forgotten * target
+            return torch.cat((output_gate * torch.tanh(cell), cell), dim=-1)
+        gates, candidate = input_gates.split([2 * size, size], dim=-1)
+        hidden_gates, hidden_candidate = torch.bmm(memory, hidden_weight).split(
+            [2 * size, size], dim=-1
         )
         update_gate, reset_gate = torch.sigmoid(gates + hidden_gates).chunk(2, dim=-1)
         # the gate is the share retained over the training step; take its root for shorter steps
@@ -122,9 +176,9 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
                 self.step_ratio * torch.log(update_gate.clamp(min=self.min_gate))
             )
         # reset after the product, as in cuDNN and torch.nn.GRU
-        candidate = torch.tanh(candidate + reset_gate * (hidden_candidate + self.bias_hidden))
+        candidate = torch.tanh(candidate + reset_gate * (hidden_candidate + bias_hidden))
         # convex combination of candidate and memory, written with one product
-        return candidate + update_gate * (hidden - candidate)
+        return candidate + update_gate * (memory - candidate)
 
     def teacher_forced_residuals(self, z: Tensor) -> Tensor:
         s = torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
@@ -141,6 +195,8 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
         return s
 
     def memory_bounds(self) -> tuple[Tensor, Tensor]:
-        """Return the bounds of the memory [H]; units are convex combinations of tanh values."""
+        """Return the bounds of the memory [n_state]; outputs are between -1 and 1."""
         bound = self.bias.detach().new_ones(self.n_state)
+        if self.is_lstm:
+            bound[self.hidden_size :] = _MAX_CELL_STATE
         return -bound, bound

@@ -508,7 +508,7 @@ def _check_head_config(
         f"{subject}: has_closed_form of its config differs from the head",
     )
     assert_true(
-        config.has_innovations(names) == (head.innovation_time_constant > 0.0),
+        config.has_innovations(names) == (head.has_encoder or head.innovation_time_constant > 0.0),
         f"{subject}: has_innovations of its config differs from the head",
     )
 

@@ -308,7 +308,7 @@ class HeadTraining(EpochTraining):
             torch.cat([getattr(part, name) for part in windows]) for name in ("w", "y", "usable")
         )
         return rollout_loss(
-            self._free_run(),
+            self._run_from_measured_start,
             x0,
             w[:, :-1],
             torch.cat(memories),
@@ -318,6 +318,25 @@ class HeadTraining(EpochTraining):
             self.settings.robust,
             self.process_mean,
         )
+
+    def _run_from_measured_start(
+        self, x0: Tensor, w: Tensor, s: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Run the model from measured states x0 [B, 3 + n], see `Rollout`.
+
+        The encoder of a head reads the measured states only, hence the compiled rollout from the
+        second state on is without it.
+        """
+        head = self.model.head
+        if not isinstance(head, GRUEnsembleHead) or not head.has_encoder:
+            return self._free_run()(x0, w, s)
+        first_state, first_memory = self.model.step(x0, w[:, 0], s)
+        head.is_decoding_only = True
+        try:
+            states, _, memory = self._free_run()(first_state, w[:, 1:], first_memory)
+        finally:
+            head.is_decoding_only = False
+        return torch.cat((x0[:, None], states), dim=1), w, memory
 
     def _draw_noise(self, stage: int) -> Tensor:
         """Draw standard normal numbers [B, n] for the windows of this process.
