@@ -100,6 +100,13 @@ HEAD_VARIANTS: dict[str, dict[str, Any]] = {
         "delay": {"channels": ["n_port", "n_stbd"], "longest": 4},
     },
     "terms": {"kind": "kernel", "folds": 2, "penalties": [0.1], "terms": ["n_port|n_port|"]},
+    "encoder": {"kind": "recurrent", "hidden_size": 5, "encoder": "measurements"},
+    "lstm encoder": {
+        "kind": "recurrent",
+        "cell": "lstm",
+        "hidden_size": 5,
+        "encoder": "measurements",
+    },
 }
 MANOEUVRES: dict[str, dict[str, Any]] = {
     "constant": {"drive": 0.6, "steer": 0.2},

@@ -29,8 +29,9 @@ pytestmark = [pytest.mark.exporters, pytest.mark.usefixtures("short_parity")]
 INPUTS = {"n_port": 20.0, "n_stbd": 25.0, "wind_speed": 3.0, "wind_dir": 1.0}
 
 
-def test_a_unit_is_imported_and_stepped(tmp_path: Path) -> None:
-    spec, model = built("lstm_mirror")
+@pytest.mark.parametrize("variant", ["lstm_mirror", "gru_encoder"])
+def test_a_unit_is_imported_and_stepped(variant: str, tmp_path: Path) -> None:
+    spec, model = built(variant)
     file = str(tmp_path / "boat.fmu")
     get_exporter("fmu2").export(ExportedVessel(spec, model), Path(file))
     assert validate_fmu(file) == []

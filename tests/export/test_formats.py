@@ -80,7 +80,7 @@ LOADED: dict[str, Callable[[Path, ExportedVessel], LoadedExport]] = {
     "casadi": lambda file, made: CasadiModel(file),
     "aoti": lambda file, made: AotiModel(file),
 }
-SOME = ("plsr", "kernel", "mlp_mirror", "lstm")
+SOME = ("plsr", "kernel", "mlp_mirror", "lstm", "lstm_encoder")
 CASES = [
     *(("c", variant) for variant in VARIANTS),
     *(("casadi", variant) for variant in VARIANTS),

@@ -50,6 +50,21 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "mirror": True,
     },
     "recurrent_members": {"kind": "recurrent", "members": 3, "hidden_size": 4, "step": 0.4},
+    "gru_encoder": {
+        "kind": "recurrent",
+        "members": 2,
+        "hidden_size": 4,
+        "step": 0.4,
+        "encoder": "measurements",
+    },
+    "lstm_encoder": {
+        "kind": "recurrent",
+        "cell": "lstm",
+        "members": 2,
+        "hidden_size": 4,
+        "step": 0.4,
+        "encoder": "measurements",
+    },
     "mean": {},
     "lstm_per_axis": {"kind": "lstm", "hidden_size": 4, "per_axis": True, "activation": "softsign"},
 }
@@ -100,7 +115,7 @@ def fill(model: HybridDynamics, seed: int = 0) -> None:
 def built(variant: str) -> tuple[ModelSpec, HybridDynamics]:
     torch.manual_seed(0)
     if variant == "mean":
-        parts = [built(member) for member in ("plsr", "lstm", "recurrent_members")]
+        parts = [built(member) for member in ("plsr", "lstm", "recurrent_members", "gru_encoder")]
         members = tuple(
             spec.model_copy(update={"name": f"member_{i}"}) for i, (spec, _) in enumerate(parts)
         )
