@@ -128,8 +128,8 @@ class MeasurementIndicator(nn.Module):
         has_prediction, prediction = s.split([1, self.dof], dim=-1)
         tolerance = _MEASUREMENT_SHARE * self.dt * acceleration_scale.to(x.dtype)
         scaled = (dynamic_states(x, self.dof) - prediction) / tolerance
-        agreement: Tensor = 1.0 / (1.0 + scaled.square().sum(dim=-1, keepdim=True))
-        return 1.0 - has_prediction * agreement
+        indicator: Tensor = 1.0 - has_prediction / (1.0 + scaled.square().sum(-1, keepdim=True))
+        return indicator
 
     def next_memory(self, next_state: Tensor, indicator: Tensor) -> Tensor:
         """Return the memory [B, 1 + n] after a step to the predicted states [B, nx]."""
