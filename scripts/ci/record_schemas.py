@@ -30,8 +30,8 @@ from residnet.evaluation.records import (
     SelectionFile,
 )
 from residnet.identification.records import FitNotes
-from residnet.quality.records import InspectionFile
-from residnet.report.records import MonitorFile, SweepFile
+from residnet.quality.records import CompatibilityFile, InspectionFile
+from residnet.report.records import MonitorFile, SweepFile, VariantsFile
 from residnet.training.records import CurrentsFile
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -53,11 +53,13 @@ RECORDS: dict[str, type[StoredFile]] = {
     "booklet.json": BookletFile,
     "data_quality.json": DataQualityFile,
     "doctor.json": InspectionFile,
+    "compatibility.json": CompatibilityFile,
     "currents.json": CurrentsFile,
     "fit.json": FitNotes,
     "exports.json": ExportsFile,
     "indices.json": IndicesFile,
     "sweep.json": SweepFile,
+    "variants.json": VariantsFile,
     "monitor.json": MonitorFile,
 }
 """Files of a run folder with the class of their contents."""

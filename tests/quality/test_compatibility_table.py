@@ -60,7 +60,7 @@ def test_a_current_is_significant_and_estimated() -> None:
     assert row.current.is_significant
     assert row.current.north == pytest.approx(0.25, abs=4.0 * row.current.standard_error)
     assert row.meaning == "u, v through the water, with a current"
-    assert "significant" in str(compatibility_tables([row.model_dump()])[-1].__dict__)
+    assert "significant" in str(compatibility_tables([row])[-1].__dict__)
 
 
 def test_earth_fixed_velocities_win_by_a_margin() -> None:

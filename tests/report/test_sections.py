@@ -197,10 +197,16 @@ def made_variants(run: Path) -> Path:
     for variant, overrides, shift in (("recipe", [], 0.0), ("no_head", ["~heads"], 0.05)):
         row = {"variant": variant, "overrides": overrides, "seeds": 3, "windows": 12}
         row |= {"nrmse_mean": 0.2 + shift, "nrmse_sd": 0.01, "seconds": 12.0}
-        row |= {"nrmse_range": [0.19 + shift, 0.21 + shift], "difference": shift}
+        row |= {"diverged": 0, "nrmse_range": [0.19 + shift, 0.21 + shift], "difference": shift}
         row |= {"difference_ci95": [0.5 * shift, 1.5 * shift] if shift else None}
         rows += [{**row, "protocol": protocol} for protocol in ("T30", "manoeuvre")]
-    content = {"run": "made", "model": "plsr", "split": "test", "reference": "recipe"}
+    content = {
+        "schema": "residnet.variants/1",
+        "run": "made",
+        "model": "plsr",
+        "split": "test",
+        "reference": "recipe",
+    }
     write_json(run / "variants.json", content | {"rows": rows})
     return run
 
@@ -368,29 +374,29 @@ def test_rows_of_a_study_are_means_over_windows_and_seeds() -> None:
     table, arrays = variants(3)
     recipe, other = compare_variants(table, "recipe")
     errors = arrays["other"]
-    assert other["nrmse_mean"] == pytest.approx(errors.mean())
-    assert other["nrmse_sd"] == pytest.approx(errors.mean(1).std(ddof=1))
-    assert other["nrmse_range"] == pytest.approx([errors.mean(1).min(), errors.mean(1).max()])
+    assert other.nrmse_mean == pytest.approx(errors.mean())
+    assert other.nrmse_sd == pytest.approx(errors.mean(1).std(ddof=1))
+    assert other.nrmse_range == pytest.approx([errors.mean(1).min(), errors.mean(1).max()])
     apart = errors.mean(0) - arrays["recipe"].mean(0)
-    assert other["difference"] == pytest.approx(apart.mean())
+    assert other.difference == pytest.approx(apart.mean())
     (expected,) = bootstrap_intervals(
         apart[:, None], make_resampling_blocks([i // 3 for i in range(18)])
     )
-    assert other["difference_ci95"] == pytest.approx(expected)
-    assert (recipe["difference"], recipe["difference_ci95"]) == (0.0, None)
-    assert (other["windows"], other["seeds"], other["diverged"]) == (18, 3, 1)
+    assert other.difference_ci95 == pytest.approx(expected)
+    assert (recipe.difference, recipe.difference_ci95) == (0.0, None)
+    assert (other.windows, other.seeds, other.diverged) == (18, 3, 1)
 
 
 def test_one_seed_has_no_spread_and_the_reference_no_difference(tmp_path: Path) -> None:
     found = compare_variants(variants(1)[0], "recipe")
-    rows = [row | {"overrides": [], "seconds": 10.0} for row in found]
-    assert rows[1]["nrmse_sd"] is None
+    rows = [row.model_copy(update={"seconds": 10.0}) for row in found]
+    assert rows[1].nrmse_sd is None
     recipe, other = tabulate_variants(rows, "recipe").rows
-    assert [cell.text for cell in recipe.cells[:4]] == [f"{rows[0]['nrmse_mean']:.4f}", "–", "", ""]
-    low, high = rows[1]["difference_ci95"]
+    assert [cell.text for cell in recipe.cells[:4]] == [f"{rows[0].nrmse_mean:.4f}", "–", "", ""]
+    low, high = rows[1].difference_ci95
     assert (other.cells[3].text, other.cells[3].mark) == (f"+{low:.4f} to +{high:.4f}", "best")
     figure = plot_differences(rows, "recipe")
-    assert figure.cases[0].curves[0]["difference"][0].tolist() == [rows[1]["difference"]]
+    assert figure.cases[0].curves[0]["difference"][0].tolist() == [rows[1].difference]
     run = made_run(tmp_path / "made")
     for model, split, said in (("gru", "test", "no model 'gru'"), ("selected", "train", "'train'")):
         with pytest.raises(DataError, match=said):

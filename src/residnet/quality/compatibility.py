@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import cast
 
 import numpy as np
-from pydantic import BaseModel
 from scipy.stats import chi2
 
 from residnet.core.errors import DataError
@@ -16,7 +15,6 @@ from residnet.core.log import Log
 from residnet.core.names import POSE_NAMES
 from residnet.preprocessing.channel_values import mask_held_values, nan_median, nan_std
 from residnet.preprocessing.compatibility.hypotheses import (
-    MIN_MARGIN,
     Hypothesis,
     RankedHypothesis,
     choose_stretch,
@@ -24,6 +22,7 @@ from residnet.preprocessing.compatibility.hypotheses import (
 )
 from residnet.preprocessing.compatibility.reconstruction import Prior
 from residnet.preprocessing.compatibility.sensors import CURRENT_NAMES, Sensor, SensorKind
+from residnet.quality.records import CompatibilityRow, CurrentTest, InstrumentErrorRow
 
 _MAX_NODES = 300
 _STEP_SHARE = 0.3
@@ -49,73 +48,6 @@ _PRIORS = {
     "current_east": (Prior(0.0, 1.0), "m/s"),
 }
 """Instrument error -> prior and SI unit."""
-
-
-class ErrorRow(BaseModel):
-    """One instrument error of a log.
-
-    Attributes:
-        name: of the error.
-        unit: SI unit.
-        value: estimate.
-        standard_error: of the estimate.
-        is_determined: whether sensors determine it; otherwise the smoothness of the motion does.
-        is_significant: whether it is determined and differs from zero by 3.5 standard errors.
-    """
-
-    name: str
-    unit: str
-    value: float
-    standard_error: float
-    is_determined: bool
-    is_significant: bool
-
-
-class CurrentTest(BaseModel):
-    """Likelihood-ratio test of a current between velocities through the water and positions.
-
-    Attributes:
-        north: component of the current in m/s.
-        east: component of the current in m/s.
-        standard_error: larger one of the standard errors of both components in m/s.
-        statistic: likelihood ratio, reduced by the autocorrelation of the residuals.
-        p_value: probability of such a statistic without a current.
-        is_significant: whether the current is significant and large enough for a fit.
-    """
-
-    north: float
-    east: float
-    standard_error: float
-    statistic: float
-    p_value: float
-    is_significant: bool
-
-
-class CompatibilityRow(BaseModel):
-    """Data compatibility analysis of one log.
-
-    Attributes:
-        log: name of the log.
-        meaning: most likely meaning of its velocities; empty if none are measured.
-        runner_up: next meaning.
-        margin: difference of the BIC between both, reduced by the autocorrelation of the residuals.
-        errors: instrument errors.
-        current: test of a current; None without velocities.
-        reason: why there is no analysis; empty if there is one.
-    """
-
-    log: str
-    meaning: str = ""
-    runner_up: str = ""
-    margin: float = 0.0
-    errors: list[ErrorRow] = []
-    current: CurrentTest | None = None
-    reason: str = ""
-
-    @property
-    def is_ambiguous(self) -> bool:
-        """Whether the data do not distinguish the two most likely meanings."""
-        return bool(self.runner_up) and self.margin < MIN_MARGIN
 
 
 def analyse_compatibility(log: Log) -> CompatibilityRow:
@@ -150,7 +82,7 @@ def analyse_compatibility(log: Log) -> CompatibilityRow:
         return CompatibilityRow(log=log.name, reason=str(error))
     best = ranking[0].reconstruction
     rows = [
-        ErrorRow(
+        InstrumentErrorRow(
             name=name,
             unit=_PRIORS[name][1],
             value=estimate.value,
@@ -166,7 +98,7 @@ def analyse_compatibility(log: Log) -> CompatibilityRow:
         meaning=ranking[0].name if has_velocities else "",
         runner_up=ranking[1].name if has_velocities else "",
         margin=ranking[1].margin if has_velocities else 0.0,
-        errors=rows,
+        errors=tuple(rows),
         current=_test_current(ranking, stretch) if has_velocities else None,
     )
 

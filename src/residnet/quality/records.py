@@ -6,8 +6,10 @@ from typing import Literal
 
 from pydantic import Field
 
-from residnet.core.records import FileRecord, Record
+from residnet.core.records import FileRecord, FileRows, Record
 
+COMPATIBILITY_FILE = "compatibility.json"
+"""File of a run folder with the instrument errors of measured logs."""
 Level = Literal["note", "will mislead", "fatal"]
 """Severity of a finding: a remark, a fault that misleads a fit, a log without use for a fit."""
 
@@ -72,3 +74,69 @@ class InspectionFile(FileRecord):
         """All findings with the name of the log; `together` for the set of logs."""
         findings = [(log.name, finding) for log in self.logs for finding in log.findings]
         return findings + [("together", finding) for finding in self.together]
+
+
+class InstrumentErrorRow(Record):
+    """One instrument error of a log.
+
+    Attributes:
+        name: name of the error.
+        unit: SI unit.
+        value: estimate.
+        standard_error: standard error of the estimate.
+        is_determined: whether sensors determine it; otherwise the smoothness of the motion does.
+        is_significant: whether it is determined and differs from zero by 3.5 standard errors.
+    """
+
+    name: str
+    unit: str
+    value: float
+    standard_error: float
+    is_determined: bool
+    is_significant: bool
+
+
+class CurrentTest(Record):
+    """Likelihood-ratio test of a current between velocities through the water and positions.
+
+    Attributes:
+        north: component of the current in m/s.
+        east: component of the current in m/s.
+        standard_error: larger one of the standard errors of both components in m/s.
+        statistic: likelihood ratio, reduced by the autocorrelation of the residuals.
+        p_value: probability of such a statistic without a current.
+        is_significant: whether the current is significant and large enough for a fit.
+    """
+
+    north: float
+    east: float
+    standard_error: float
+    statistic: float
+    p_value: float
+    is_significant: bool
+
+
+class CompatibilityRow(Record):
+    """Data compatibility analysis of one log.
+
+    Attributes:
+        log: name of the log.
+        meaning: most likely meaning of its velocities; empty if none are measured.
+        runner_up: next meaning.
+        margin: difference of the BIC between both, reduced by the autocorrelation of the residuals.
+        errors: instrument errors.
+        current: test of a current; None without velocities.
+        reason: why there is no analysis; empty if there is one.
+    """
+
+    log: str
+    meaning: str = ""
+    runner_up: str = ""
+    margin: float = 0.0
+    errors: tuple[InstrumentErrorRow, ...] = ()
+    current: CurrentTest | None = None
+    reason: str = ""
+
+
+class CompatibilityFile(FileRows[CompatibilityRow]):
+    """compatibility.json: instrument errors and meanings of the velocities, a row for each log."""

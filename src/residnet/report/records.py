@@ -64,6 +64,57 @@ class SweepFile(FileRecord):
         return [(trial, trial.value) for trial in self.trials if trial.value is not None]
 
 
+class VariantRow(Record):
+    """The error of one variant of a fit under one protocol.
+
+    Attributes:
+        variant: name of the variant.
+        protocol: name of the protocol.
+        seeds: number of seeds.
+        windows: number of windows.
+        diverged: number of windows in which a free run diverged, over all seeds.
+        nrmse_mean: NRMSE of the free runs, mean over windows and seeds.
+        nrmse_sd: standard deviation of the NRMSE over seeds; None for one seed.
+        nrmse_range: smallest and largest NRMSE of the seeds.
+        difference: mean difference from the reference variant over the same windows.
+        difference_ci95: its 95 % confidence interval; None for the reference variant.
+        overrides: overrides of config keys that define the variant.
+        seconds: mean duration of a run in s.
+    """
+
+    variant: str
+    protocol: str
+    seeds: int
+    windows: int
+    diverged: int
+    nrmse_mean: float
+    nrmse_sd: float | None
+    nrmse_range: tuple[float, float]
+    difference: float
+    difference_ci95: tuple[float, float] | None
+    overrides: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+
+class VariantsFile(FileRecord):
+    """variants.json: the errors of all variants of a fit.
+
+    Attributes:
+        run: name of the sweep.
+        model: the compared model of each run.
+        split: split of the logs.
+        reference: name of the reference variant.
+        rows: a row for each variant and protocol.
+    """
+
+    schema_name: Literal["residnet.variants/1"] = Field(alias="schema")
+    run: str
+    model: str
+    split: str
+    reference: str
+    rows: tuple[VariantRow, ...]
+
+
 class SuspectRow(Record):
     """The score test of one possible change of a vessel or a sensor.
 

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 from residnet.core.format import DASH, DEGREES_PER_RADIAN, format_minus_signs, format_number
 from residnet.evaluation.records import LogQuality
-from residnet.quality.records import FindingRow
+from residnet.quality.records import (
+    COMPATIBILITY_FILE,
+    CompatibilityFile,
+    CompatibilityRow,
+    FindingRow,
+    InstrumentErrorRow,
+)
 from residnet.report.blocks import (
     Block,
     Bullets,
@@ -22,7 +28,7 @@ from residnet.report.blocks import (
     build_table,
     flag_cell,
 )
-from residnet.report.run_reader import JsonObject, RunFiles
+from residnet.report.run_reader import RunFiles
 from residnet.report.run_settings import ProtocolSettings
 from residnet.training.records import CurrentRow, CurrentsFile
 
@@ -85,8 +91,8 @@ def fit_data_section(run: RunFiles) -> Section | None:
                 "Data quality", [summary_table, Section("Log by log", [log_table], is_folded=True)]
             )
         ]
-    if compatibility := run.read_json("compatibility.json"):
-        blocks.append(Section("Instrument errors", compatibility_tables(compatibility)))
+    if compatibility := CompatibilityFile.read_optional(run.path, COMPATIBILITY_FILE):
+        blocks.append(Section("Instrument errors", compatibility_tables(compatibility.root)))
     currents = run.read_record(CurrentsFile, "currents.json")
     if currents is not None:
         blocks.append(Section("Currents", [_currents_table(run, currents.root)], is_folded=True))
@@ -115,39 +121,43 @@ def _currents_table(run: RunFiles, currents: Sequence[CurrentRow]) -> Table:
     )
 
 
-def compatibility_tables(rows: Sequence[JsonObject]) -> list[Block]:
+def compatibility_tables(rows: Sequence[CompatibilityRow]) -> list[Block]:
     """Return the instrument errors over all logs, and the meaning of the velocities of each log.
 
     Args:
-        rows: content of compatibility.json.
+        rows: rows of compatibility.json.
     """
-    errors: dict[str, list[JsonObject]] = {}
+    errors: dict[str, list[InstrumentErrorRow]] = {}
     for row in rows:
-        for error in row["errors"]:
-            errors.setdefault(error["name"], []).append(error)
+        for error in row.errors:
+            errors.setdefault(error.name, []).append(error)
 
-    def median(members: Sequence[JsonObject], key: str) -> float:
-        return statistics.median(float(error[key]) for error in members)
-
-    def scale_text(members: Sequence[JsonObject], key: str) -> str:
-        unit = members[0]["unit"]
+    def median_text(unit: str, values: Iterable[float]) -> str:
         factor = DEGREES_PER_RADIAN if unit.startswith("rad") else 1.0
-        text = format_number(factor * median(members, key), 2)
+        text = format_number(factor * statistics.median(values), 2)
         return text if unit == "-" else f"{text} {unit.replace('rad', 'deg')}"
 
-    def source(members: Sequence[JsonObject]) -> str:
-        n_determined = sum(bool(error["is_determined"]) for error in members)
+    def source(members: Sequence[InstrumentErrorRow]) -> str:
+        n_determined = sum(error.is_determined for error in members)
         return "sensors" if 2 * n_determined > len(members) else "smoothness only"
 
-    def count_significant(members: Sequence[JsonObject]) -> str:
-        return f"{sum(bool(e['is_significant']) for e in members)} of {len(members)}"
+    def count_significant(members: Sequence[InstrumentErrorRow]) -> str:
+        return f"{sum(e.is_significant for e in members)} of {len(members)}"
 
     error_table = build_table(
         errors.values(),
         [
-            ("instrument error", lambda members: members[0]["name"]),
-            ("median estimate", lambda members: scale_text(members, "value")),
-            ("median standard error", lambda members: scale_text(members, "standard_error")),
+            ("instrument error", lambda members: members[0].name),
+            (
+                "median estimate",
+                lambda members: median_text(members[0].unit, (error.value for error in members)),
+            ),
+            (
+                "median standard error",
+                lambda members: median_text(
+                    members[0].unit, (error.standard_error for error in members)
+                ),
+            ),
             ("determined by", source),
             ("logs where significant", count_significant),
         ],
@@ -156,25 +166,25 @@ def compatibility_tables(rows: Sequence[JsonObject]) -> list[Block]:
         " determines is no finding.",
     )
 
-    def current_text(row: JsonObject) -> str:
-        current = row.get("current")
-        if not current:
+    def current_text(row: CompatibilityRow) -> str:
+        current = row.current
+        if current is None:
             return DASH
-        size = math.hypot(current["north"], current["east"])
-        verdict = "significant" if current["is_significant"] else "not significant"
-        error = format_number(current["standard_error"], 2)
-        p_value = format_number(current["p_value"], 1)
+        size = math.hypot(current.north, current.east)
+        verdict = "significant" if current.is_significant else "not significant"
+        error = format_number(current.standard_error, 2)
+        p_value = format_number(current.p_value, 1)
         return f"{format_number(size, 2)} ± {error} m/s, p = {p_value}, {verdict}"
 
     log_table = build_table(
         rows,
         [
-            ("log", lambda row: row["log"]),
-            ("velocities", lambda row: row["meaning"] or row["reason"] or "not measured"),
-            ("runner-up", lambda row: row["runner_up"] or DASH),
+            ("log", lambda row: row.log),
+            ("velocities", lambda row: row.meaning or row.reason or "not measured"),
+            ("runner-up", lambda row: row.runner_up or DASH),
             (
                 "margin (BIC)",
-                lambda row: format_number(row["margin"], 3) if row["meaning"] else DASH,
+                lambda row: format_number(row.margin, 3) if row.meaning else DASH,
             ),
             ("current (likelihood-ratio test)", current_text),
         ],

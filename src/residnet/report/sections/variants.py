@@ -27,7 +27,8 @@ from residnet.report.figure import (
     tick_labels,
 )
 from residnet.report.figure_files import write_figures
-from residnet.report.run_reader import JsonObject, RunFiles
+from residnet.report.records import VariantRow, VariantsFile
+from residnet.report.run_reader import RunFiles
 
 VARIANTS_FILE = "variants.json"
 """File of a run folder with the errors of all variants."""
@@ -35,41 +36,41 @@ VARIANTS_FILE = "variants.json"
 
 def variant_sections(files: RunFiles) -> list[Section]:
     """Return the sections of the report, and draw the figure."""
-    content = files.read_json(VARIANTS_FILE)
-    rows = content["rows"]
+    comparison = VariantsFile.read(files.path / VARIANTS_FILE)
+    rows = comparison.rows
     figure_blocks = write_figures(
-        files.path / "figures", [plot_differences(rows, content["reference"])]
+        files.path / "figures", [plot_differences(rows, comparison.reference)]
     )
     explanation = [
-        f"Free-run NRMSE of model {content['model']} on {content['split']} data, mean over the"
-        f" windows and {format_count(rows[0]['seeds'], 'seed')}.",
-        f"Difference: to {content['reference']} over the same windows, seeds averaged first;"
+        f"Free-run NRMSE of model {comparison.model} on {comparison.split} data, mean over the"
+        f" windows and {format_count(rows[0].seeds, 'seed')}.",
+        f"Difference: from {comparison.reference} over the same windows, seeds averaged first;"
         " negative is better, and a bold interval excludes 0. Its 95 % interval comes from"
         " blocks of windows.",
     ]
-    table = tabulate_variants(rows, content["reference"])
+    table = tabulate_variants(rows, comparison.reference)
     return [Section("", [table, *figure_blocks, Text(explanation, is_secondary=True)])]
 
 
-def plot_differences(rows: Sequence[JsonObject], reference: str) -> Figure:
+def plot_differences(rows: Sequence[VariantRow], reference: str) -> Figure:
     """Plot the differences to the reference with intervals, one panel for each protocol.
 
     Args:
         reference: name of the reference variant.
     """
-    protocols = list(dict.fromkeys(row["protocol"] for row in rows))
-    names = [name for name in dict.fromkeys(row["variant"] for row in rows) if name != reference]
+    protocols = list(dict.fromkeys(row.protocol for row in rows))
+    names = [name for name in dict.fromkeys(row.variant for row in rows) if name != reference]
     panel_curves = []
     panels = []
     for protocol in protocols:
         protocol_rows = [
-            row for row in rows if row["protocol"] == protocol and row["variant"] != reference
+            row for row in rows if row.protocol == protocol and row.variant != reference
         ]
-        positions = [names.index(row["variant"]) for row in protocol_rows]
+        positions = [names.index(row.variant) for row in protocol_rows]
         interval_spans = [
-            (position, *row["difference_ci95"])
+            (position, *row.difference_ci95)
             for position, row in zip(positions, protocol_rows, strict=True)
-            if row["difference_ci95"]
+            if row.difference_ci95
         ]
         interval_lines = join_with_gaps(
             [
@@ -78,7 +79,7 @@ def plot_differences(rows: Sequence[JsonObject], reference: str) -> Figure:
             ]
         )
         points = (
-            np.array([row["difference"] for row in protocol_rows]),
+            np.array([row.difference for row in protocol_rows]),
             np.array(positions, dtype=float),
         )
         panel_curves.append(
@@ -111,49 +112,48 @@ def plot_differences(rows: Sequence[JsonObject], reference: str) -> Figure:
     )
 
 
-def tabulate_variants(rows: Sequence[JsonObject], reference: str) -> Table:
+def tabulate_variants(rows: Sequence[VariantRow], reference: str) -> Table:
     """Return the table of variants with error and difference under each protocol.
 
     Args:
         reference: name of the reference variant.
     """
-    by_variant: dict[str, dict[str, JsonObject]] = {}
+    by_variant: dict[str, dict[str, VariantRow]] = {}
     for row in rows:
-        by_variant.setdefault(row["variant"], {})[row["protocol"]] = row
-    protocols = list(dict.fromkeys(row["protocol"] for row in rows))
+        by_variant.setdefault(row.variant, {})[row.protocol] = row
+    protocols = list(dict.fromkeys(row.protocol for row in rows))
 
-    def format_error(row: JsonObject) -> Cell:
-        # results of earlier versions have no count of diverged windows
-        n_diverged = int(row.get("diverged", 0))
+    def format_error(row: VariantRow) -> Cell:
+        n_diverged = row.diverged
         note = f"{n_diverged} diverged" if n_diverged else ""
-        protocol_rows = [other for other in rows if other["protocol"] == row["protocol"]]
-        is_lowest = row["nrmse_mean"] == min(other["nrmse_mean"] for other in protocol_rows)
+        protocol_rows = [other for other in rows if other.protocol == row.protocol]
+        is_lowest = row.nrmse_mean == min(other.nrmse_mean for other in protocol_rows)
         return Cell(
-            f"{row['nrmse_mean']:.4f}", note, "bad" if n_diverged else "best" if is_lowest else ""
+            f"{row.nrmse_mean:.4f}", note, "bad" if n_diverged else "best" if is_lowest else ""
         )
 
-    protocol_columns: list[Column[JsonObject]] = [
+    protocol_columns: list[Column[VariantRow]] = [
         ("NRMSE", format_error),
-        ("sd of seeds", lambda row: row["nrmse_sd"], 4),
+        ("sd of seeds", lambda row: row.nrmse_sd, 4),
         (
             "difference",
-            lambda row: format_signed(row["difference"]) if row["difference_ci95"] else "",
+            lambda row: format_signed(row.difference) if row.difference_ci95 else "",
             str,
         ),
-        ("95 % interval", lambda row: format_paired_interval(row["difference_ci95"], "")),
+        ("95 % interval", lambda row: format_paired_interval(row.difference_ci95, "")),
     ]
     return build_table(
         by_variant.values(),
         [
-            ("variant", lambda row: row[protocols[0]]["variant"]),
+            ("variant", lambda row: row[protocols[0]].variant),
             *(
                 (title, lambda row, name=name, of=cell_function: of(row[name]), *number_format)
                 for name in protocols
                 for title, cell_function, *number_format in protocol_columns
             ),
-            ("run [s]", f"{protocols[0]}.seconds", 0),
-            ("what changes", lambda row: ", ".join(row[protocols[0]]["overrides"])),
+            ("run [s]", lambda row: row[protocols[0]].seconds, 0),
+            ("what changes", lambda row: ", ".join(row[protocols[0]].overrides)),
         ],
         groups=[*((f"protocol {name}", len(protocol_columns)) for name in protocols), ("", 2)],
-        is_selected=lambda row: row[protocols[0]]["variant"] == reference,
+        is_selected=lambda row: row[protocols[0]].variant == reference,
     )

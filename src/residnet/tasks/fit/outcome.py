@@ -24,6 +24,7 @@ from residnet.io.split import assign_log_names
 from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.preprocessing.masks import SpikeMask
 from residnet.preprocessing.prepare import PreparedLog, prepare_log
+from residnet.quality.records import COMPATIBILITY_FILE, CompatibilityFile
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.free_runs import errors_table
 from residnet.report.sections.verdict import verdict_level, verdict_sentences
@@ -63,8 +64,8 @@ def write_inspection(
             log_message(f"  {report.name}: {finding.text}")
     if not isinstance(config.data, SimulatedTrials):
         # instruments of simulated logs have the declared noise and no errors
-        rows = [analyse_compatibility(log).model_dump() for log in logs[:_MAX_ANALYSED_LOGS]]
-        folder.write_json(folder.path / "compatibility.json", rows)
+        rows = tuple(analyse_compatibility(log) for log in logs[:_MAX_ANALYSED_LOGS])
+        folder.write_record(folder.path / COMPATIBILITY_FILE, CompatibilityFile(rows))
     inspection = build_inspection(reports, joint_report)
     folder.write_record(folder.inspection, inspection)
     # a correctable error is reported before the fit takes its time; the verdict counts all findings

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from residnet.core.processes import process_pool
 from residnet.core.progress import report_progress
 from residnet.core.run_records import ProvenanceFile
 from residnet.evaluation.metrics import bootstrap_intervals, make_resampling_blocks
+from residnet.report.records import VariantRow, VariantsFile
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.variants import VARIANTS_FILE, tabulate_variants
 from residnet.runs.folder import RunFolder
@@ -64,58 +65,61 @@ def compare_variants_of_fit(
         names=["variant", "seed"],
     )
     rows = compare_variants(errors, search.reference)
-    for row in rows:
-        row["overrides"] = list(search.variants[row["variant"]])
-        row["seconds"] = float(np.mean([seconds[row["variant"], seed] for seed in search.seeds]))
-    content = {
-        "schema": "residnet.variants/1",
-        "run": config.name,
-        "model": search.model,
-        "split": search.split,
-        "reference": search.reference,
-        "rows": rows,
-    }
-    folder.write_json(folder.path / VARIANTS_FILE, content)
-    summary_metrics = {
-        f"nrmse_{row['variant']}_{row['protocol']}": SummaryMetric(row["nrmse_mean"])
+    rows = [
+        row.model_copy(
+            update={
+                "overrides": tuple(search.variants[row.variant]),
+                "seconds": float(np.mean([seconds[row.variant, seed] for seed in search.seeds])),
+            }
+        )
         for row in rows
+    ]
+    comparison = VariantsFile(
+        schema="residnet.variants/1",
+        run=config.name,
+        model=search.model,
+        split=search.split,
+        reference=search.reference,
+        rows=tuple(rows),
+    )
+    folder.write_record(folder.path / VARIANTS_FILE, comparison)
+    summary_metrics = {
+        f"nrmse_{row.variant}_{row.protocol}": SummaryMetric(row.nrmse_mean) for row in rows
     }
     text = tabulate_variants(rows, search.reference).to_text()
     return TaskOutcome(_summarize_variants(rows, search.reference), summary_metrics, text)
 
 
-def _summarize_variants(rows: Sequence[dict[str, Any]], reference: str) -> list[str]:
+def _summarize_variants(rows: Sequence[VariantRow], reference: str) -> list[str]:
     """Return a sentence for each protocol on the variant with the lowest error."""
     sentences = []
-    for protocol in dict.fromkeys(row["protocol"] for row in rows):
-        protocol_rows = [row for row in rows if row["protocol"] == protocol]
+    for protocol in dict.fromkeys(row.protocol for row in rows):
+        protocol_rows = [row for row in rows if row.protocol == protocol]
         # diverged runs have the constant-velocity error: variants without them are ranked first
-        best_row = min(
-            protocol_rows, key=lambda row: (int(row["diverged"]) > 0, float(row["nrmse_mean"]))
-        )
-        qualifier = " of the steady ones" if any(row["diverged"] for row in protocol_rows) else ""
+        best_row = min(protocol_rows, key=lambda row: (row.diverged > 0, row.nrmse_mean))
+        qualifier = " of the steady ones" if any(row.diverged for row in protocol_rows) else ""
         sentence = (
-            f"{protocol}: '{best_row['variant']}' has the least free-run NRMSE{qualifier},"
-            f" {best_row['nrmse_mean']:.4f}"
+            f"{protocol}: '{best_row.variant}' has the least free-run NRMSE{qualifier},"
+            f" {best_row.nrmse_mean:.4f}"
         )
-        if best_row["diverged"]:
+        if best_row.diverged:
             sentence = (
                 f"{protocol}: EVERY VARIANT DIVERGED in some windows; of the errors, which count"
-                f" those windows as constant velocity does, that of '{best_row['variant']}' is"
+                f" those windows as constant velocity does, that of '{best_row.variant}' is"
                 f" the least,"
-                f" {best_row['nrmse_mean']:.4f}"
+                f" {best_row.nrmse_mean:.4f}"
             )
-        interval = best_row["difference_ci95"]
-        if best_row["variant"] != reference and interval is not None:
+        interval = best_row.difference_ci95
+        if best_row.variant != reference and interval is not None:
             sentence += (
-                f"; that is {best_row['difference']:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]"
+                f"; that is {best_row.difference:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]"
                 f" from '{reference}'"
             )
         sentences.append(f"{sentence}.")
-        diverged_rows = [row for row in protocol_rows if row["diverged"]]
+        diverged_rows = [row for row in protocol_rows if row.diverged]
         if diverged_rows:
             diverged_text = ", ".join(
-                f"'{row['variant']}' in {row['diverged']} windows" for row in diverged_rows
+                f"'{row.variant}' in {row.diverged} windows" for row in diverged_rows
             )
             sentences.append(f"{protocol}: free runs DIVERGED: {diverged_text}.")
     return sentences
@@ -170,7 +174,7 @@ def compute_window_errors(run: Path, model: str, split: str) -> pd.DataFrame:
     )
 
 
-def compare_variants(errors: pd.DataFrame, reference: str) -> list[dict[str, Any]]:
+def compare_variants(errors: pd.DataFrame, reference: str) -> list[VariantRow]:
     """Return one row per variant and protocol.
 
     A row has the number of windows that diverged, the mean error over windows and seeds, its
@@ -184,7 +188,7 @@ def compare_variants(errors: pd.DataFrame, reference: str) -> list[dict[str, Any
     """
     import pandas as pd
 
-    rows = []
+    rows: list[VariantRow] = []
     for (variant, protocol), variant_errors in errors.groupby(["variant", "protocol"], sort=False):
         reference_errors = errors.loc[reference]
         differences_mean, reference_mean = (
@@ -201,17 +205,17 @@ def compare_variants(errors: pd.DataFrame, reference: str) -> list[dict[str, Any
         )
         by_seed = variant_errors.groupby("seed")["nrmse"].mean()
         rows.append(
-            {
-                "variant": variant,
-                "protocol": protocol,
-                "seeds": len(by_seed),
-                "windows": len(differences_mean),
-                "diverged": int(variant_errors["diverged"].sum()),
-                "nrmse_mean": float(by_seed.mean()),
-                "nrmse_sd": float(by_seed.std()) if len(by_seed) > 1 else None,
-                "nrmse_range": [float(by_seed.min()), float(by_seed.max())],
-                "difference": float(differences_mean.mean()),
-                "difference_ci95": None if variant == reference else interval,
-            }
+            VariantRow(
+                variant=str(variant),
+                protocol=str(protocol),
+                seeds=len(by_seed),
+                windows=len(differences_mean),
+                diverged=int(variant_errors["diverged"].sum()),
+                nrmse_mean=float(by_seed.mean()),
+                nrmse_sd=float(by_seed.std()) if len(by_seed) > 1 else None,
+                nrmse_range=(float(by_seed.min()), float(by_seed.max())),
+                difference=float(differences_mean.mean()),
+                difference_ci95=None if variant == reference else interval,
+            )
         )
     return rows
