@@ -1,6 +1,6 @@
 """Equations recovered from simulated logs: how often, how exactly, and how fast, on one thread.
 
-    python scripts/bench/symbolic.py [--parts ships ratios bred] [--designs 10] [--seed 0]
+    python scripts/bench/symbolic.py [--parts ships ratios cubic bred] [--designs 10] [--seed 0]
 
     exact       all six equations of Odin (document 000, (6.6)-(6.8), (6.21)-(6.23)) from random
                 multi-sine designs with accelerations given; a coefficient counts within 1 %
@@ -9,6 +9,7 @@
     late        the same with inputs that act 0.3 s late
     ships       random ships with propeller and rudder, no settings at all, without and with noise
     ratios      the same of ships that divide by their revolutions, which stay away from zero
+    cubic       equations with cubic terms, no settings at all, 10 % noise: six kinds, four draws
     bred        the noisy ships by genetic programming, no settings at all (extra gp)
     delay       a delay of 0.5 s, 10 % noise on all channels: the errors of the true terms at every
                 shift
@@ -34,7 +35,7 @@ from typing import Any
 import bench
 import numpy as np
 import torch
-from made_equations import CHANNELS, SPACE, Drawn, draw, draw_ship
+from made_equations import CHANNELS, CUBIC_SHIPS, SPACE, Drawn, draw, draw_ship
 from made_odin import (
     FORCE_TRUTH,
     JET_TRUTH,
@@ -301,6 +302,16 @@ def ships(label: str, count: int, first: int, levels: Iterable[float], **given: 
         drawn(f"{label} {noise:g}", designs, {}, kind=kind)
 
 
+def cubic(count: int, first: int) -> None:
+    """Print how often equations with cubic terms are recovered, for two kinds of each axis."""
+    designs = [
+        draw_ship(first + k, noise=0.1, terms=terms)
+        for terms in CUBIC_SHIPS
+        for k in range(max(1, 2 * count // 5))
+    ]
+    drawn("cubic 0.1", designs, {})
+
+
 def equations(label: str, count: int, first: int, delay: int) -> None:
     """Print the same of random equations whose inputs act so many samples late."""
     config: dict[str, Any] = {"candidates": SPACE.model_dump()}
@@ -316,6 +327,7 @@ PARTS: dict[str, Callable[[int, int], None]] = {
     "late": lambda count, first: equations("late", 2 * count, first, 3),
     "ships": lambda count, first: ships("ships", 2 * count, first, (0.0, 0.1)),
     "ratios": lambda count, first: ships("ratios", count, first, (0.0, 0.1), ratios=True),
+    "cubic": cubic,
     "bred": lambda count, first: ships("bred", count, first, (0.1,)),
     "delay": delay,
     "sets": input_sets,

@@ -75,6 +75,7 @@ def test_noise_hides_no_equation_that_a_sparse_search_finds(final: bool) -> None
     notes = head.fit_preferred(design.samples)
     for axis, truth in zip(ACCELERATION_NAMES, design.truth, strict=True):
         assert bool(notes["equations"][axis]["by_sparse_search"]) == final
+        assert notes["equations"][axis]["lack_of_fit"] == {}
         if final:
             found = {
                 tuple(sorted(parse_term(c["term"], CHANNELS))): c["value"]

@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 import sympy
 import torch
-from made_equations import SPACE, draw, draw_ship
+from made_equations import CUBIC_SHIPS, SPACE, draw, draw_ship
 from made_odin import FORCE_TRUTH, JET_TRUTH, MSD_TRUTH, force_logs, jet_logs, msd_log, step_log
 from made_samples import sampled
 
@@ -23,8 +23,10 @@ from residnet.core.names import ACCELERATION_NAMES
 from residnet.core.samples import Samples
 from residnet.heads.symbolic import SegmentedSamples, SymbolicHead, find_best_delay
 from residnet.heads.symbolic_config import SymbolicConfig
+from residnet.identification.records import FitNotes
 from residnet.physics.symmetry import compute_term_parity
 from residnet.preprocessing.derivatives import SavitzkyGolay
+from residnet.report.sections.models import equation_remarks
 
 FORCES = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
 JETS = ("u", "v", "r", "rpm", "nozzle")
@@ -100,6 +102,26 @@ def test_ships_are_known_without_settings(ratios: bool) -> None:
     _, notes = fitted({}, drawn.samples)
     for axis, terms in zip(ACCELERATION_NAMES, drawn.truth, strict=True):
         assert found(notes, axis) == pytest.approx(terms, rel=1e-6)
+
+
+@pytest.mark.parametrize("terms", CUBIC_SHIPS)
+def test_cubic_terms_are_candidates_by_default(
+    terms: tuple[tuple[tuple[str, ...], ...], ...],
+) -> None:
+    drawn = draw_ship(2, noise=0.1, terms=terms)
+    _, notes = fitted({}, drawn.samples)
+    for axis, truth in zip(ACCELERATION_NAMES, drawn.truth, strict=True):
+        assert set(found(notes, axis)) == set(truth)
+        assert notes["equations"][axis]["lack_of_fit"] == {}
+
+
+def test_lack_of_fit_is_reported_for_the_equations_whose_candidates_exclude_a_term() -> None:
+    drawn = draw_ship(1, noise=0.1, terms=CUBIC_SHIPS[0])
+    _, notes = fitted({"candidates": {"motion_degree": 2}}, drawn.samples)
+    families = {axis: list(notes["equations"][axis]["lack_of_fit"]) for axis in ACCELERATION_NAMES}
+    assert families == {"u_dot": ["u"], "v_dot": ["v"], "r_dot": ["r"]}
+    remarks = " ".join(equation_remarks(FitNotes.model_validate(notes)))
+    assert "which functions of v predict" in remarks
 
 
 def test_two_levels_of_an_input_do_not_tell_its_square() -> None:

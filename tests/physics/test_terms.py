@@ -157,10 +157,14 @@ def terms_of(names: Sequence[str], **config: Any) -> set[str]:
 
 
 def test_motions_with_magnitudes() -> None:
-    plain = {"1", "u", "v", "u^2", "u v", "v^2"}
+    cubic = {"u^3", "u^2 v", "u v^2", "v^3"}
+    plain = {"1", "u", "v", "u^2", "u v", "v^2"} | cubic
     assert terms_of("uv", inputs=(), magnitudes=False) == plain
     sized = {"|u|", "|v|", "u |u|", "u |v|", "v |u|", "v |v|", "|u| |v|"}
     assert terms_of("uv", inputs=()) == plain | sized
+    # explicit degrees exclude the cubic terms
+    assert terms_of("uv", inputs=(), motion_degree=2) == (plain | sized) - cubic
+    assert terms_of("uv", inputs=(), input_degree=1) == (plain | sized) - cubic
 
 
 def test_jets_have_every_term_of_the_document_by_degree_then_by_effort() -> None:
@@ -188,6 +192,9 @@ def test_candidates_know_propellers_and_rudders_unless_told_otherwise() -> None:
     assert [term for term in named if "tau" in term] == ["tau_x inv(u)"]
     ship = {"n |n|", "u |n|", "u^2 delta", "u |u| delta", "|u| delta", "n |n| delta", "u n delta"}
     assert ship <= terms_of(SHIP)
+    cubic = {"u^3", "v^3", "r^3", "v^2 r", "v r^2", "n^2 delta^2", "n |n| delta^2", "delta^3"}
+    assert cubic <= terms_of(SHIP)
+    assert not cubic & terms_of(SHIP, input_degree=1)
     assert not ship & terms_of(SHIP, input_degree=1)
     plain = terms_of(SHIP, magnitudes=False)
     assert {"u^2 delta", "n^2 delta"} <= plain

@@ -102,6 +102,23 @@ SHIP: tuple[tuple[tuple[str, ...], ...], ...] = (
     ),
 )
 """Terms of ships' equations by axis: one of each group."""
+CUBIC_SHIPS: tuple[tuple[tuple[tuple[str, ...], ...], ...], ...] = (
+    (
+        (("n |n|", "n^2"), ("u^3",), ("v r",), ("n^2 delta^2",)),
+        (("v^3",), ("u r",), ("u^2 delta", "n |n| delta")),
+        (("r^3",), ("u v", "v |u|"), ("u^2 delta", "n |n| delta")),
+    ),
+    (
+        (("u",), ("u^3",), ("v^2", "r^2"), ("n", "u n"), ("u^2 delta^2",)),
+        (("v",), ("v^2 r", "v r^2"), ("u r",), ("u delta", "delta^3")),
+        (("r",), ("v^2 r", "v r^2", "v^3"), ("u v",), ("n^2 delta",)),
+    ),
+)
+"""Terms of equations with cubic terms by kind and axis: one of each group.
+
+The first kind has the cubic damping of document 002 and the rudder drag in the slipstream of
+document 001; the second has terms of the third-order expansion of Abkowitz (1964).
+"""
 OVER = (
     ("u inv(n)", "u^2 inv(n)", "inv(n)"),
     ("v inv(n)", "u v inv(n)", "delta inv(n)"),
@@ -111,19 +128,26 @@ OVER = (
 
 
 def draw_ship(
-    seed: int, *, count: int = 3000, step: float = 0.1, noise: float = 0.0, ratios: bool = False
+    seed: int,
+    *,
+    count: int = 3000,
+    step: float = 0.1,
+    noise: float = 0.0,
+    ratios: bool = False,
+    terms: tuple[tuple[tuple[str, ...], ...], ...] = SHIP,
 ) -> Drawn:
     """Return the equations of a random ship with propeller and rudder, and a record of it.
 
     Each term makes up between 0.3 and 1 standard deviation of its target. With `ratios` each
     equation has one of `OVER`, and revolutions stay ahead: terms with |n| are then those with n.
+    `terms` has the groups of terms of each axis, of which an equation has one each.
     """
     random = np.random.default_rng(seed)
     z = record(random, count, step, astern=True)
     z[:, 3] += 7.0 * ratios
     targets = []
     truth = []
-    for groups, over in zip(SHIP, OVER, strict=True):
+    for groups, over in zip(terms, OVER, strict=True):
         if ratios:
             told = [tuple(term for term in group if "|n|" not in term) for group in groups]
             groups = (*told, over)

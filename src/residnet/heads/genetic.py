@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, final
 
 import torch
@@ -12,7 +13,7 @@ from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, Features
 from residnet.physics.term_library import TermLibrary
-from residnet.physics.terms import CandidatesConfig, parse_term
+from residnet.physics.terms import CandidatesConfig, CandidateTerm, parse_term
 from residnet.regression.estimator import Solution
 from residnet.regression.expressions import (
     CoefficientTable,
@@ -21,6 +22,7 @@ from residnet.regression.expressions import (
     format_product,
 )
 from residnet.regression.genetic import GeneticEquations
+from residnet.regression.lack_of_fit import estimate_lack_of_fit, probe_families
 from residnet.regression.sparse import SparseRegression
 
 if TYPE_CHECKING:
@@ -66,13 +68,59 @@ class GeneticHead(EquationHead):
             FitError: if the data do not determine an equation.
             UsageError: if DEAP is not installed.
         """
-        return GeneticEquations(self.config, self._sparse_search_terms(samples)).fit(
+        solutions = GeneticEquations(self.config, self._sparse_search_terms(samples)).fit(
             self.features.select_clamped(samples.z),
             samples.target,
             samples.group,
             names=self.features.names,
             outputs=self.output_names,
         )
+        return [self._add_lack_of_fit(solution, samples) for solution in solutions]
+
+    def _add_lack_of_fit(self, solution: Solution, samples: Samples) -> Solution:
+        """Add the lack of fit of the usual candidates and the terms of a solution to its notes."""
+        z = self.features.select_clamped(samples.z)
+        solution_library = ExpressionLibrary(self.config.evolution.nesting)
+        prefix = "library."
+        solution_library.load_state_dict(
+            {
+                name.removeprefix(prefix): value
+                for name, value in solution.state.items()
+                if name.startswith(prefix)
+            }
+        )
+        sparse_library, is_nonsingular, _ = self._sparse_candidates(z)
+        columns = torch.cat((sparse_library(z)[:, is_nonsingular], solution_library(z)), dim=1)
+        families, probes = probe_families(z.numpy(), self.features.names)
+        equations = {
+            output: notes
+            | {
+                "lack_of_fit": estimate_lack_of_fit(
+                    columns.numpy(),
+                    samples.target[:, k].numpy(),
+                    families,
+                    probes,
+                )
+            }
+            for k, (output, notes) in enumerate(solution.notes["equations"].items())
+        }
+        return replace(solution, notes=solution.notes | {"equations": equations})
+
+    def _sparse_candidates(
+        self, z: Tensor
+    ) -> tuple[TermLibrary, Tensor, tuple[CandidateTerm, ...]]:
+        """Return the usual candidates of sparse regression.
+
+        Returns:
+            The library of J terms, whether each has no divisor near zero in the channels z [J], and
+            the degrees and complexities of the terms.
+        """
+        candidate_settings = CandidatesConfig()
+        names = self.features.names
+        candidates = candidate_settings.generate_candidates(names)
+        library = TermLibrary([candidate.term for candidate in candidates], names)
+        is_nonsingular = candidate_settings.find_nonsingular_terms(library.terms, names, z)
+        return library, is_nonsingular, candidates
 
     def _sparse_search_terms(self, samples: Samples) -> list[list[Factors]]:
         """Return the factors of the terms that a sparse search selects for each output."""
@@ -80,11 +128,8 @@ class GeneticHead(EquationHead):
         names = self.features.names
         if search_settings is None:
             return []
-        candidate_settings = CandidatesConfig()
         z = self.features.select_clamped(samples.z)
-        candidates = candidate_settings.generate_candidates(names)
-        library = TermLibrary([candidate.term for candidate in candidates], names)
-        is_nonsingular = candidate_settings.find_nonsingular_terms(library.terms, names, z)
+        library, is_nonsingular, candidates = self._sparse_candidates(z)
         estimator = SparseRegression(
             search_settings,
             degrees=[candidate.degree for candidate in candidates],

@@ -23,6 +23,7 @@ from residnet.regression.equation_rows import (
 )
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.expressions import format_equation, format_sum, terms_to_sympy
+from residnet.regression.lack_of_fit import estimate_lack_of_fit, probe_families
 from residnet.regression.sparse import SparseRegression
 
 if TYPE_CHECKING:
@@ -274,11 +275,12 @@ class SymbolicHead(EquationHead):
         samples_with_past = self._segment_samples(samples)
         delay_steps, delay_notes = self._fit_delay(samples_with_past)
         gammas = _GAMMAS if self.config.choose == "free_run" else ()
-        solutions = self._fit_equations(
-            samples_with_past.with_delay(delay_steps, self.line.delayed_index.numpy()), gammas
-        )
+        delayed_samples = samples_with_past.with_delay(delay_steps, self.line.delayed_index.numpy())
+        solutions = self._fit_equations(delayed_samples, gammas)
+        lack_of_fit = self._estimate_lack_of_fit(delayed_samples)
         return [
-            self._add_delay_and_text(solution, delay_steps, delay_notes) for solution in solutions
+            self._add_delay_and_text(solution, delay_steps, delay_notes, lack_of_fit)
+            for solution in solutions
         ]
 
     def _segment_samples(self, samples: Samples) -> SegmentedSamples:
@@ -318,6 +320,32 @@ class SymbolicHead(EquationHead):
         return estimator.fit(
             design_matrix, targets, names=self.library.terms, outputs=self.output_names
         )
+
+    def _estimate_lack_of_fit(self, samples: SegmentedSamples) -> dict[str, dict[str, float]]:
+        """Return the lack of fit of all candidates of each axis by family of functions."""
+        with torch.no_grad():
+            term_values = self.candidate_values(torch.from_numpy(samples.features)).numpy()
+        families, probes = probe_families(samples.features, self.features.names)
+        # rows of the weak form are linear in the columns, so probes are integrated like terms
+        regression_rows = self.config.estimator.build_rows(
+            RegressionRows(
+                np.concatenate((term_values, *probes), axis=1), samples.target, samples.segment
+            ),
+            samples.time_step,
+        )
+        n_terms = term_values.shape[1]
+        probe_ends = n_terms + np.cumsum([columns.shape[1] for columns in probes])
+        probe_columns = np.split(regression_rows.x, [n_terms, *probe_ends[:-1]], axis=1)[1:]
+        is_allowed = self._allowed_terms(samples).numpy()
+        return {
+            output: estimate_lack_of_fit(
+                regression_rows.x[:, :n_terms][:, is_allowed[:, k]],
+                regression_rows.y[:, k],
+                families,
+                probe_columns,
+            )
+            for k, output in enumerate(self.output_names)
+        }
 
     def _allowed_terms(self, samples: SegmentedSamples) -> Tensor:
         """Return the mask of the candidates of each axis, [J, n]."""
@@ -382,9 +410,13 @@ class SymbolicHead(EquationHead):
         return tried_delays[-1], {"delay": notes}
 
     def _add_delay_and_text(
-        self, solution: Solution, delay_steps: int, delay_notes: dict[str, Any]
+        self,
+        solution: Solution,
+        delay_steps: int,
+        delay_notes: dict[str, Any],
+        lack_of_fit: dict[str, dict[str, float]],
     ) -> Solution:
-        """Add the delay to the state of a solution, and the written equations to its notes."""
+        """Add the delay to the state of a solution; equations and lack of fit to its notes."""
         equations = {
             name: self._format_solution(
                 name,
@@ -392,6 +424,7 @@ class SymbolicHead(EquationHead):
                 delay_steps,
             )
             | notes
+            | {"lack_of_fit": lack_of_fit[name]}
             for name, notes in solution.notes["equations"].items()
         }
         delay_state = {"line.steps": torch.full((1,), float(delay_steps), dtype=torch.float64)}

@@ -72,6 +72,8 @@ class EquationNotes(OpenRecord):
         same_as_simpler: terms that equal a combination of simpler ones on the data.
         cannot_tell_apart: candidates that could replace each term.
         undecided: largest share of the target that each omitted candidate may explain.
+        lack_of_fit: share of the mean square of the residual of all candidates that functions of
+            the named channels predict in cross-validation.
         generation: generation of the selected equation, of a symbolic regression.
         history: all generations; empty for other estimators.
     """
@@ -84,6 +86,7 @@ class EquationNotes(OpenRecord):
     same_as_simpler: dict[str, dict[str, float]] = Field(default_factory=dict)
     cannot_tell_apart: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     undecided: dict[str, float] = Field(default_factory=dict)
+    lack_of_fit: dict[str, float] = Field(default_factory=dict)
     generation: int = 0
     history: tuple[GenerationRow, ...] = ()
 

@@ -160,15 +160,18 @@ class CandidatesConfig(Config):
 
     Attributes:
         motions: channels of the motion; those that the model does not have are ignored.
-        motion_degree: maximum degree of the products of motions.
+        motion_degree: maximum degree of the products of motions. If null, it is 2; without
+            `input_degree` and `coupling`, the products of degree 3 without magnitudes are included,
+            as in the third-order expansion of Abkowitz (1964): `u^3`, `v^2 r`, `r^3`.
         magnitudes: whether magnitudes of factors are included, as in `u|u|`.
         inputs: inputs of the products; null for all that are neither motions nor angles.
         input_degree: maximum degree of the products of inputs without magnitudes. If null, it is 1
             with `coupling`; otherwise the products are those of propellers and rudders: degrees one
             and two with magnitudes as in `n|n|`, times u and |u|; those of one input also times u^2
-            and `u|u|` as in `u^2 delta`; squares of one input times another as in `n|n| delta`; and
-            ratios of products of motions over an input and of one input over another. A head uses
-            the ratios whose divisor is not near zero in its data.
+            and `u|u|` as in `u^2 delta`; squares of one input times another or its square, as in
+            `n|n| delta` and `n^2 delta^2`; cubes as in `delta^3`; and ratios of products of motions
+            over an input and of one input over another. A head uses the ratios whose divisor is not
+            near zero in its data.
         angles: inputs whose sine and cosine are used.
         coupling: motions by which products of inputs are multiplied.
         coupling_degree: maximum degree of these factors.
@@ -176,7 +179,7 @@ class CandidatesConfig(Config):
     """
 
     motions: tuple[str, ...] = VELOCITY_NAMES
-    motion_degree: int = Field(default=2, ge=0, le=4)
+    motion_degree: int | None = Field(default=None, ge=0, le=4)
     magnitudes: bool = True
     inputs: tuple[str, ...] | None = None
     input_degree: int | None = Field(default=None, ge=0, le=4)
@@ -203,7 +206,10 @@ class CandidatesConfig(Config):
                 raise ConfigError(
                     f"candidates: '{name}' is not a channel of the model{suggest_name(name, names)}"
                 )
-        motion_products = _products_up_to(motions, self.motion_degree, magnitudes=self.magnitudes)
+        motion_degree = 2 if self.motion_degree is None else self.motion_degree
+        motion_products = _products_up_to(motions, motion_degree, magnitudes=self.magnitudes)
+        if self.motion_degree is None and self._has_ship_inputs:
+            motion_products += _products_of_degree(motions, 3)
         angle_functions = [
             "",
             *(f"{function}({angle})" for angle in angles for function in ("sin", "cos")),
@@ -215,9 +221,14 @@ class CandidatesConfig(Config):
         ]
         return rank_candidates(dict.fromkeys(term_text or "1" for term_text in term_texts), names)
 
+    @property
+    def _has_ship_inputs(self) -> bool:
+        """Whether the products of inputs are those of propellers and rudders."""
+        return self.input_degree is None and not self.coupling
+
     def _input_products(self, motions: Sequence[str], inputs: Sequence[str]) -> list[str]:
         """Return the products of inputs and coupled motions."""
-        if self.input_degree is None and not self.coupling:
+        if self._has_ship_inputs:
             return _ship_input_products(motions, inputs, magnitudes=self.magnitudes)
         degree = 1 if self.input_degree is None else self.input_degree
         coupling_products = _products_up_to(
@@ -283,14 +294,17 @@ def _ship_input_products(
             _products_up_to([second_input], 1, magnitudes=magnitudes)[1:],
         )
     ]
-    # rudder lift in the slipstream: squared revolutions times an angle
+    # rudder lift and drag in the slipstream: squared revolutions times an angle or its square
     squares = [
-        f"{squared_input} {other_input}"
+        f"{squared_input} {factor}"
         for name in inputs
         for squared_input in ([f"{name}^2", f"{name} |{name}|"] if magnitudes else [f"{name}^2"])
         for other_input in inputs
         if other_input != name
+        for factor in (other_input, f"{other_input}^2")
     ]
+    # stall of a rudder, saturation of a thruster
+    cubes = [f"{name}^3" for name in inputs]
     # advance ratio and similar quotients, with the protected division `inv`
     ratios = [
         f"{numerator} inv({name})".strip()
@@ -305,6 +319,7 @@ def _ship_input_products(
         *_combine_products(speed_squares, single_input_products),
         *_combine_products(speed_products, input_pairs),
         *squares,
+        *cubes,
         *ratios,
     ]
 
@@ -334,6 +349,12 @@ def rank_candidates(terms: Iterable[str], names: Sequence[str]) -> tuple[Candida
         )
         ranked.append(CandidateTerm(term, degree, complexity))
     return tuple(sorted(ranked, key=lambda candidate: candidate[1:]))
+
+
+def _products_of_degree(names: Sequence[str], degree: int) -> list[str]:
+    """Return the products of exactly one degree, without magnitudes."""
+    lower_products = set(_products_up_to(names, degree - 1))
+    return [text for text in _products_up_to(names, degree) if text not in lower_products]
 
 
 def _products_up_to(names: Sequence[str], degree: int, *, magnitudes: bool = False) -> list[str]:

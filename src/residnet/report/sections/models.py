@@ -296,6 +296,12 @@ def equation_remarks(notes: FitNotes) -> list[str]:
                 f"{name}: these terms were left out, but within two standard errors they could"
                 f" make up the stated share of the target: {_join_truncated(terms)}."
             )
+        for channels, share in equation.lack_of_fit.items():
+            sentences.append(
+                f"{name}: no candidate explains {100 * share:.0f} % of the mean square of the"
+                f" residual, which functions of {channels} predict in cross-validation. Add terms"
+                " of these channels to `candidates: {extra: [...]}` of the head."
+            )
     if notes.unexcited:
         sentences.append(
             "These terms are 0 in all samples, so nothing is known of them:"
