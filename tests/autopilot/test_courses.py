@@ -25,10 +25,10 @@ from residnet.autopilot.courses.config import (
     smallest_turn,
 )
 from residnet.autopilot.courses.course_check import (
-    Protocol,
+    PassingRule,
     find_first_violation,
     find_passages,
-    first_counted_sample,
+    first_checked_sample,
 )
 from residnet.autopilot.courses.turns import TurnMaker, choose_time_step, simulate_steady_turn
 from residnet.autopilot.guidance import CourseGuidance, TrackKeeping
@@ -58,7 +58,7 @@ def vessel() -> SteeredPlant:
     return SteeredPlant(load_vessel("nomoto_oceanos").build())
 
 
-def plan_of(vessel: SteeredPlant, protocol: Protocol = "sides", **changes: Any) -> PlannedCourse:
+def plan_of(vessel: SteeredPlant, protocol: PassingRule = "sides", **changes: Any) -> PlannedCourse:
     wanted = WANTED.model_copy(update=changes)
     steady = smallest_turn(wanted, vessel, TURNING, LIMIT)
     return plan_course(wanted, protocol, vessel, TURNING, LIMIT, steady)
@@ -252,19 +252,19 @@ def test_going_away_from_where_a_course_begins_is_no_approach() -> None:
     """It begins within the circle, leaves it with the buoy on the wrong side, and comes back."""
     track = line((0.0, 0.0), (0.0, 40.0), (12.0, 40.0), (12.0, -20.0))
     (passage,) = find_passages(track, [buoy(1.0, 1.0)])
-    assert passage.passing_side == passage.side_at_min_distance == "port"
+    assert passage.buoy_side == passage.buoy_side_at_min_distance == "port"
     assert passage.min_distance == pytest.approx(11.0, abs=0.05)
     assert find_first_violation(track, [buoy(1.0, 1.0)], "sides", 5.0) is None
     fault = find_first_violation(track, [buoy(1.0, 1.0, "starboard")], "sides", 5.0)
     assert "not left to starboard" in str(fault)
     distance = np.hypot(*(track - (1.0, 1.0)).T)
-    begin = first_counted_sample(distance, 10.0)
+    begin = first_checked_sample(distance, 10.0)
     assert distance[begin] == pytest.approx(np.hypot(1.0, 39.0))
     # a circle that is never left is cut, and one that begins outside counts from the start
     track = line((0.0, 0.0), (0.0, 5.0))
-    assert first_counted_sample(np.hypot(*(track - (1.0, 1.0)).T), 10.0) == len(track)
+    assert first_checked_sample(np.hypot(*(track - (1.0, 1.0)).T), 10.0) == len(track)
     assert "is cut" in str(find_first_violation(track, [buoy(1.0, 1.0)], "sides", 5.0))
-    assert first_counted_sample(np.hypot(*(line((0, 0), (0, 30)) - (0.0, 20.0)).T), 5.0) == 0
+    assert first_checked_sample(np.hypot(*(line((0, 0), (0, 30)) - (0.0, 20.0)).T), 5.0) == 0
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.25, 0.5])
@@ -290,7 +290,7 @@ def test_each_buoy_is_judged_in_its_turn_and_its_distance_over_the_whole_course(
     """The track comes by the first buoy again, nearer and with it on the other side."""
     track = line((0.0, 0.0), (60.0, 0.0), (60.0, 30.0), (0.0, 30.0), (0.0, 10.0), (60.0, 10.0))
     first, second = find_passages(track, [buoy(30.0, east, radius=4.0) for east in (8.0, 25.0)])
-    assert (first.passing_side, second.passing_side) == ("starboard", "starboard")
-    assert (first.side_at_min_distance, first.sample) == ("port", pytest.approx(120, abs=1))
+    assert (first.buoy_side, second.buoy_side) == ("starboard", "starboard")
+    assert (first.buoy_side_at_min_distance, first.sample) == ("port", pytest.approx(120, abs=1))
     assert first.min_distance == pytest.approx(2.0, abs=1e-6)
     assert first.distance == pytest.approx(8.0, abs=1e-6)

@@ -530,7 +530,7 @@ def build_course_row(
         metrics |= {"entered": n_cleared}
     else:
         n_on_correct_side = sum(
-            closest_passage.passing_side == buoy.leave_to
+            closest_passage.buoy_side == buoy.leave_to
             for closest_passage, buoy in zip(closest_passages, buoys, strict=True)
         )
         metrics |= {"right_side": n_on_correct_side, "clear": n_cleared, "clearance": min(margins)}

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from pydantic import Field
 
-from residnet.autopilot.courses.course_check import BuoyConfig, Protocol
+from residnet.autopilot.courses.course_check import BuoyConfig, PassingRule
 from residnet.autopilot.courses.course_plan import Course, CourseRequest, find_quickest_course
 from residnet.autopilot.courses.outline import Circle
 from residnet.autopilot.courses.turns import (
@@ -101,7 +101,7 @@ class PlannedCourse:
         shortest: shortest course without margins, with arcs of the radius of that turn.
     """
 
-    protocol: Protocol
+    protocol: PassingRule
     course: Course
     buoys: tuple[BuoyConfig, ...]
     steady: SteadyTurn
@@ -147,7 +147,7 @@ def buoy_feasibility(
 
 def plan_course(
     config: BuoyCourseConfig,
-    protocol: Protocol,
+    protocol: PassingRule,
     vessel: SteeredVessel,
     nomoto: NomotoModel,
     limit: float,
@@ -215,7 +215,7 @@ def plan_course(
 
 def _clearance_circles(
     config: BuoyCourseConfig,
-    protocol: Protocol,
+    protocol: PassingRule,
     buoys: tuple[BuoyConfig, ...],
     min_radius: float,
     margin: float,

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from residnet.autopilot.courses.course_check import BuoyConfig, Protocol, find_first_violation
+from residnet.autopilot.courses.course_check import BuoyConfig, PassingRule, find_first_violation
 from residnet.autopilot.courses.fitting import RouteProblem, RouteSolution
 from residnet.autopilot.courses.outline import RINGS, Circle, RouteSearch, TurnRoom
 from residnet.autopilot.courses.turns import (
@@ -169,7 +169,7 @@ class CourseRequest:
         heading: start heading in rad; None to start on the first leg.
         circles: circles of the buoys in order, including margins.
         buoys: buoys without margins, for the check of the finished course.
-        protocol: rule for passing buoys, see `course_check.Protocol`.
+        protocol: rule for passing buoys, see `course_check.PassingRule`.
         turns: turn tables of the vessel.
         max_offset: largest deviation of the vessel from the course in m.
     """
@@ -178,7 +178,7 @@ class CourseRequest:
     heading: float | None
     circles: tuple[Circle, ...]
     buoys: tuple[BuoyConfig, ...]
-    protocol: Protocol
+    protocol: PassingRule
     turns: TurnTables
     max_offset: float = 0.0
 

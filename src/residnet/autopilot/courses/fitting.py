@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import linprog
 
-from residnet.autopilot.courses.course_check import first_counted_sample
+from residnet.autopilot.courses.course_check import first_checked_sample
 from residnet.autopilot.courses.outline import Circle
 from residnet.autopilot.courses.turns import LEG, POINTS, Array, Route, RouteGeometry
 
@@ -252,11 +252,11 @@ class RouteProblem:
             ]
 
     def _first_counted_point(self, points: np.ndarray, circle: Circle) -> int:
-        """Return the first point that counts for a circle, see `first_counted_sample`."""
+        """Return the first point that counts for a circle, see `first_checked_sample`."""
         if circle.turn_sign == 0 or abs(circle.centre - points[0]) >= circle.radius:
             return 0
         return min(
-            first_counted_sample(np.abs(points - circle.centre), circle.radius), len(points) - 2
+            first_checked_sample(np.abs(points - circle.centre), circle.radius), len(points) - 2
         )
 
     def _constrained_parts(self, points: np.ndarray) -> list[tuple[int, slice]]:

@@ -11,7 +11,7 @@ import torch
 from pydantic import Field, model_validator
 
 from residnet.autopilot.courses.config import BuoyCourseConfig, plan_course, smallest_turn
-from residnet.autopilot.courses.course_check import Protocol
+from residnet.autopilot.courses.course_check import PassingRule
 from residnet.autopilot.guidance import AnyLineOfSight
 from residnet.autopilot.heading.steering_variation import Vessels
 from residnet.autopilot.tasks.autopilot.config import AnyController, AutopilotConfig
@@ -110,7 +110,7 @@ class CourseTaskConfig(PackageTask, ComputingTask):
     peers: tuple[PartName, ...] = ("pid",)
     others: dict[PartName, AnyController] = Field(default_factory=dict)
     course: BuoyCourseConfig
-    protocols: tuple[Protocol, ...] = Field(default=("enter", "sides"), min_length=1)
+    protocols: tuple[PassingRule, ...] = Field(default=("enter", "sides"), min_length=1)
     integral: MetresPerSecond | None = Field(default=None, gt=0)
     line_of_sight: tuple[AnyLineOfSight, ...] = ()
     legs_change: Literal["circle", "wheel_over"] = "circle"

@@ -20,7 +20,7 @@ from residnet.autopilot.courses.config import (
     plan_course,
     smallest_turn,
 )
-from residnet.autopilot.courses.course_check import Protocol
+from residnet.autopilot.courses.course_check import PassingRule
 from residnet.autopilot.courses.turns import SteadyTurn
 from residnet.autopilot.evaluation import CourseRun, build_course_row, build_ensemble_row
 from residnet.autopilot.export import ExportedCoursePolicy
@@ -238,7 +238,7 @@ def load_policy(autopilot_run: AutopilotRun, name: str) -> HeadingPolicy:
 
 
 def plan_with_guidance(
-    config: CourseTaskConfig, autopilot_run: AutopilotRun, protocol: Protocol
+    config: CourseTaskConfig, autopilot_run: AutopilotRun, protocol: PassingRule
 ) -> tuple[PlannedCourse, CourseGuidance]:
     """Return the plan of a protocol, and the guidance along it.
 
@@ -473,7 +473,7 @@ _MAX_PLAN_DEVIATION = 1e-6
 
 
 def _replan_and_verify(
-    config: CourseTaskConfig, autopilot_run: AutopilotRun, run: RunFolder, protocol: Protocol
+    config: CourseTaskConfig, autopilot_run: AutopilotRun, run: RunFolder, protocol: PassingRule
 ) -> tuple[PlannedCourse, CourseGuidance]:
     planned_course, guidance = plan_with_guidance(config, autopilot_run, protocol)
     new_plan = tabulate_plan(planned_course)
