@@ -1,4 +1,8 @@
-"""Typed contents of fit.json, the notes on the fit of one model."""
+"""Typed contents of fit.json, the notes on the fit of one model.
+
+Baselines and residual models (called heads: they add a residual to the accelerations of a baseline)
+write these notes. An `alias` is the key in the file.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ Hyperparameter = float | str | tuple[float | str, ...]
 
 
 class OpenRecord(Record):
-    """A JSON object with some known keys; heads and baselines may add others."""
+    """A JSON object with some known keys; a head or a baseline may add keys of its own."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -36,28 +40,29 @@ class EpochRow(OpenRecord):
     """An epoch of the training of a network.
 
     Attributes:
-        epoch: number from 0 on.
-        stage: number of the training stage, from 0 on.
+        epoch: index of the epoch, starting at 0.
+        stage: index of the training stage, starting at 0.
         loss: mean training loss of the epoch.
-        validation: free-run error over the validation logs; None if it was not computed.
+        validation_error: free-run error over the validation logs; None if it was not computed.
     """
 
     epoch: float
     stage: float = 0.0
     loss: float | None = None
-    validation: float | None = None
+    validation_error: float | None = Field(default=None, alias="validation")
 
 
 class GenerationRow(OpenRecord):
     """The best individual of a generation of a symbolic regression.
 
     Attributes:
-        train: mean square error over the target's mean square, on the samples that breed.
-        validation: the same on the samples that validate.
+        training_error: mean square error divided by the mean square of the target, on the training
+            samples.
+        validation_error: the same ratio on the validation samples.
     """
 
-    train: float
-    validation: float
+    training_error: float = Field(alias="train")
+    validation_error: float = Field(alias="validation")
 
 
 class EquationNotes(OpenRecord):
@@ -67,13 +72,16 @@ class EquationNotes(OpenRecord):
         text: the equation.
         error_share: root mean square error over the root mean square target.
         exact: whether the error is at the level of rounding errors.
-        candidates: number of candidate terms that differ on the data.
+        candidates: number of candidate terms that are linearly independent on the data.
         condition: condition number of the candidates.
-        same_as_simpler: terms that equal a combination of simpler ones on the data.
-        cannot_tell_apart: candidates that could replace each term.
-        undecided: largest share of the target that each omitted candidate may explain.
-        lack_of_fit: share of the mean square of the residual of all candidates that functions of
-            the named channels predict in cross-validation.
+        linear_dependencies: for each term that equals a linear combination of simpler terms on the
+            data, the coefficients of this combination by term.
+        indistinguishable_terms: for each term of the equation, the candidates that explain the data
+            equally well in its place.
+        max_omitted_share: for each omitted candidate that may matter, the largest share of the
+            target that it could explain within two standard errors of its coefficient.
+        lack_of_fit: fraction of the mean square of the residual of all candidates that functions of
+            the named channels predict in cross-validation, by names of channels.
         generation: generation of the selected equation, of a symbolic regression.
         history: all generations; empty for other estimators.
     """
@@ -83,16 +91,20 @@ class EquationNotes(OpenRecord):
     exact: bool = False
     candidates: int = 0
     condition: float = 1.0
-    same_as_simpler: dict[str, dict[str, float]] = Field(default_factory=dict)
-    cannot_tell_apart: dict[str, tuple[str, ...]] = Field(default_factory=dict)
-    undecided: dict[str, float] = Field(default_factory=dict)
+    linear_dependencies: dict[str, dict[str, float]] = Field(
+        default_factory=dict, alias="same_as_simpler"
+    )
+    indistinguishable_terms: dict[str, tuple[str, ...]] = Field(
+        default_factory=dict, alias="cannot_tell_apart"
+    )
+    max_omitted_share: dict[str, float] = Field(default_factory=dict, alias="undecided")
     lack_of_fit: dict[str, float] = Field(default_factory=dict)
     generation: int = 0
     history: tuple[GenerationRow, ...] = ()
 
 
 class TrainingStageNotes(OpenRecord):
-    """A stage of training over free runs.
+    """A stage of the training in which the loss is the error of free runs.
 
     Attributes:
         horizon: length of the free runs in s.
@@ -105,10 +117,10 @@ class TrainingNotes(OpenRecord):
     """The training settings of a network.
 
     Attributes:
-        multi_step: stages over free runs.
+        simulation_stages: stages in which the loss is the error of free runs, in their order.
     """
 
-    multi_step: tuple[TrainingStageNotes, ...] = ()
+    simulation_stages: tuple[TrainingStageNotes, ...] = Field(default=(), alias="multi_step")
 
 
 class InputDelay(OpenRecord):
@@ -122,27 +134,29 @@ class InputDelay(OpenRecord):
 
 
 class RefitNotes(OpenRecord):
-    """The refit of a baseline through rollouts.
+    """Re-estimation of the parameters of a baseline that minimises the error of free runs.
 
     Attributes:
-        at_rest: indices of the parameters that are held at zero.
+        parameters_fixed_at_zero: indices of the parameters that are fixed at zero.
     """
 
-    at_rest: tuple[int, ...] = ()
+    parameters_fixed_at_zero: tuple[int, ...] = Field(default=(), alias="at_rest")
 
 
 class SteadyConstraint(OpenRecord):
-    """The linear relation between a steady state and the force that drives it.
+    """The linear relation between a steady velocity and the force that drives it.
+
+    It is Phi of Woo et al. 2018, Table 1: velocity = gain * force + bias.
 
     Attributes:
-        phi: steady state per unit of force.
-        phi_error: its standard error.
-        bias: steady state without force.
-        bias_error: its standard error.
+        gain: steady velocity per unit of force.
+        gain_error: standard error of the gain.
+        bias: steady velocity without force.
+        bias_error: standard error of the bias.
     """
 
-    phi: float
-    phi_error: float
+    gain: float = Field(alias="phi")
+    gain_error: float = Field(alias="phi_error")
     bias: float = 0.0
     bias_error: float = 0.0
 
@@ -153,52 +167,54 @@ class FitNotes(FileRecord):
     Attributes:
         seconds: duration of the fit in s.
         samples: number of training samples.
-        validation: mean free-run error over the validation logs; None if it is not finite.
+        validation_error: mean free-run error over the validation logs; None if it is not finite.
         validation_diverged: number of diverged validation windows.
-        baseline: name of the baseline below a head.
+        baseline: name of the baseline to which a head adds its residual.
         members: members of an ensemble.
         parameters: number of fitted parameters.
-        terms: number of basis functions, for each axis where it differs.
-        order: number of latent variables, for each axis where it differs.
-        penalty: penalty of a regression, for each axis where it differs.
+        n_terms: number of basis functions; one number per axis if the axes differ.
+        order: number of latent variables; one number per axis if the axes differ.
+        penalty: penalty of a regression; one value per axis if the axes differ.
         epochs: number of training epochs.
-        training: settings of the training; None for other models.
-        curve: training by epoch.
+        training: training settings of a network; None for other models.
+        training_history: losses and validation errors by epoch.
         coefficients: coefficients of all axes.
         equations: equation of each acceleration.
         unexcited: candidate terms that are zero in all samples.
-        delay: delay of the inputs of an equation; None without one.
-        refit: refit through rollouts; None without one.
-        prior: standard deviation of the prior of a refit.
-        feeding: axis and term of the parameters that a refit holds at zero, because their sign
-            would feed energy.
-        open: axis and term of the parameters that the data do not determine.
-        steady_states: means of the settled parts of manoeuvres by state and force.
-        steady_constraints: relation of each steady state to its force.
+        delay: delay of the inputs of an equation; None without a delay.
+        refit: re-estimation by the error of free runs; None without a refit.
+        prior: weight of the least-squares solution as the prior of a refit, as a share of its own
+            information; see `RefitConfig`.
+        energy_generating_terms: axis and term of the parameters that a refit fixes at zero, because
+            their estimates would add energy to the motion (negative damping).
+        undetermined_parameters: axis and term of the parameters that the data do not determine.
+        steady_states: for each velocity and force, its mean in every manoeuvre with constant
+            inputs, over the part in which the motion is steady.
+        steady_constraints: by the name of a velocity: its relation to the force that drives it.
     """
 
     model_config = ConfigDict(extra="allow")
 
     seconds: float | None = None
     samples: int | None = None
-    validation: float | None = None
+    validation_error: float | None = Field(default=None, alias="validation")
     validation_diverged: int = 0
     baseline: str = "baseline"
     members: tuple[str, ...] = ()
     parameters: float | None = None
-    terms: Hyperparameter | None = None
+    n_terms: Hyperparameter | None = Field(default=None, alias="terms")
     order: Hyperparameter | None = None
     penalty: Hyperparameter | None = None
     epochs: int | None = None
     training: TrainingNotes | None = None
-    curve: tuple[EpochRow, ...] = ()
+    training_history: tuple[EpochRow, ...] = Field(default=(), alias="curve")
     coefficients: tuple[CoefficientRow, ...] = ()
     equations: dict[str, EquationNotes] = Field(default_factory=dict)
     unexcited: tuple[str, ...] = ()
     delay: InputDelay | None = None
     refit: RefitNotes | None = None
     prior: float | None = None
-    feeding: tuple[tuple[str, str], ...] = ()
-    open: tuple[tuple[str, str], ...] = ()
+    energy_generating_terms: tuple[tuple[str, str], ...] = Field(default=(), alias="feeding")
+    undetermined_parameters: tuple[tuple[str, str], ...] = Field(default=(), alias="open")
     steady_states: dict[str, tuple[float, ...]] = Field(default_factory=dict)
     steady_constraints: dict[str, SteadyConstraint] = Field(default_factory=dict)

@@ -20,6 +20,8 @@ from residnet.quality.statistics import LogStatistics, interpolate_gaps, moving_
 
 _MAX_CONDITION_NUMBER = 30.0
 """Condition number from which collinearity is harmful (Belsley, Kuh and Welsch 1980)."""
+# In the checks below `make_finding` is the registered check itself: called with a text, it creates
+# a finding with the code, severity and action of the check as defaults.
 
 
 @check("excitation", "range", "note")
@@ -31,13 +33,13 @@ def report_ranges(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
         lower = float(values.min())
         upper = float(values.max())
         std = float(values.std())
-        figures = {"min": lower, "max": upper, "std": std}
+        statistics = {"min": lower, "max": upper, "std": std}
         if std <= 1e-6 * max(abs(lower), abs(upper)):
             text = (
                 f"{name} is constant at {format_quantity(lower, unit)}: its effect cannot be"
                 " identified from this log only"
             )
-            yield make_finding(text, figures, code="constant")
+            yield make_finding(text, statistics, code="constant")
             continue
         text = (
             f"{name} from {format_quantity(lower, unit)} to {format_quantity(upper, unit)},"
@@ -52,27 +54,29 @@ def report_ranges(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
                 )
                 ** 2
             )
+            # bandwidth: frequency below which lies 95 % of the power
             cumulative_power = np.cumsum(power_spectrum)
-            band_index = 1 + np.searchsorted(cumulative_power, 0.95 * cumulative_power[-1])
-            figures["band"] = float(band_index / (len(subsample) * log.sampling_interval))
-            text += f", 95 % of its power below {figures['band']:.3g} Hz"
-        yield make_finding(text, figures)
+            bandwidth_index = 1 + np.searchsorted(cumulative_power, 0.95 * cumulative_power[-1])
+            statistics["band"] = float(bandwidth_index / (len(subsample) * log.sampling_interval))
+            text += f", 95 % of its power below {statistics['band']:.3g} Hz"
+        yield make_finding(text, statistics)
 
 
-def find_rest(log: LogStatistics) -> np.ndarray:
-    """Return [T] bool: samples whose motion averaged over two seconds is within the noise."""
+def find_samples_at_rest(log: LogStatistics) -> np.ndarray:
+    """Return [T] bool: samples at which the speed and the yaw rate, averaged over 2 s, are small.
+
+    A mean is small if it is below 3 % of its 95 % quantile over the log, or below four standard
+    errors of a mean of white noise.
+    """
     n_samples = max(round(2.0 / log.sampling_interval), 5)
     is_at_rest = np.ones(len(log), dtype=bool)
     speeds = np.hypot(moving_average(log["u"], n_samples), moving_average(log["v"], n_samples))
     yaw_rates = np.abs(moving_average(log["r"], n_samples))
     noise_levels = np.hypot(log.noise_std("u"), log.noise_std("v")), log.noise_std("r")
     for values, noise_level in zip((speeds, yaw_rates), noise_levels, strict=True):
-        # threshold: the averaged noise, bounded by shares of the speed that this vessel reaches
-        high_level = nan_quantiles(values, 0.95)[0]
-        averaged_noise = 4.0 * noise_level / np.sqrt(n_samples)
-        is_at_rest &= values < min(
-            max(0.03 * high_level, averaged_noise), max(0.2 * high_level, averaged_noise)
-        )
+        quantile_95 = nan_quantiles(values, 0.95)[0]
+        standard_error = noise_level / np.sqrt(n_samples)
+        is_at_rest &= values < max(0.03 * quantile_95, 4.0 * standard_error)
     return is_at_rest
 
 
@@ -82,9 +86,9 @@ def find_rest(log: LogStatistics) -> np.ndarray:
     fix="exclude these parts: they hold noise only",
     required_channels=("u", "v", "r"),
 )
-def check_rest(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+def check_samples_at_rest(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report parts of a log in which the vessel is at rest."""
-    is_at_rest = find_rest(log)
+    is_at_rest = find_samples_at_rest(log)
     starts, stops = find_runs(is_at_rest)
     rest_share = float(is_at_rest.mean())
     durations = log.t[stops - 1] - log.t[starts]
@@ -96,18 +100,18 @@ def check_rest(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
             f"the vessel is at rest for {format_share(rest_share)} of the time, at most"
             f" {longest_duration:.1f} s without a break from t = {start_time:.2f} s"
         )
-        level: Level = "will mislead" if rest_share > 0.1 else "note"
+        severity: Level = "will mislead" if rest_share > 0.1 else "note"
         yield make_finding(
             text,
             {"share": rest_share, "longest": longest_duration, "t": start_time},
-            level=level,
+            level=severity,
             sample_mask=is_at_rest,
         )
 
 
 @check("excitation", "slow", "note", "there is little to learn there", required_channels=("u", "v"))
 def check_slow_motion(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report parts of a log at less than a tenth of the usual speed."""
+    """Report parts of a log slower than a tenth of the 95 % quantile of the speed."""
     speed = np.hypot(log["u"], log["v"])
     slow_speed = 0.1 * nan_quantiles(speed, 0.95)[0]
     slow_share = float(np.mean(speed[np.isfinite(speed)] <= slow_speed))
@@ -120,14 +124,14 @@ def check_slow_motion(log: LogStatistics, make_finding: Check) -> Iterator[Findi
 
 
 @check("excitation", "condition", "note", on_subsample=True)
-def report_condition_number(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+def report_condition_number(subsample: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report collinear velocities and inputs of a log."""
     names = [
         name
-        for name in (*log.velocities, *log.inputs)
-        if log.std(name) > 1e-6 * np.nanmax(np.abs(log[name]))
+        for name in (*subsample.velocities, *subsample.inputs)
+        if subsample.std(name) > 1e-6 * np.nanmax(np.abs(subsample[name]))
     ]
-    columns = log.log.stack(names)
+    columns = subsample.log.stack(names)
     columns = columns[np.isfinite(columns).all(axis=1)]
     if len(names) < 2 or columns.shape[0] < 10 * len(names):
         return
@@ -151,7 +155,7 @@ def compute_condition_number(columns: np.ndarray, names: Sequence[str]) -> tuple
 
     Args:
         columns: [N, k].
-        names: of the columns.
+        names: names of the columns.
 
     Returns:
         Ratio of the largest to the smallest singular value, and up to three names with the largest

@@ -146,7 +146,7 @@ def steady_state_table(files: RunFiles) -> Table:
         cells: list[Any] = []
         constraint = notes.steady_constraints[state]
         estimates = (
-            (constraint.phi, constraint.phi_error),
+            (constraint.gain, constraint.gain_error),
             (constraint.bias, constraint.bias_error),
         )
         for (value, standard_error), number in zip(
@@ -188,7 +188,7 @@ def build_figures(files: RunFiles) -> list[Figure]:
         constraint = notes.steady_constraints[state]
         tau = np.array(states[force])
         force_limits = np.array([tau.min(), tau.max()])
-        fitted_line = factor * (constraint.phi * force_limits + constraint.bias)
+        fitted_line = factor * (constraint.gain * force_limits + constraint.bias)
         traces = {
             "points": (tau, factor * np.array(states[state])),
             "line": (force_limits, fitted_line),

@@ -82,7 +82,7 @@ def _baseline_section(run: RunFiles) -> Section | None:
 def _refit_text(model: str, notes: FitNotes) -> str:
     fixed_terms, unidentifiable_terms = (
         ", ".join(f"{term} in {axis.replace('_dot', '')}′" for axis, term in parameters)
-        for parameters in (notes.feeding, notes.open)
+        for parameters in (notes.energy_generating_terms, notes.undetermined_parameters)
     )
     text = (
         f"{model}: values and standard errors are those after the refit through rollouts. The"
@@ -176,14 +176,14 @@ def _head_section(run: RunFiles) -> Section | None:
     def parameter_count(model: str) -> str:
         notes = notes_or_defaults[model]
         n_parameters = notes.parameters
-        if not n_parameters and isinstance(notes.terms, float):
+        if not n_parameters and isinstance(notes.n_terms, float):
             # closed forms have a coefficient for each term and an offset, on each of three axes
-            n_parameters = 3 * (notes.terms + 1)
+            n_parameters = 3 * (notes.n_terms + 1)
         return whole_number(n_parameters) if n_parameters else DASH
 
     def error_cell(model: str) -> Cell:
         row = run.find_row(model, "validation", run.selection_protocol)
-        value = notes_or_defaults[model].validation if row is None else row.mean_nrmse
+        value = notes_or_defaults[model].validation_error if row is None else row.mean_nrmse
         has_diverged = row is not None and row.diverged > 0
         note = describe_divergence(row) if row else ""
         mark: CellMark = "best" if model == run.selected else "bad" if has_diverged else ""
@@ -241,7 +241,7 @@ def _complexity_text(settings: ModelSettings, notes: FitNotes) -> str:
     """Return the selected settings of a head and the size of its network."""
     head = settings.head or HeadSettings()
     formats: dict[str, Hyperparameter | None] = {
-        "{} basis functions": notes.terms,
+        "{} basis functions": notes.n_terms,
         "order {} (latent variables)": notes.order,
         "penalty {}": notes.penalty,
         "layers of {}": head.hidden,
@@ -280,18 +280,21 @@ def equation_remarks(notes: FitNotes) -> list[str]:
     sentences = []
     equal_terms: dict[str, dict[str, float]] = {}
     for name, equation in notes.equations.items():
-        equal_terms |= equation.same_as_simpler
+        equal_terms |= equation.linear_dependencies
         sentences.append(
             f"{name}: {equation.candidates} candidate terms differ on these data (condition"
             f" number {equation.condition:.1e}). {100 * equation.error_share:.2g} % of the"
             " target (RMS) stays unexplained."
         )
-        for term, alternatives in equation.cannot_tell_apart.items():
+        for term, alternatives in equation.indistinguishable_terms.items():
             sentences.append(
                 f"{name}: the data cannot tell {term} from {_join_truncated(alternatives)}."
             )
-        if equation.undecided:
-            terms = [f"{term} ({100 * share:.0f} %)" for term, share in equation.undecided.items()]
+        if equation.max_omitted_share:
+            terms = [
+                f"{term} ({100 * share:.0f} %)"
+                for term, share in equation.max_omitted_share.items()
+            ]
             sentences.append(
                 f"{name}: these terms were left out, but within two standard errors they could"
                 f" make up the stated share of the target: {_join_truncated(terms)}."
@@ -404,11 +407,14 @@ def evolution_figures(run: RunFiles) -> Iterator[Figure]:
             if not equation.history:
                 continue
             generations = np.arange(len(equation.history))
-            validation = np.array([row.validation for row in equation.history])
+            validation = np.array([row.validation_error for row in equation.history])
             selected_generation = [equation.generation]
             panel_curves.append(
                 {
-                    "train": (generations, np.array([row.train for row in equation.history])),
+                    "train": (
+                        generations,
+                        np.array([row.training_error for row in equation.history]),
+                    ),
                     "validation": (generations, validation),
                     "kept": (generations[selected_generation], validation[selected_generation]),
                 }
@@ -438,9 +444,12 @@ def learning_figure(run: RunFiles) -> Figure | None:
     reference = run.find_row(run.baseline, "validation", run.selection_protocol)
     for model in run.heads:
         notes = run.fit_notes(model)
-        if notes is None or not notes.curve:
+        if notes is None or not notes.training_history:
             continue
-        points = [(row.epoch + 1, row.stage, row.loss, row.validation) for row in notes.curve]
+        points = [
+            (row.epoch + 1, row.stage, row.loss, row.validation_error)
+            for row in notes.training_history
+        ]
         # a missing number becomes NaN, which is not drawn
         epoch, stage, loss, validation = np.array(points, dtype=float).T
         # each stage has a loss of its own
@@ -466,7 +475,7 @@ def learning_figure(run: RunFiles) -> Figure | None:
         settings = run.fit_settings.training.get(model)
         horizons: list[float] = []
         if notes.training is not None:
-            horizons = [stage.horizon for stage in notes.training.multi_step]
+            horizons = [stage.horizon for stage in notes.training.simulation_stages]
         elif settings is not None:
             horizons = [stage.horizon for stage in settings.multi_step]
         stage_labels = {0: "one-step"} | {
