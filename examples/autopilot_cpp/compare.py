@@ -84,11 +84,11 @@ def eager(folder: Path, card: dict[str, Any]) -> Any:
     from residnet.autopilot.export import guard_policy
     from residnet.autopilot.heading.controllers import (
         NetworkPolicySpec,
-        ObservedPolicySpec,
+        ObserverPolicySpec,
         load_recurrent,
     )
 
-    kinds = {"observed": ObservedPolicySpec, "network": NetworkPolicySpec}
+    kinds = {"observed": ObserverPolicySpec, "network": NetworkPolicySpec}
     policy = load_recurrent(folder, kinds[card["kind"]])
     policy.set_step(card["dt"])
     return guard_policy(policy, "hold" if "held" in card["fault"] else "amidships")

@@ -12,8 +12,8 @@ from residnet.autopilot.heading.conditions import (
     ConditionsConfig,
     SteadinessLimits,
 )
-from residnet.autopilot.heading.controllers import ObservedPolicySpec, PtosConfig
-from residnet.autopilot.heading.policies import ObservedPolicy
+from residnet.autopilot.heading.controllers import ObserverPolicySpec, PtosConfig
+from residnet.autopilot.heading.policies import ObserverPolicy
 from residnet.autopilot.heading.steering_variation import HEADING
 from residnet.autopilot.heading.vessels import SteeredPlant
 from residnet.autopilot.training.config import PolicyTraining
@@ -29,8 +29,8 @@ STEEP = PtosConfig(
 )  # fmt: skip
 
 
-def policy(units: int) -> ObservedPolicy:
-    return ObservedPolicySpec(
+def policy(units: int) -> ObserverPolicy:
+    return ObserverPolicySpec(
         state=VESSEL.state, gain=3.47, time=3.94, speed=3.2, limit=math.radians(5), rate=None,
         dt=0.1, trained_at=0.1, law=STEEP, units=units,
     ).build()  # fmt: skip

@@ -104,7 +104,7 @@ def test_gradients_of_the_cost_reach_law_line_of_sight_and_network(vessel: Steer
     run = ClosedLoopSimulation(vessel, policy, 0.1, "heun", torch.float32)
     flown = run.to_trajectories(changes, *run.rollout(4)(*run.rollout_arguments(changes))[:2])
     flown.step_metrics(conditions)["cost"].mean().backward()
-    network: Any = policy.law
+    network: Any = policy.inner_policy
     for part in (policy.constants, network.constants, network.network.out.weight):
         assert part.grad is not None
         assert torch.isfinite(part.grad).all()

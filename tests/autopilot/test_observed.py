@@ -14,10 +14,10 @@ from residnet.autopilot.heading.controllers import (
     ControlTask,
     NetworkPolicySpec,
     ObservedLqrConfig,
-    ObservedPolicySpec,
+    ObserverPolicySpec,
     PtosConfig,
 )
-from residnet.autopilot.heading.policies import ObservedPolicy
+from residnet.autopilot.heading.policies import ObserverPolicy
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError
@@ -37,9 +37,9 @@ LQR = ObservedLqrConfig(lag=0.3, heading_weight=4.0, rate_weight=1.0, **RATES)
 
 def policy(
     units: int = 0, rate: float | None = None, law: PtosConfig | ObservedLqrConfig = PTOS
-) -> ObservedPolicy:
+) -> ObserverPolicy:
     torch.manual_seed(4)
-    spec = ObservedPolicySpec(
+    spec = ObserverPolicySpec(
         state=STATE, gain=3.47, time=3.94, speed=3.2, limit=5 * DEG, rate=rate, dt=0.02,
         trained_at=0.04, law=law, units=units,
     )  # fmt: skip
@@ -51,7 +51,7 @@ def measured(rows: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     return torch.cat((drawn[0], torch.full_like(drawn[0], 3.2), 0.2 * drawn[1]), dim=1), drawn[0]
 
 
-def trained(units: int, rate: float | None = None) -> ObservedPolicy:
+def trained(units: int, rate: float | None = None) -> ObserverPolicy:
     """A policy whose network gives something."""
     made = policy(units, rate)
     with torch.no_grad():

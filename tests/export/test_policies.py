@@ -51,7 +51,7 @@ def depth() -> ExportedHeading:
     torch.manual_seed(0)
     sight = {"lookahead": 8.0, "depth_rate": 2.0, "drift_rate": 0.2}
     made = DepthPolicySpec(law=law, steepest=0.5, sight=sight).build().requires_grad_(False)
-    inner: Any = made.law
+    inner: Any = made.inner_policy
     inner.network.out.weight.normal_(std=0.02)
     return ExportedHeading("pilot", made, fallback="amidships", description={}, metrics=[])
 

@@ -11,8 +11,8 @@ from residnet.regression.equation_rows import (
     RegressionRows,
     WeakRows,
     effective_correlation_length,
+    label_regular_segments,
     median_time_step,
-    number_regular_segments,
 )
 
 
@@ -72,7 +72,7 @@ def test_stretches_end_at_gaps_and_manoeuvres() -> None:
     t = np.array([0.0, 0.1, 0.2, 0.5, 0.6, 0.0, 0.1])
     group = np.array([0, 0, 0, 0, 0, 1, 1])
     assert median_time_step(group, t) == pytest.approx(0.1)
-    assert number_regular_segments(group, t, 0.1).tolist() == [0, 0, 0, 1, 1, 2, 2]
+    assert label_regular_segments(group, t, 0.1).tolist() == [0, 0, 0, 1, 1, 2, 2]
 
 
 def test_what_cannot_be_done_is_one_line() -> None:

@@ -77,8 +77,8 @@ def every_kind() -> Figure:
         {"measured": MEASURED_STYLE, "masked": MASKED_STYLE, **style_family(("a", "b"))}
         | {
             "band": GlyphStyle("band of a", BLUE, kind="fill", alpha=0.2),
-            "level": GlyphStyle("limits", kind="across", dash="dotted"),
-            "now": GlyphStyle("now", kind="upright"),
+            "level": GlyphStyle("limits", kind="hline", dash="dotted"),
+            "now": GlyphStyle("now", kind="vline"),
             "bars": GlyphStyle("</script>", BLUE, kind="fill"),
             "spread": GlyphStyle("interval", is_visible=False),
             "start": START_STYLE,
@@ -91,7 +91,12 @@ def every_kind() -> Figure:
         ],
         [
             Case("one", first, "A note.", texts=[(1, 5.0, np.nan, "stage")]),
-            Case("two", [{}, {"b": (T[:90], np.full(90, 3.0))}, {}, {}], "Other.", still=False),
+            Case(
+                "two",
+                [{}, {"b": (T[:90], np.full(90, 3.0))}, {}, {}],
+                "Other.",
+                has_static_image=False,
+            ),
         ],
         "Run",
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from residnet.autopilot.heading.controllers import ObservedPolicySpec, PtosConfig
+from residnet.autopilot.heading.controllers import ObserverPolicySpec, PtosConfig
 
 DEG = math.pi / 180
 DT = 0.02
@@ -25,10 +25,10 @@ SETTINGS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def observed(rate: float | None, **changes: Any) -> tuple[ObservedPolicySpec, Any]:
+def observed(rate: float | None, **changes: Any) -> tuple[ObserverPolicySpec, Any]:
     """Return the description of a policy and the policy, its network slightly off zero."""
     torch.manual_seed(0)
-    spec = ObservedPolicySpec(rate=rate, law=LAW, **SETTINGS | changes)
+    spec = ObserverPolicySpec(rate=rate, law=LAW, **SETTINGS | changes)
     made = spec.build().requires_grad_(False)
     made.network.out.weight.normal_(std=0.02)
     return spec, made

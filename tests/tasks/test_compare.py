@@ -56,7 +56,7 @@ def test_two_runs_side_by_side(two: list[Path], tmp_path: Path) -> None:
     assert "Error against horizon" in plain(page)
     # a part that one of them lacks stands in one line
     (line,) = [line for line in text.splitlines() if line.startswith("heads")]
-    assert line.split() == ["heads.mlp", "there", "(kind", "mlp)", "not", "there"]
+    assert line.split() == ["heads.mlp", "set", "(kind", "mlp)", "not", "set"]
     shutil.rmtree(two[1] / "rollouts" / "test")
     accept_run(two[1])
     assert "no common window" in compare_runs(two, tmp_path / "again")[0]

@@ -39,7 +39,7 @@ class Policy(StatefulModule):
             s: memory [B, n_state].
         """
 
-    def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
+    def replace_rudder_in_memory(self, s: Tensor, rudder: Tensor) -> Tensor:
         """Return the memory corrected for the rudder angle [B, 1] that is applied.
 
         A controller without an observer returns the memory unchanged.

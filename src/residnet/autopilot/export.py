@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from residnet.autopilot.courses.course_plan import Course
 from residnet.autopilot.guidance import CourseGuidance, TrackKeeping
-from residnet.autopilot.heading.policies import MAX_DEPTH, HeadingPolicy
+from residnet.autopilot.heading.policies import MAX_DEPTH, SteeringPolicy
 from residnet.autopilot.heading.steering_variation import DEPTH, HEADING
 from residnet.core.errors import ExportError
 from residnet.core.version import __version__
@@ -66,7 +66,7 @@ class _GuardedController(nn.Module):
         self,
         limits: Sequence[tuple[float, float]],
         memory_limits: Sequence[tuple[float, float]],
-        policy: HeadingPolicy,
+        policy: SteeringPolicy,
         fallback: FallbackCommand,
         dtype: torch.dtype,
     ) -> None:
@@ -138,7 +138,7 @@ class GuardedPolicy(_GuardedController):
 
     def __init__(
         self,
-        policy: HeadingPolicy,
+        policy: SteeringPolicy,
         limits: Sequence[tuple[float, float]],
         fallback: FallbackCommand,
         dtype: torch.dtype = torch.float32,
@@ -194,7 +194,7 @@ class GuardedCoursePolicy(_GuardedController):
     """
 
     def __init__(
-        self, policy: HeadingPolicy, guidance: CourseGuidance, fallback: FallbackCommand
+        self, policy: SteeringPolicy, guidance: CourseGuidance, fallback: FallbackCommand
     ) -> None:
         policy = copy.deepcopy(policy).double().eval().requires_grad_(False)
         policy.set_state_columns(tuple(COURSE_MEASUREMENTS))
@@ -359,7 +359,7 @@ class _InitialState(nn.Module):
 
 
 def guard_policy(
-    policy: HeadingPolicy, fallback: FallbackCommand, dtype: torch.dtype = torch.float32
+    policy: SteeringPolicy, fallback: FallbackCommand, dtype: torch.dtype = torch.float32
 ) -> GuardedPolicy:
     """Add input checks to a policy.
 
@@ -402,7 +402,7 @@ class ExportedController(Exportable):
     def __init__(
         self,
         name: str,
-        policy: HeadingPolicy,
+        policy: SteeringPolicy,
         *,
         fallback: FallbackCommand,
         description: Mapping[str, Any],
@@ -486,7 +486,7 @@ class ExportedController(Exportable):
             ],
             "dt": policy.dt,
             **policy.describe(),
-            "turning": {"K": policy.gain, "T": policy.time, "speed": policy.speed},
+            "turning": {"K": policy.gain, "T": policy.time_constant, "speed": policy.speed},
             "frame": _FRAME_OF_AXIS[self.steering_axis],
             "versions": {"residnet": __version__, "torch": torch.__version__},
             "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -598,7 +598,7 @@ class ExportedCoursePolicy(ExportedController):
     def __init__(
         self,
         name: str,
-        policy: HeadingPolicy,
+        policy: SteeringPolicy,
         guidance: CourseGuidance,
         course: Course,
         *,

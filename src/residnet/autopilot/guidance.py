@@ -651,7 +651,7 @@ class TrackKeeping(Policy):
         rudder = s[:, 0:1] + (command - s[:, 0:1]).clamp(
             -self.max_rudder_step, self.max_rudder_step
         )
-        memory = self.law.with_applied_rudder(memory, rudder - planned_rudder)
+        memory = self.law.replace_rudder_in_memory(memory, rudder - planned_rudder)
         return command, torch.cat((rudder, memory), dim=-1)
 
 

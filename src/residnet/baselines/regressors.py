@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from residnet.baselines.base import ParametricBaseline, select_manoeuvres
 from residnet.core.samples import Samples, directional_derivatives
-from residnet.physics.signals import RestoringAcceleration
+from residnet.physics.signals import SoftVelocityLimit
 from residnet.physics.symmetry import (
     ChannelNames,
     acts_along_own_velocity,
@@ -79,8 +79,8 @@ class RegressorBaseline(ParametricBaseline):
         )
         self.is_dissipative = is_dissipative
         self.channel_names = names if isinstance(names, ChannelNames) else tuple(names)
-        self.bound: RestoringAcceleration | None = (
-            RestoringAcceleration(_RANGE_MARGIN, len(names), dof.n_dynamic) if is_bounded else None
+        self.bound: SoftVelocityLimit | None = (
+            SoftVelocityLimit(_RANGE_MARGIN, len(names), dof.n_dynamic) if is_bounded else None
         )
 
     def forward(self, z: Tensor) -> Tensor:
@@ -372,7 +372,7 @@ def fit_regressors(
     ]
     if not config.bounded:
         return axis_solutions
-    restoring = RestoringAcceleration(_RANGE_MARGIN, len(selected.names), baseline.n_dof)
+    restoring = SoftVelocityLimit(_RANGE_MARGIN, len(selected.names), baseline.n_dof)
     restoring.calibrate(selected)
     state = {f"bound.{name}": value for name, value in restoring.state_dict().items()}
     return [replace(solution, state={**solution.state, **state}) for solution in axis_solutions]

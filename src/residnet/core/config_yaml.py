@@ -20,7 +20,8 @@ from residnet.core.errors import ConfigError
 KeyPath = tuple[str | int, ...]
 """Path to a value of a config: keys of mappings and indices of lists."""
 
-# limits on values, nesting levels and digits, chosen by hand: far more take minutes to parse
+# limits on values, nesting levels and digits: no config is near them, and a file far beyond them
+# would occupy the parser for minutes
 _MAX_VALUES = 200_000
 _MAX_DEPTH = 60
 _MAX_DIGITS = 400
@@ -124,12 +125,13 @@ class _ConfigDumper(yaml.SafeDumper):
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
-    def represent_short_list(self, data: Sequence[Any]) -> Node:
+    def represent_list(self, data: Sequence[Any]) -> Node:
+        # a list of scalars is written on one line, [a, b]; nested values have a line each
         is_flat = not any(isinstance(item, (dict, list)) for item in data)
         return self.represent_sequence(_TAG_PREFIX + "seq", data, flow_style=is_flat)
 
 
-_ConfigDumper.add_representer(list, _ConfigDumper.represent_short_list)
+_ConfigDumper.add_representer(list, _ConfigDumper.represent_list)
 
 
 def parse_yaml(text: str, source: str, *, show_location: bool = True) -> tuple[Any, Node | None]:
@@ -153,9 +155,10 @@ def parse_yaml(text: str, source: str, *, show_location: bool = True) -> tuple[A
 
 @lru_cache(maxsize=64)
 def _parse_document(text: str, source: str, show_location: bool) -> tuple[Any, Node | None]:
-    """Parse one YAML document; a vessel file is read several times in the check of a config.
+    """Parse one YAML document and cache the result.
 
-    The caller must not change the value.
+    The cache serves vessel files, which the check of a config reads several times. The cached value
+    is shared, so that the caller must copy it before changing it.
     """
     try:
         # inside the try block, because the constructor rejects characters that YAML forbids

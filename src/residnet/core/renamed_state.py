@@ -9,18 +9,18 @@ from torch import Tensor, nn
 
 
 class RenamedStateModule(nn.Module):
-    """Module that accepts earlier names of its parameters and submodules in a state_dict.
+    """Module that accepts the names which its parameters and submodules had in earlier versions.
 
     Attributes:
-        renamed_state: current name by earlier name.
+        legacy_parameter_names: maps an earlier name in a state_dict to the current name.
     """
 
-    renamed_state: ClassVar[Mapping[str, str]] = {}
+    legacy_parameter_names: ClassVar[Mapping[str, str]] = {}
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Tensor], prefix: str, *other_arguments: Any
     ) -> None:
-        for earlier_name, name in self.renamed_state.items():
+        for earlier_name, name in self.legacy_parameter_names.items():
             earlier_key = prefix + earlier_name
             for key in list(state_dict):
                 if key == earlier_key or key.startswith(f"{earlier_key}."):

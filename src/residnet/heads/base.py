@@ -15,7 +15,7 @@ from residnet.core.columns import zero_acceleration
 from residnet.core.layout import PLANAR_LAYOUT
 from residnet.core.renamed_state import RenamedStateModule
 from residnet.core.samples import Samples
-from residnet.physics.signals import RestoringAcceleration
+from residnet.physics.signals import SoftVelocityLimit
 from residnet.physics.symmetry import get_dof
 from residnet.regression.estimator import Solution
 from residnet.regression.shrinkage import CONSTANT_TOLERANCE
@@ -140,10 +140,10 @@ class ResidualHead(nn.Module, ABC):
         """Calibrate the scales and ranges on the training samples, once before the fit.
 
         The default calibrates all submodules of the types `Features`, `ResidualScale` and
-        `RestoringAcceleration`.
+        `SoftVelocityLimit`.
         """
         for module in self.modules():
-            if isinstance(module, Features | ResidualScale | RestoringAcceleration):
+            if isinstance(module, Features | ResidualScale | SoftVelocityLimit):
                 module.calibrate(samples)
 
     def residual_scale(self) -> Tensor:
@@ -289,7 +289,7 @@ def _index_buffer(indices: Sequence[int]) -> nn.Buffer:
 class ResidualScale(RenamedStateModule):
     """Scales network outputs by the standard deviation of the residual on the training samples."""
 
-    renamed_state: ClassVar[Mapping[str, str]] = {"spread": "std"}
+    legacy_parameter_names: ClassVar[Mapping[str, str]] = {"spread": "std"}
 
     def __init__(self, dof: int = PLANAR_LAYOUT.n_dof) -> None:
         super().__init__()

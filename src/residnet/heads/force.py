@@ -37,7 +37,7 @@ class ForceHead(RenamedStateModule, ClosedFormHead):
     evaluated once per time step.
     """
 
-    renamed_state: ClassVar[Mapping[str, str]] = {
+    legacy_parameter_names: ClassVar[Mapping[str, str]] = {
         "lowest": "lower_velocities",
         "highest": "upper_velocities",
     }
@@ -167,7 +167,7 @@ class ForceHead(RenamedStateModule, ClosedFormHead):
 class AugmentedMassBaseline(RenamedStateModule):
     """Baseline with the mass M + A: its acceleration [..., 3] is (M + A)^-1 M nu_dot_0."""
 
-    renamed_state: ClassVar[Mapping[str, str]] = {"gain": "inertia_ratio"}
+    legacy_parameter_names: ClassVar[Mapping[str, str]] = {"gain": "inertia_ratio"}
 
     def __init__(self, baseline: nn.Module, inertia_ratio: Tensor) -> None:
         super().__init__()

@@ -1,23 +1,28 @@
-"""Kernel ridge regression of the residual (document 001 section 3.2, corrections M4, M5)."""
+"""Kernel ridge regression of the residual.
+
+Source: Moreno-Salinas et al. 2019, section 3.2. The article misprints the inverse matrix of the
+solution and the exponent of the radial kernel (`docs/documents/corrections.md`, M4 and M5).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, ClassVar, final
 
 import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import FitError
+from residnet.core.renamed_state import RenamedStateModule
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, Features
 from residnet.physics.symmetry import get_dof
 from residnet.physics.term_library import TermLibrary
-from residnet.regression.equation_rows import median_time_step, number_regular_segments
+from residnet.regression.equation_rows import label_regular_segments, median_time_step
 from residnet.regression.estimator import Solution, default_fold_count
-from residnet.regression.kernel import KernelRidge, RecursiveErrors, RegularizationPath
+from residnet.regression.kernel import KernelRidge, RegularizationPath, SingleStateFreeRun
 from residnet.regression.shrinkage import CONSTANT_TOLERANCE
 
 if TYPE_CHECKING:
@@ -26,7 +31,7 @@ if TYPE_CHECKING:
 
 @final
 class TermFeatures(nn.Module):
-    """Computes standardised terms [..., J] of clamped channels [..., F]."""
+    """Computes standardised terms [..., J], such as n|n|, of clamped channels [..., F]."""
 
     def __init__(self, terms: Sequence[str], channels: Sequence[str]) -> None:
         super().__init__()
@@ -63,8 +68,18 @@ class TermFeatures(nn.Module):
 
 
 @final
-class KernelHead(ClosedFormHead):
-    """Head with the residual rho [..., n] = f(standardised features), f a kernel function."""
+class KernelHead(RenamedStateModule, ClosedFormHead):
+    """Head with the residual f(x) = sum over p of a_p k(x, x_p), a kernel expansion [..., n].
+
+    x are standardised features and terms, x_p the support points of the kernel k, and a_p the
+    fitted coefficients [n].
+
+    Args:
+        config: settings of the head.
+        names: names of the channels z of the model.
+    """
+
+    legacy_parameter_names: ClassVar[Mapping[str, str]] = {"effective": "effective_parameters"}
 
     def __init__(self, config: KernelConfig, names: Sequence[str]) -> None:
         super().__init__(names)
@@ -73,7 +88,7 @@ class KernelHead(ClosedFormHead):
         self.terms = TermFeatures(config.terms, feature_names)
         self.kernel = config.kernel.build(len(feature_names) + self.terms.n_terms, self.n_dof)
         self.config = config
-        self.effective = nn.Buffer(torch.zeros(self.n_dof, dtype=torch.float64))
+        self.effective_parameters = nn.Buffer(torch.zeros(self.n_dof, dtype=torch.float64))
 
     def calibrate(self, samples: Samples) -> None:
         super().calibrate(samples)
@@ -93,22 +108,21 @@ class KernelHead(ClosedFormHead):
         )
 
     def parameter_counts(self) -> list[float]:
-        """Return the effective number of parameters per axis, the trace of the smoother."""
-        return [float(n_effective) for n_effective in self.effective]
+        """Return the effective number of parameters per axis: the trace of the smoother matrix."""
+        return [float(n_effective) for n_effective in self.effective_parameters]
 
     def fit_solutions(self, samples: Samples) -> list[Solution]:
+        # criterion of kernel setting and penalty; None for the cross-validated one-step error
         score_paths = None
         if self.config.choose == "recursion":
             group = samples.group.numpy()
             t = samples.t.numpy()
-            # recursion runs one velocity freely, which needs segments without gaps
+            # the free run of a single velocity needs segments without gaps
             time_step = median_time_step(group, t)
-            segment = torch.from_numpy(number_regular_segments(group, t, time_step))
+            segment = torch.from_numpy(label_regular_segments(group, t, time_step))
             columns = [samples.names.index(name) for name in get_dof(samples.names).dynamic_states]
-            recursive_errors = RecursiveErrors(
-                samples.z, samples.target, segment, time_step, columns
-            )
-            score_paths = partial(self._recursion_errors, recursive_errors)
+            free_run = SingleStateFreeRun(samples.z, samples.target, segment, time_step, columns)
+            score_paths = partial(self._free_run_errors, free_run)
         estimator = KernelRidge(
             self.kernel,
             self.config.penalties,
@@ -119,26 +133,32 @@ class KernelHead(ClosedFormHead):
         with torch.no_grad():
             inputs = self.kernel_inputs(samples.z)
         solutions = estimator.fit(inputs, samples.target, samples.group, outputs=self.output_names)
-        return [self._to_state(solution) for solution in solutions]
+        return [self._with_head_state(solution) for solution in solutions]
 
-    def _to_state(self, solution: Solution) -> Solution:
-        """Return a solution of the kernel with the names of the state of this head."""
-        state_names = {"effective": "effective"}
+    def _with_head_state(self, solution: Solution) -> Solution:
+        """Rename the state of a kernel solution to the entries of this head's state_dict."""
         state = {
-            state_names.get(name, f"kernel.{name}"): value for name, value in solution.state.items()
+            name if name == "effective_parameters" else f"kernel.{name}": value
+            for name, value in solution.state.items()
         }
+        # solutions of neighbouring penalties are computed only when a selection asks for them
         make_neighbours = solution.neighbours
         neighbours = (
             None
             if make_neighbours is None
-            else lambda: [self._to_state(neighbour) for neighbour in make_neighbours()]
+            else lambda: [self._with_head_state(neighbour) for neighbour in make_neighbours()]
         )
         return replace(solution, state=state, neighbours=neighbours)
 
-    def _recursion_errors(
-        self, recursive_errors: RecursiveErrors, paths: Sequence[RegularizationPath]
+    def _free_run_errors(
+        self, free_run: SingleStateFreeRun, paths: Sequence[RegularizationPath]
     ) -> Tensor:
-        """Return mean squared errors of single-velocity free runs, [settings, penalties, n]."""
+        """Return mean squared errors of single-velocity free runs, [settings, penalties, n].
+
+        Args:
+            free_run: free runs of one velocity with the other velocities as measured.
+            paths: solutions of all penalties, one path per kernel setting.
+        """
         n_penalties = len(self.config.penalties)
         errors = torch.zeros(len(paths), n_penalties, self.n_dof, dtype=torch.float64)
         for i, path in enumerate(paths):
@@ -149,8 +169,9 @@ class KernelHead(ClosedFormHead):
                     z: Tensor, path: RegularizationPath = path, weights: Tensor = weights
                 ) -> Tensor:
                     features = self.kernel.evaluate_features(path, self.kernel_inputs(z))
+                    # penalty c, segment g, support point p: the expansion of each penalty
                     return torch.einsum("cgp,cp->cg", features, weights)
 
                 with torch.no_grad():
-                    errors[i, :, axis] = recursive_errors.state_errors(axis, predict, n_penalties)
+                    errors[i, :, axis] = free_run.state_errors(axis, predict, n_penalties)
         return errors

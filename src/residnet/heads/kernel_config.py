@@ -24,14 +24,14 @@ class KernelConfig(ClosedFormConfig):
         kernel: radial basis functions (`rbf`) or a polynomial (`polynomial`).
         terms: additional features computed from the features, such as `n|n|`, which a polynomial of
             low degree in the revolutions approximates poorly.
-        penalties: candidate penalties per sample; lambda of document 001 and `alpha` of
-            scikit-learn are the penalty times the number of samples.
-        choose: criterion of the kernel setting and the penalties. `free_run` minimizes the error of
+        penalties: candidate penalties per sample; lambda of Moreno-Salinas et al. 2019 and `alpha`
+            of scikit-learn are the penalty times the number of samples.
+        choose: criterion of the kernel setting and the penalties. `free_run` minimises the error of
             free runs on validation data, first over the setting and a shared penalty, then over the
-            penalty of each axis in turn, with no residual as a candidate (document 001 section 4,
-            second approach). `one_step` minimizes the cross-validated error of the acceleration of
-            each axis. `recursion` minimizes, for each axis, the error of its velocity in a free run
-            with the other velocities as measured (first approach).
+            penalty of each axis in turn, with no residual as a candidate (Moreno-Salinas et al.
+            2019, section 4, second approach). `one_step` minimises the cross-validated error of the
+            acceleration of each axis. `recursion` minimises, for each axis, the error of its
+            velocity in a free run with the other velocities as measured (first approach).
         folds: number of folds of the cross-validation, which never splits a manoeuvre; null for
             five folds, or the number of manoeuvres if it is lower.
     """

@@ -1,4 +1,9 @@
-"""Residual head with long short-term memory (document 003 eq. (17), correction W4)."""
+"""Residual head with long short-term memory (LSTM).
+
+Source: Woo et al. 2018, eqs. (17) and following. The printed cell candidate of eq. (17) lacks the
+recurrent term W_hc h, which the number of parameters requires (`docs/documents/corrections.md`,
+W4).
+"""
 
 from __future__ import annotations
 
@@ -12,7 +17,7 @@ from torch import Tensor, nn
 from residnet.core.renamed_state import RenamedStateModule
 from residnet.heads.base import Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import Tanh, fast_tanh
-from residnet.physics.signals import RestoringAcceleration
+from residnet.physics.signals import SoftVelocityLimit
 
 if TYPE_CHECKING:
     from residnet.heads.lstm_config import LstmConfig
@@ -27,7 +32,7 @@ class LSTMCell(RenamedStateModule):
     The memory s [B, 2H] is the concatenation of h and c. The layer has 4 H (F + H + 1) parameters.
     """
 
-    renamed_state: ClassVar[Mapping[str, str]] = {
+    legacy_parameter_names: ClassVar[Mapping[str, str]] = {
         "w_input": "input_weight",
         "w_hidden": "hidden_weight",
     }
@@ -114,27 +119,39 @@ class LSTMCell(RenamedStateModule):
 
 
 class LstmNetwork(RenamedStateModule):
-    """Features, LSTM and readout for one or all axes, with `n_outputs` outputs per sample."""
+    """Features, LSTM and readout for one or all axes, with `n_outputs` outputs per sample.
 
-    renamed_state: ClassVar[Mapping[str, str]] = {"core": "cell"}
+    Args:
+        config: settings of the head.
+        feature_names: channels that are features of this network.
+        n_outputs: number of residual accelerations that this network predicts.
+        channel_names: names of the channels z of the model.
+    """
+
+    legacy_parameter_names: ClassVar[Mapping[str, str]] = {"core": "cell"}
 
     def __init__(
-        self, config: LstmConfig, feature_names: Sequence[str], n_outputs: int, names: Sequence[str]
+        self,
+        config: LstmConfig,
+        feature_names: Sequence[str],
+        n_outputs: int,
+        channel_names: Sequence[str],
     ) -> None:
         super().__init__()
-        self.features = Features(feature_names, names, config.margin)
-        memory_features = config.select_memory(feature_names)
-        self.has_memory_selection = len(config.memory) > 0
-        self.memory_input_index = nn.Buffer(
+        # features are clamped to their training range, widened by `margin` times its width
+        self.features = Features(feature_names, channel_names, config.margin)
+        lstm_feature_names = config.select_lstm_features(feature_names)
+        self.has_lstm_feature_subset = len(config.memory) > 0
+        self.lstm_feature_index = nn.Buffer(
             torch.tensor(
-                [list(feature_names).index(name) for name in memory_features], dtype=torch.long
+                [list(feature_names).index(name) for name in lstm_feature_names], dtype=torch.long
             ),
             persistent=False,
         )
         uses_softsign = config.activation == "softsign"
-        self.cell = LSTMCell(len(memory_features), config.hidden_size, uses_softsign)
+        self.cell = LSTMCell(len(lstm_feature_names), config.hidden_size, uses_softsign)
         self.dropout = nn.Dropout(config.dropout)
-        self.has_readout_layer = config.readout > 0
+        self.has_hidden_readout_layer = config.readout > 0
         output_layer = nn.Linear(config.readout or config.hidden_size, n_outputs)
         with torch.no_grad():
             # small initial outputs: training starts near the baseline
@@ -144,16 +161,16 @@ class LstmNetwork(RenamedStateModule):
             nn.Sequential(
                 nn.Linear(config.hidden_size + self.features.n_features, config.readout), Tanh()
             )
-            if self.has_readout_layer
+            if self.has_hidden_readout_layer
             else nn.Sequential()
         )
         self.readout = nn.Sequential(*hidden_layers, output_layer)
 
-    def memory_inputs(self, features: Tensor) -> Tensor:
-        """Return the features that the LSTM receives."""
+    def lstm_features(self, features: Tensor) -> Tensor:
+        """Return the features that the LSTM receives; the readout receives all of them."""
         return (
-            features.index_select(-1, self.memory_input_index)
-            if self.has_memory_selection
+            features.index_select(-1, self.lstm_feature_index)
+            if self.has_lstm_feature_subset
             else features
         )
 
@@ -161,42 +178,45 @@ class LstmNetwork(RenamedStateModule):
         """Return residuals [..., n_outputs] from LSTM outputs [..., H] and features [..., F]."""
         hidden = self.dropout(hidden)
         residual: Tensor = self.readout(
-            torch.cat((hidden, features), dim=-1) if self.has_readout_layer else hidden
+            torch.cat((hidden, features), dim=-1) if self.has_hidden_readout_layer else hidden
         )
         return residual
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return outputs [B, n_outputs] and the memory after one step of channels [B, nz]."""
         features = self.features(z)
-        hidden, s = self.cell(self.memory_inputs(features), s)
+        hidden, s = self.cell(self.lstm_features(features), s)
         return self.readout_residual(hidden, features), s
 
     def run_sequence(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return outputs [B, T, n_outputs] for channels [B, T, nz], and the memory at the end."""
         features = self.features(z)
-        hidden, s = self.cell.run_sequence(self.memory_inputs(features))
+        hidden, s = self.cell.run_sequence(self.lstm_features(features))
         return self.readout_residual(hidden, features), s
 
 
 @final
 class LstmHead(ResidualHead):
-    """LSTM head; the memory s is the concatenation of (h, c) of all networks."""
+    """LSTM head; the memory s is the concatenation of (h, c) of all networks.
 
-    def __init__(self, config: LstmConfig, names: Sequence[str]) -> None:
-        super().__init__(names)
+    Args:
+        config: settings of the head.
+        channel_names: names of the channels z of the model, the velocities first.
+    """
+
+    def __init__(self, config: LstmConfig, channel_names: Sequence[str]) -> None:
+        super().__init__(channel_names)
         self.networks: Sequence[LstmNetwork] = nn.ModuleList(  # type: ignore[assignment]
             [
-                LstmNetwork(config, feature_names, n_outputs, names)
-                for feature_names, n_outputs in config.network_specs(names)
+                LstmNetwork(config, feature_names, n_outputs, channel_names)
+                for feature_names, n_outputs in config.network_specs(channel_names)
             ]
         )
         self.network_state_size = 2 * config.hidden_size
         self.n_state = self.network_state_size * len(self.networks)
         self.scale = ResidualScale(self.n_dof)
-        self.restoring_acceleration: RestoringAcceleration | None = (
-            RestoringAcceleration(n_channels=self.n_dof, n_dof=self.n_dof)
-            if config.restoring
-            else None
+        self.restoring_acceleration: SoftVelocityLimit | None = (
+            SoftVelocityLimit(n_channels=self.n_dof, n_dof=self.n_dof) if config.restoring else None
         )
 
     def residual_scale(self) -> Tensor:
@@ -214,16 +234,25 @@ class LstmHead(ResidualHead):
         return self.combine_networks(residuals, memories, z)
 
     def combine_networks(
-        self, residuals: list[Tensor], memories: list[Tensor], nu: Tensor
+        self, residuals: list[Tensor], memories: list[Tensor], z: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Combine residuals and memories of the networks, at velocities nu."""
-        # joining a single part would copy it
-        rho: Tensor = self.scale(
+        """Concatenate the outputs and the memories of all networks and scale the outputs.
+
+        Args:
+            residuals: normalised outputs of each network [..., n_outputs].
+            memories: memory of each network [B, 2H].
+            z: channels [..., nz], the velocities first.
+
+        Returns:
+            Residual accelerations [..., n] and memory [B, n_state].
+        """
+        # concatenating a single tensor would copy it
+        residual: Tensor = self.scale(
             residuals[0] if len(residuals) == 1 else torch.cat(residuals, dim=-1)
         )
         if self.restoring_acceleration is not None:
-            rho = rho + self.restoring_acceleration(nu)
-        return rho, memories[0] if len(memories) == 1 else torch.cat(memories, dim=-1)
+            residual = residual + self.restoring_acceleration(z)
+        return residual, memories[0] if len(memories) == 1 else torch.cat(memories, dim=-1)
 
     def teacher_forced_residuals(self, z: Tensor) -> Tensor:
         residuals: list[Tensor] = []
@@ -237,8 +266,8 @@ class LstmHead(ResidualHead):
     def warmup(self, z: Tensor) -> Tensor:
         memories: list[Tensor] = []
         for network in self.networks:
-            memory_inputs = network.memory_inputs(network.features(z))
-            memories.append(network.cell.run_sequence(memory_inputs)[1])
+            lstm_features = network.lstm_features(network.features(z))
+            memories.append(network.cell.run_sequence(lstm_features)[1])
         return torch.cat(memories, dim=-1)
 
     def memory_bounds(self) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Configuration of the LSTM head (document 003 eq. (17), correction W4)."""
+"""Configuration of the LSTM head (Woo et al. 2018, eq. (17); see `heads.lstm`)."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ class LstmConfig(NetworkConfig):
     Attributes:
         hidden_size: number of hidden units.
         readout: number of units of a tanh layer between (hidden state, features) and the residual;
-            0 for a linear readout of the hidden state, as in document 003.
+            0 for a linear readout of the hidden state, as in Woo et al. 2018.
         memory: features that the LSTM receives; empty for all. An LSTM of the commands only has the
             same states in a free run and in teacher forcing: it can represent actuator dynamics but
             not infer measured accelerations. Needs `readout`, which receives all features.
-        activation: activation of block input and output; softsign in document 003 instead of tanh.
+        activation: activation of block input and output; Woo et al. 2018 use softsign in place of
+            tanh.
         dropout: dropout probability of the hidden outputs before the readout.
-        per_axis: whether surge, sway and yaw have a network each, as in document 003.
+        per_axis: whether surge, sway and yaw have a network each, as in Woo et al. 2018.
         axis_features: channels of the network of each axis if they differ; needs `per_axis`.
         mirror: whether the residual is mirror-symmetric between port and starboard by construction.
-        restoring: whether a restoring acceleration acts on velocities outside their training range,
-            so that a network without a baseline cannot diverge.
+        restoring: whether an acceleration returns velocities to their training range, so that a
+            network without a baseline cannot diverge; see `physics.signals.SoftVelocityLimit`.
     """
 
     kind: Literal["lstm"] = "lstm"
@@ -62,11 +63,11 @@ class LstmConfig(NetworkConfig):
 
     def check_channels(self, names: Sequence[str]) -> None:
         for feature_names, _ in self.network_specs(names):
-            self.select_memory(feature_names)
+            self.select_lstm_features(feature_names)
         if self.mirror:
             require_mirror_image(names)
 
-    def select_memory(self, feature_names: Sequence[str]) -> tuple[str, ...]:
+    def select_lstm_features(self, feature_names: Sequence[str]) -> tuple[str, ...]:
         """Return the features that the LSTM receives.
 
         Raises:

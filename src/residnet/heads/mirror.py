@@ -50,7 +50,7 @@ class MirroredHead(RenamedStateModule, ResidualHead):
     size, and the memory is the concatenation of both memories.
     """
 
-    renamed_state: ClassVar[Mapping[str, str]] = {"inner": "inner_head"}
+    legacy_parameter_names: ClassVar[Mapping[str, str]] = {"inner": "inner_head"}
 
     def __init__(self, inner: ResidualHead, names: Sequence[str]) -> None:
         super().__init__(names)

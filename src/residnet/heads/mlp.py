@@ -27,7 +27,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 class MlpHead(RenamedStateModule, ResidualHead):
     """Head with the residual rho = std * network(features)."""
 
-    renamed_state: ClassVar[Mapping[str, str]] = {"net": "network"}
+    legacy_parameter_names: ClassVar[Mapping[str, str]] = {"net": "network"}
 
     def __init__(self, config: MlpConfig, names: Sequence[str]) -> None:
         super().__init__(names)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from residnet.core.renamed_state import RenamedStateModule
 from residnet.heads.base import Features, ResidualHead, ResidualScale
-from residnet.physics.signals import RestoringAcceleration
+from residnet.physics.signals import SoftVelocityLimit
 
 if TYPE_CHECKING:
     from residnet.heads.recurrent_config import GRUEnsembleConfig
@@ -34,7 +34,7 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
     The n innovations may be appended to the channels.
     """
 
-    renamed_state: ClassVar[Mapping[str, str]] = {
+    legacy_parameter_names: ClassVar[Mapping[str, str]] = {
         "w_input": "input_weight",
         "w_hidden": "hidden_weight",
         "w_out": "output_weight",
@@ -58,10 +58,8 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
         self.n_channels = len(names)
         self.features = Features(config.select_features(names), names, config.margin)
         self.scale = ResidualScale(self.n_dof)
-        self.restoring_acceleration: RestoringAcceleration | None = (
-            RestoringAcceleration(n_channels=self.n_dof, n_dof=self.n_dof)
-            if config.restoring
-            else None
+        self.restoring_acceleration: SoftVelocityLimit | None = (
+            SoftVelocityLimit(n_channels=self.n_dof, n_dof=self.n_dof) if config.restoring else None
         )
         n_innovations = 0 if self.has_encoder else self.n_dof
         self.n_inputs = n_inputs = self.features.n_features + n_innovations

@@ -18,8 +18,8 @@ from residnet.physics.term_library import TermLibrary
 from residnet.physics.terms import parse_term
 from residnet.regression.equation_rows import (
     RegressionRows,
+    label_regular_segments,
     median_time_step,
-    number_regular_segments,
 )
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.expressions import format_equation, format_sum, terms_to_sympy
@@ -296,7 +296,7 @@ class SymbolicHead(EquationHead):
         t = samples.t.numpy()
         time_step = median_time_step(group, t)
         return SegmentedSamples(
-            features, target, number_regular_segments(group, t, time_step), time_step
+            features, target, label_regular_segments(group, t, time_step), time_step
         )
 
     def _fit_equations(

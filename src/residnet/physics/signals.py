@@ -123,11 +123,12 @@ _MIN_RANGE = 1e-9
 
 
 @final
-class RestoringAcceleration(RenamedStateModule):
-    """Restoring acceleration [..., n] on velocities outside their training range, otherwise zero.
+class SoftVelocityLimit(RenamedStateModule):
+    """Acceleration [..., n] that returns velocities to their training range; zero inside the range.
 
-    A fitted model is not valid outside the training range. Without damping, the clamped
-    acceleration would be integrated without limit.
+    It is proportional to the excess of a velocity over its range. A fitted model is not valid
+    outside the training range: without damping, its clamped acceleration would be integrated
+    without limit. This is no hydrostatic restoring force, which depends on the position.
 
     Args:
         margin: widening of the training range on either side, as a share of its width.
@@ -135,7 +136,7 @@ class RestoringAcceleration(RenamedStateModule):
         n_dof: number of velocities n.
     """
 
-    renamed_state: ClassVar[Mapping[str, str]] = {"rate": "restoring_rate"}
+    legacy_parameter_names: ClassVar[Mapping[str, str]] = {"rate": "restoring_rate"}
 
     def __init__(
         self,

@@ -4,8 +4,9 @@ Measurement noise affects a regression twice: differentiation amplifies the nois
 and noise of the regressors biases the coefficients towards zero (attenuation). The weak form
 integrates both sides with a test function w that vanishes at the ends of a window,
 int w y dt = sum c_j int w f_j dt. Integration by parts, int w x_dot dt = -int w_dot x dt, moves the
-derivative from the noisy record to w. If accelerations are central differences (`savitzky_golay`
-over three samples), the weighted sum of accelerations equals the sum by parts.
+derivative from the noisy record to w. If the accelerations are central differences
+(`savitzky_golay` over three samples), summation by parts gives the same sums: differentiating the
+record first then adds no noise.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.stretches import find_run_bounds
 
-_MAX_BLOCK_NUMBERS = 8_000_000
+_MAX_BLOCK_ELEMENTS = 8_000_000
 """Maximum number of array elements of the windows that are integrated at a time."""
 _MIN_VARIANCE = 1e-300
 """Lower bound of a variance in a denominator."""
@@ -32,7 +33,7 @@ class RegressionRows(NamedTuple):
     Attributes:
         x: terms [N, J].
         y: targets [N, K].
-        segment: number of the uninterrupted segment of each row [N], ascending.
+        segment: index of the uninterrupted segment of each row [N], ascending.
     """
 
     x: np.ndarray
@@ -124,10 +125,11 @@ def integrate_windows(
     window_coordinate = np.linspace(-1.0, 1.0, window_samples + 2)[1:-1]
     test_function = np.square(1.0 - np.square(window_coordinate))
     test_function /= test_function.sum()
-    segment_starts, segment_ends = find_run_bounds(samples.segment)
+    # first sample of the segment, and the sample after its last one, for every sample [N]
+    segment_start, segment_end = find_run_bounds(samples.segment)
     # a window must end within the segment of its first sample
     window_starts = np.flatnonzero(
-        np.arange(window_samples, len(segment_ends) + window_samples) <= segment_ends
+        np.arange(window_samples, len(segment_end) + window_samples) <= segment_end
     )
     if not window_starts.size:
         raise FitError(
@@ -136,12 +138,12 @@ def integrate_windows(
         )
     # the stride is counted from the start of each segment
     window_starts = window_starts[
-        (window_starts - segment_starts[window_starts])
+        (window_starts - segment_start[window_starts])
         % max(round(stride_share * window_samples), 1)
         == 0
     ]
     columns = np.concatenate((samples.x, samples.y), axis=1)
-    windows_per_block = max(_MAX_BLOCK_NUMBERS // (window_samples * columns.shape[1]), 1)
+    windows_per_block = max(_MAX_BLOCK_ELEMENTS // (window_samples * columns.shape[1]), 1)
     # blocks bound the memory of the windows
     block_sums = []
     windows = np.lib.stride_tricks.sliding_window_view(columns, window_samples, axis=0)
@@ -157,11 +159,11 @@ def integrate_windows(
     )
 
 
-def number_regular_segments(group: np.ndarray, t: np.ndarray, time_step: float) -> np.ndarray:
-    """Return the number of the uninterrupted segment of each sample [N], ascending from 0.
+def label_regular_segments(group: np.ndarray, t: np.ndarray, time_step: float) -> np.ndarray:
+    """Return the index of the uninterrupted segment of each sample [N], ascending from 0.
 
     Args:
-        group: number of the manoeuvre of each sample [N], ascending.
+        group: index of the manoeuvre of each sample [N], ascending.
         t: time of each sample within its manoeuvre [N], s.
         time_step: sampling interval, s.
     """
@@ -173,7 +175,7 @@ def median_time_step(group: np.ndarray, t: np.ndarray) -> float:
     """Return the median time between neighbouring samples of a manoeuvre, s.
 
     Args:
-        group: number of the manoeuvre of each sample [N], ascending.
+        group: index of the manoeuvre of each sample [N], ascending.
         t: time of each sample within its manoeuvre [N], s.
 
     Raises:
@@ -189,11 +191,11 @@ def median_time_step(group: np.ndarray, t: np.ndarray) -> float:
 
 
 def effective_correlation_length(residual: np.ndarray) -> np.ndarray:
-    """Estimate the integrated autocorrelation time of residuals [N, K] in rows, [K], at least 1.
+    """Estimate the integrated autocorrelation time of residuals [N, K], counted in rows, [K] >= 1.
 
-    N rows have the information of N divided by this number of independent rows. The estimate is
-    1 + 2 sum rho over the lags before rho becomes insignificant (initial positive sequence
-    estimator, Geyer 1992).
+    N correlated rows determine a mean as well as N / (this number) independent rows. With the
+    autocorrelation rho at lags of 1, 2, ... rows, the estimate is 1 + 2 sum rho. The sum ends
+    before the first lag at which rho is not significant (Geyer 1992: initial positive sequence).
     """
     n = len(residual)
     centred = residual - residual.mean(axis=0)

@@ -403,7 +403,7 @@ def kmeans_plus_plus_indices(x: Tensor, n_points: int, seed: int) -> Tensor:
     return torch.tensor(indices)
 
 
-class RecursiveErrors:
+class SingleStateFreeRun:
     """Errors of free runs in which one state is integrated and all other inputs are measured.
 
     This is the first approach of document 001 section 4. It tunes every output alone; the coupled
@@ -551,7 +551,7 @@ class KernelRidge(Estimator):
             for i in range(len(paths))
             for j in range(n_penalties)
         ]
-        zero_state = self.kernel.zero_state() | {"effective": y.new_zeros(n_outputs)}
+        zero_state = self.kernel.zero_state() | {"effective_parameters": y.new_zeros(n_outputs)}
         empty_solution = Solution({"penalty": []}, zero_state, notes=notes)
         return [
             *(
@@ -599,7 +599,7 @@ class KernelRidge(Estimator):
 
         return Solution(
             kernel_settings | {"penalty": [self.penalties[j] for j in setting_indices.penalties]},
-            state | {"effective": effective_parameters},
+            state | {"effective_parameters": effective_parameters},
             notes=notes | {"effective_parameters": effective_parameters.tolist()},
             neighbours=neighbours if self.has_alternatives else None,
         )

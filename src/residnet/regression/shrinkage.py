@@ -1,6 +1,7 @@
 """Cross-validated ridge regression and partial least squares from moments per fold.
 
-Sources: document 001 section 2.2 with correction M4; document 002 section 3.2, corrections J14 to
+Sources: Moreno-Salinas et al. 2019, section 2.2 (ridge regression), and Jervan 2020, section 3.2
+(partial least squares). Both misprint equations; see `docs/documents/corrections.md`, M4 and J14 to
 J17.
 """
 
@@ -27,13 +28,13 @@ from residnet.regression.estimator import (
 
 CONSTANT_TOLERANCE = 1e-9
 """Ratio of standard deviation to maximum magnitude below which a column counts as constant."""
-_MIN_LATENT_ENERGY = 1e-13
-"""Minimum energy of a latent variable relative to that of a column.
+_MIN_LATENT_SUM_OF_SQUARES = 1e-13
+"""Minimum sum of squares of a latent variable relative to that of a column.
 
-A latent variable of less energy is caused by rounding or by linearly dependent columns.
+A smaller latent variable is caused by rounding or by linearly dependent columns.
 """
 _EXPLAINED_TOLERANCE = 1e-13
-"""Share of the initial covariance below which the residual covariance counts as zero."""
+"""Fraction of the initial covariance below which the residual covariance counts as zero."""
 _MIN_NORM = 1e-300
 """Lower bound of a norm in a denominator."""
 _MAX_CONSECUTIVE_ORDER = 8
@@ -61,13 +62,14 @@ class CentredMoments(NamedTuple):
 class FoldMoments:
     """Raw moments [1, X, Y]' [1, X, Y] of each fold, float64.
 
-    The moments need one pass over the data, and those of a training set are the difference of the
-    total and a fold. X and Y are shifted by their overall means first, which avoids cancellation.
+    The moments need one pass over the data. Those of a training set are the sum over all folds
+    minus the moments of the test fold. X and Y are shifted by their overall means first, which
+    avoids cancellation.
 
     Args:
         sums: moments of each fold [F, 1 + J + n, 1 + J + n].
-        shift_x: subtracted from x before [J].
-        shift_y: subtracted from y before [n].
+        shift_x: constants that were subtracted from the columns of x [J].
+        shift_y: constants that were subtracted from the columns of y [n].
     """
 
     def __init__(self, sums: Tensor, shift_x: Tensor, shift_y: Tensor) -> None:
@@ -178,8 +180,8 @@ class _RegularizationPathEstimator(Estimator):
     Args:
         folds: number of folds of the cross-validation; None for a fold per group.
         is_scaled: whether columns are scaled to unit variance; otherwise they are only centred.
-        has_alternatives: whether `fit` also returns the other complexities and the model without
-            coefficients.
+        has_alternatives: whether `fit` also returns the other complexities and the intercept-only
+            model.
     """
 
     def __init__(self, *, folds: int | None, is_scaled: bool, has_alternatives: bool) -> None:
@@ -205,7 +207,10 @@ class _RegularizationPathEstimator(Estimator):
 
     @abstractmethod
     def describe_complexity(self, complexities: Sequence[int]) -> dict[str, Any]:
-        """Return the hyperparameters of complexities per output; those of no model if empty."""
+        """Return the hyperparameters of complexities per output.
+
+        An empty sequence gives the hyperparameters of the intercept-only model.
+        """
 
     def fit_notes(self, errors: Tensor, variance: Tensor) -> dict[str, Any]:
         """Return the cross-validated errors [C, n] as notes of the fit."""
@@ -258,15 +263,15 @@ class _RegularizationPathEstimator(Estimator):
             return [empty_solution]
         solutions = []
         for complexities in self.select_complexities(errors, variance, len(path)):
-            columns = torch.stack(
+            coefficients = torch.stack(
                 [path[i, :, output] for output, i in enumerate(complexities)], dim=1
             )
             intercept = (
                 all_moments.mean_y
                 + moments.shift_y
-                - (all_moments.mean_x + moments.shift_x) @ columns
+                - (all_moments.mean_x + moments.shift_x) @ coefficients
             )
-            state = {"coefficients": columns, "intercept": intercept}
+            state = {"coefficients": coefficients, "intercept": intercept}
             solutions.append(Solution(self.describe_complexity(complexities), state, notes=notes))
         return [*solutions, empty_solution] if self.has_alternatives else solutions
 
@@ -285,17 +290,17 @@ class _RegularizationPathEstimator(Estimator):
 class Ridge(_RegularizationPathEstimator):
     """Ridge regression of every output, with an intercept that is not penalised.
 
-    The solution without coefficients has an empty list of penalties.
+    The intercept-only solution has an empty list of penalties.
 
     Args:
-        penalties: candidate penalties relative to the energy of a standardised column; the `alpha`
-            of scikit-learn is the penalty times the number of samples.
+        penalties: candidate penalties relative to the sum of squares of a standardised column; the
+            `alpha` of scikit-learn is the penalty times the number of samples.
         folds: number of folds of the cross-validation; None for a fold per group.
         is_scaled: whether columns are scaled to unit variance; otherwise they are only centred.
-        is_shared: whether all outputs have the same penalty, which minimizes the sum of errors;
+        is_shared: whether all outputs have the same penalty, which minimises the sum of errors;
             otherwise the penalty is chosen per output.
         has_alternatives: whether `fit` also returns a solution per penalty, shared by all outputs,
-            and the solution without coefficients.
+            and the intercept-only solution.
     """
 
     def __init__(
@@ -394,12 +399,12 @@ class PLSR(_RegularizationPathEstimator):
             # every low order, then orders that increase by a quarter
             alternative_orders = [1]
             while alternative_orders[-1] < n_complexities:
-                step = (
+                next_order = (
                     alternative_orders[-1] * 5 // 4
                     if alternative_orders[-1] >= _MAX_CONSECUTIVE_ORDER
                     else alternative_orders[-1] + 1
                 )
-                alternative_orders.append(min(step, n_complexities))
+                alternative_orders.append(min(next_order, n_complexities))
             orders += alternative_orders
         return [[k - 1] * n_outputs for k in orders]
 
@@ -422,7 +427,7 @@ def pls_path(
     """Compute the coefficients of partial least squares for every order, [A, ..., J, K].
 
     This is the kernel algorithm of Dayal and MacGregor (1997), which needs moments only. The path
-    ends early if the residual covariance or the energy of the next latent variable is zero.
+    ends early if the residual covariance or the next latent variable is zero.
 
     Args:
         xx: X'X of centred, scaled columns [..., J, J].
@@ -436,14 +441,14 @@ def pls_path(
     min_covariance = _EXPLAINED_TOLERANCE * torch.linalg.vector_norm(
         residual_covariance, dim=(-2, -1) if is_joint else -2
     )
-    min_energy = _MIN_LATENT_ENERGY * float(xx.diagonal(dim1=-2, dim2=-1).max())
+    min_sum_of_squares = _MIN_LATENT_SUM_OF_SQUARES * float(xx.diagonal(dim1=-2, dim2=-1).max())
     loadings: list[Tensor] = []
     rotations: list[Tensor] = []
     path_coefficients = torch.zeros_like(xy)
     path = []
-    for step in range(orders if isinstance(orders, int) else int(orders.max())):
+    for order in range(orders if isinstance(orders, int) else int(orders.max())):
         # orders ascend: the columns before `first_active` have all their latent variables
-        first_active = 0 if isinstance(orders, int) else int((orders <= step).sum())
+        first_active = 0 if isinstance(orders, int) else int((orders <= order).sum())
         active_covariance = residual_covariance[..., first_active:]
         if is_joint:
             left_vectors, singular_values, _ = torch.linalg.svd(
@@ -465,16 +470,17 @@ def pls_path(
                 * previous_rotation[..., first_active:]
             )
         gram_rotation = xx @ r if mask is None else (xx @ r) * mask[..., first_active:]
-        energy = (r * gram_rotation).sum(-2, keepdim=True)
-        is_active = is_active & (energy > min_energy)
+        # squared norm of the next latent variable X r
+        sum_of_squares = (r * gram_rotation).sum(-2, keepdim=True)
+        is_active = is_active & (sum_of_squares > min_sum_of_squares)
         if not bool(is_active.any()):
             break
         # loadings, coefficients and deflation; models that have converged do not change
-        safe_energy = torch.where(is_active, energy, 1.0)
+        divisor = torch.where(is_active, sum_of_squares, 1.0)
         y_loading = torch.where(
-            is_active, (r * active_covariance).sum(-2, keepdim=True) / safe_energy, 0.0
+            is_active, (r * active_covariance).sum(-2, keepdim=True) / divisor, 0.0
         )
-        p = torch.where(is_active, gram_rotation / safe_energy, 0.0)
+        p = torch.where(is_active, gram_rotation / divisor, 0.0)
         path_coefficients = torch.cat(
             (
                 path_coefficients[..., :first_active],
@@ -483,7 +489,10 @@ def pls_path(
             dim=-1,
         )
         residual_covariance = torch.cat(
-            (residual_covariance[..., :first_active], active_covariance - p * (y_loading * energy)),
+            (
+                residual_covariance[..., :first_active],
+                active_covariance - p * (y_loading * sum_of_squares),
+            ),
             dim=-1,
         )
         padding = torch.zeros_like(xy[..., : 0 if is_joint else first_active])

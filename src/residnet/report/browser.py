@@ -50,7 +50,7 @@ def render_bokeh(figures: Sequence[Figure]) -> InteractiveFigures | None:
 
     library = Resources(mode="inline", components=["bokeh"], minified=True).js_raw
     return InteractiveFigures(
-        {figure.key: _figure_json(figure) for figure in figures}, "\n".join(library)
+        {figure.html_id: _figure_json(figure) for figure in figures}, "\n".join(library)
     )
 
 
@@ -90,7 +90,7 @@ def _build_canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataS
 
     panel = figure.panels[number]
     canvas = new_canvas(
-        name=f"{figure.key}-{number}",
+        name=f"{figure.html_id}-{number}",
         title=Title(text=panel.heading, text_font_size=_FONT),
         height=panel.height,
         sizing_mode="stretch_width",
@@ -109,7 +109,7 @@ def _build_canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataS
     # the page scrolls under a finger; dragging zooms only after a button was pressed
     canvas.stylesheets = [":host .bk-events { touch-action: pan-y pinch-zoom; }"]
     renderers = [
-        _build_renderer(name, figure.styles[name], source) for name in figure.panel_names(number)
+        _build_renderer(name, figure.styles[name], source) for name in figure.curve_names(number)
     ]
     canvas.renderers.extend(renderers)
     # where places bear names, the name alone says what a mark is
@@ -132,7 +132,7 @@ def _build_canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataS
             code="return `${+value.toPrecision(4)} (${+(value / factor).toPrecision(4)} ${unit})`",
         )
         hover.tooltips = [("$name", "@$name{custom}")]
-        hover.formatters = {f"@{{{name}}}": unit_formatter for name in figure.panel_names(number)}
+        hover.formatters = {f"@{{{name}}}": unit_formatter for name in figure.curve_names(number)}
     canvas.add_tools(hover, models.BoxZoomTool(match_aspect=panel.kind == "map"))
     canvas.toolbar.active_drag = None
     canvas.xaxis.axis_label = format_exponents(panel.x_label) or None
@@ -185,11 +185,11 @@ def _build_renderer(name: str, style: GlyphStyle, source: ColumnDataSource) -> A
         glyph = models.Scatter(x=x, y=name, **marker)
     elif style.kind == "fill":
         glyph = models.Patch(x=x, y=name, **fill)
-    elif style.kind == "strip":
+    elif style.kind == "vspan":
         glyph = models.VStrip(x0=x, x1=name, **fill)
-    elif style.kind == "across":
+    elif style.kind == "hline":
         glyph = models.HSpan(y=name, **line)
-    elif style.kind == "upright":
+    elif style.kind == "vline":
         glyph = models.VSpan(x=x, **line)
     else:
         glyph = models.Line(x=x, y=name, **line)
@@ -201,7 +201,7 @@ def _panel_columns(figure: Figure, case: Case, panel: int) -> dict[str, np.ndarr
     traces = case.curves[panel]
     max_length = max((len(x) for x, _ in traces.values()), default=0)
     columns: dict[str, np.ndarray] = {}
-    for name in figure.panel_names(panel):
+    for name in figure.curve_names(panel):
         x, y = traces.get(name, (np.empty(0), np.empty(0)))
         columns |= {f"x of {name}": x, name: y}
     for name, values in columns.items():
@@ -222,18 +222,18 @@ def _figure_json(figure: Figure) -> str:
     names: dict[str, str] = {}
     text = json.dumps(document.to_json(deferred=False))
     for number, panel in enumerate(panels):
-        names[panel.id] = f"{figure.key}-root-{number}"
+        names[panel.id] = f"{figure.html_id}-root-{number}"
     text = re.sub(
         r"(?<=\")p\d{4,}(?=\")",
-        lambda match: names.setdefault(match[0], f"{figure.key}-{len(names)}"),
+        lambda match: names.setdefault(match[0], f"{figure.html_id}-{len(names)}"),
         text,
     )
     root_elements = {
-        f"{figure.key}-root-{i}": f"{figure.key}-{i}-panel" for i in range(len(panels))
+        f"{figure.html_id}-root-{i}": f"{figure.html_id}-{i}-panel" for i in range(len(panels))
     }
-    item = {"docid": figure.key, "roots": root_elements, "root_ids": list(root_elements)}
+    item = {"docid": figure.html_id, "roots": root_elements, "root_ids": list(root_elements)}
     content = {
-        **{"documents": {figure.key: json.loads(text)}, "items": [item]},
+        **{"documents": {figure.html_id: json.loads(text)}, "items": [item]},
         "looks": {
             name: {"color": style.color, "shown": style.is_visible}
             for name, style in figure.styles.items()

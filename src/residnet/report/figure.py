@@ -1,7 +1,7 @@
-"""A figure described once, drawn as a still picture (`still`) and in a browser (`browser`).
+"""Description of a figure, drawn as a static image (`still.py`) and on a page (`browser.py`).
 
-A figure has panels. What each panel shows bears names, and one name looks the same in all of them.
-One of several cases (a run, a protocol) is shown at a time.
+A figure has panels. Each panel shows named curves, and curves of the same name look the same in all
+panels. One of several cases (a run, a protocol) is shown at a time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ TEXT_COLOR = "ink"
 """The colour of text: black on paper, light on a dark screen."""
 Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
 """Horizontal and vertical values [T]; NaN marks a gap."""
-GlyphKind: TypeAlias = Literal["line", "points", "fill", "across", "upright", "strip"]
+# named as the functions of matplotlib: lines at values of an axis, and vertical bands
+GlyphKind: TypeAlias = Literal["line", "points", "fill", "hline", "vline", "vspan"]
 
 # Okabe and Ito's palette, which stays distinct under the common colour-vision deficiencies
 BLUE = "#0072B2"
@@ -41,17 +42,17 @@ class GlyphStyle:
 
     Attributes:
         label: text in the legend and at the visibility switch.
-        color: as CSS has it, or `TEXT_COLOR`.
+        color: CSS colour such as `#0072B2`, or `TEXT_COLOR`.
         dash: `solid`, `dashed`, `dotted`, `dashdot`, `long`, `short` or `dense`.
-        width: of its line in points.
-        kind: `line`, `points`, `fill` (outlines separated by gaps), `across` (horizontal lines at
-            vertical values), `upright` (vertical lines at horizontal values) or `strip` (vertical
-            bands between two horizontal values).
-        is_visible: whether it is visible initially and drawn in static images.
+        width: width of the line in points.
+        kind: `line`, `points`, `fill` (outlines separated by gaps), `hline` (horizontal lines at
+            the vertical values), `vline` (vertical lines at the horizontal values) or `vspan`
+            (vertical bands between two horizontal values).
+        is_visible: whether the curve is visible initially and drawn in static images.
         alpha: opacity.
-        marker: of points: `o`, `s`, `x` or `^`.
-        size: of points, in points.
-        is_hollow: points are rings.
+        marker: marker of points: `o`, `s`, `x` or `^`.
+        size: diameter of the marker in points.
+        is_hollow: whether markers are drawn as outlines.
         z_order: drawing order; higher values are drawn on top.
     """
 
@@ -69,20 +70,23 @@ class GlyphStyle:
 
 
 MAX_PREVIEW_HEIGHT = 280
-"""Most pixels of a panel on a first screen, which on a phone holds rows of a table as well."""
+"""Maximum height in pixels of a panel at the top of a page, which leaves space for the first rows
+of a table on the screen of a phone.
+"""
 MEASURED_STYLE = GlyphStyle("measured", width=0.7, z_order=2)
 SOLID_STYLE = GlyphStyle("", BLUE, width=1.6)
 DASHED_STYLE = GlyphStyle("", ORANGE, "dashed", 1.6, z_order=4)
-"""Two curves of equal rank, distinguished by colour and line style."""
-MASKED_STYLE = GlyphStyle("masked", "#E0E0E0", kind="strip", alpha=0.8, z_order=0)
+"""Styles of two curves that are compared, distinguished by colour and line style."""
+MASKED_STYLE = GlyphStyle("masked", "#E0E0E0", kind="vspan", alpha=0.8, z_order=0)
 START_STYLE = GlyphStyle("start", kind="points", size=6, is_hollow=True, z_order=6)
-ZERO_LINE_STYLE = GlyphStyle("", "#666666", width=0.8, kind="across", z_order=1)
+ZERO_LINE_STYLE = GlyphStyle("", "#666666", width=0.8, kind="hline", z_order=1)
 
 
 def style_family(names: Iterable[str], **attributes: Any) -> dict[str, GlyphStyle]:
-    """Return styles of equal rank by name, distinguished by colour and line style.
+    """Return a style for each name, distinguished by colour and line style.
 
     Args:
+        names: names of the curves, which are also their labels.
         attributes: further attributes of all styles.
     """
     n_colors = len(COLORS)
@@ -101,13 +105,13 @@ class Panel:
     """One set of axes.
 
     Attributes:
-        y_label: of the vertical axis, with its unit.
-        x_label: of the horizontal axis, with its unit; empty if the panel below has the label.
-        title: above it.
-        kind: a `map` has equal scales; `curves` of one group share their horizontal axis.
-        height: in pixels on a page, at 110 to the inch in a still picture.
+        y_label: label of the vertical axis with its unit.
+        x_label: label of the horizontal axis with its unit; empty if the panel below has the label.
+        title: title above the panel.
+        kind: `map` for equal scales of both axes, `curves` for others.
+        height: height in pixels on a page; 110 pixels are an inch in a static image.
         x_log, y_log: whether an axis is logarithmic.
-        group: of panels that share their horizontal axis.
+        group: name of the group of `curves` panels that share their horizontal axis.
         x_names, y_names: tick labels that replace numbers, by position.
         si_unit: SI unit of the vertical values and the factor from SI; empty if they are in SI
             units.
@@ -144,7 +148,7 @@ class Case:
         title: entry in the selection list.
         curves: for each panel, curves by name.
         note: optional sentence about the case.
-        still: whether a static image is written.
+        has_static_image: whether a static image of the case is written.
         texts: annotations of the static image: panel number, position and text; a vertical
             position of NaN is the upper edge.
     """
@@ -152,7 +156,7 @@ class Case:
     title: str
     curves: Sequence[Mapping[str, Curve]]
     note: str = ""
-    still: bool = True
+    has_static_image: bool = True
     texts: Sequence[tuple[int, float, float, str]] = ()
 
 
@@ -162,11 +166,11 @@ class Figure:
 
     Attributes:
         name: stem of its files and of its HTML identifiers.
-        title: a few words.
+        title: short title.
         caption: sentences that explain the figure.
-        styles: by name, in the order of the legend.
-        panels: from top to bottom; row by row if there are several columns.
-        cases: at least one.
+        styles: style of each curve by name, in the order of the legend.
+        panels: panels from top to bottom; row by row if there are several columns.
+        cases: selectable cases, at least one.
         chooser: label of the selection list.
         columns: number of panel columns.
         static_images: paths of the PNG files.
@@ -184,30 +188,30 @@ class Figure:
     static_images: Sequence[Path] = ()
 
     @property
-    def key(self) -> str:
-        """Name of its parts on a page: letters, digits and `-`."""
+    def html_id(self) -> str:
+        """Prefix of the HTML identifiers of the figure: letters, digits and `-`."""
         return "figure-" + re.sub(r"[^a-z0-9]+", "-", self.name.lower())
 
     @property
     def static_cases(self) -> list[Case]:
         """Cases with a static image, in the order of the images."""
-        return [case for case in self.cases if case.still]
+        return [case for case in self.cases if case.has_static_image]
 
-    def preview(self, panels: int = 1) -> Figure:
-        """Return the first panels without captions, for the first screen of a page.
+    def preview(self, n_panels: int = 1) -> Figure:
+        """Return a figure of the first panels without caption, for the top of a page.
 
         The preview has no static images because the complete figure follows on the page.
         """
         # panels beneath each other share the name of their horizontal axis
         last = self.panels[-1]
-        cases = [replace(case, curves=case.curves[:panels], texts=()) for case in self.cases]
+        cases = [replace(case, curves=case.curves[:n_panels], texts=()) for case in self.cases]
         preview_panels = [
             replace(
                 panel,
                 height=min(panel.height, MAX_PREVIEW_HEIGHT),
                 x_label=panel.x_label or last.x_label,
             )
-            for panel in self.panels[:panels]
+            for panel in self.panels[:n_panels]
         ]
         present_names = {
             name for case in cases for case_curves in case.curves for name in case_curves
@@ -226,8 +230,8 @@ class Figure:
             static_images=(),
         )
 
-    def panel_names(self, panel: int) -> list[str]:
-        """Return the names of what a panel shows in any case, in order."""
+    def curve_names(self, panel: int) -> list[str]:
+        """Return the names of the curves that a panel shows in one case or more, in order."""
         present = {name for case in self.cases for name in case.curves[panel]}
         return [name for name in self.styles if name in present]
 
@@ -235,7 +239,7 @@ class Figure:
         """Return whether the horizontal values of a panel are integers."""
         x_values = [x for case in self.cases for x, _ in case.curves[panel].values()]
         finite_values = [x[np.isfinite(x)] for x in x_values]
-        # values of a file are packed in 16 bits
+        # values that are read from a file were rounded to 16 bits, see `figure_files`
         tolerance = 2e-5 * max((float(np.ptp(x)) for x in finite_values if x.size), default=0.0)
         return any(x.size for x in finite_values) and all(
             (abs(x - x.round()) <= tolerance).all() for x in finite_values
@@ -243,14 +247,14 @@ class Figure:
 
 
 def split_at_gaps(x: Any, y: Any) -> list[Curve]:
-    """Return a curve in the pieces that its gaps leave."""
+    """Split a curve into its parts between gaps (values that are not finite)."""
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     is_finite = np.isfinite(x) & np.isfinite(y)
     return [(x[a:b], y[a:b]) for a, b in zip(*find_runs(is_finite), strict=True)]
 
 
 def join_with_gaps(xy_pairs: Iterable[tuple[Any, Any]]) -> Curve:
-    """Return several curves as one with gaps between them."""
+    """Join several curves to one, with a gap between each two."""
     gap = [np.nan]
     padded_curves = [
         (np.append(np.asarray(x, dtype=float), gap), np.append(np.asarray(y, dtype=float), gap))
@@ -271,7 +275,7 @@ def subsample_indices(length: int, max_count: int) -> np.ndarray:
 
 
 def band_outline(x: Any, lower: Any, upper: Any) -> Curve:
-    """Return the outline of what lies between two curves [T] over x [T], a `fill`."""
+    """Return the outline of the area between two curves [T] over x [T], for a style `fill`."""
     lower = np.asarray(lower, dtype=float)
     upper = np.asarray(upper, dtype=float)
     is_finite = np.isfinite(lower) & np.isfinite(upper)
@@ -283,7 +287,10 @@ def band_outline(x: Any, lower: Any, upper: Any) -> Curve:
 
 
 def bar_outlines(positions: Any, values: Any, thickness: float = 0.8) -> Curve:
-    """Return the outlines of upright bars from zero, a `fill`; swap its parts for lying ones."""
+    """Return the outlines of vertical bars from zero, for a style `fill`.
+
+    Exchange x and y of the result for horizontal bars.
+    """
     corners = thickness * np.array([-0.5, -0.5, 0.5, 0.5])
     return join_with_gaps(
         [
@@ -294,7 +301,10 @@ def bar_outlines(positions: Any, values: Any, thickness: float = 0.8) -> Curve:
 
 
 def error_bars(positions: Any, lower: Any, upper: Any) -> Curve:
-    """Return upright lines from low to high values, swap its parts for lying ones."""
+    """Return vertical lines from lower to upper values.
+
+    Exchange x and y of the result for horizontal lines.
+    """
     return join_with_gaps(
         [
             ([position] * 2, limits)
@@ -304,12 +314,12 @@ def error_bars(positions: Any, lower: Any, upper: Any) -> Curve:
 
 
 def step_curve(x: Any, y: Any) -> Curve:
-    """Return a curve that keeps each value up to the next one."""
+    """Return a step function that holds each value up to the next sample."""
     return np.repeat(np.asarray(x, dtype=float), 2)[1:], np.repeat(np.asarray(y, dtype=float), 2)[
         :-1
     ]
 
 
 def tick_labels(texts: Iterable[str]) -> dict[str, str]:
-    """Return the tick labels at the integers of an axis."""
+    """Return texts as the tick labels of an axis at 0, 1, 2, ...; see `Panel.x_names`."""
     return {str(index): text for index, text in enumerate(texts)}

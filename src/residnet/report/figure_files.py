@@ -84,7 +84,7 @@ def write_figure(folder: Path, figure: Figure, name: str = "") -> Figure:
         "panels": [asdict(panel) for panel in figure.panels],
         "stills": [path.name for path in image_paths],
         "cases": [
-            {"title": case.title, "note": case.note, "still": case.still}
+            {"title": case.title, "note": case.note, "still": case.has_static_image}
             | {"curves": [_pack_curves(panel_curves) for panel_curves in case.curves]}
             for case in figure.cases
         ],
@@ -95,6 +95,8 @@ def write_figure(folder: Path, figure: Figure, name: str = "") -> Figure:
 
 
 _STORED_FIELDS = ("name", "title", "caption", "chooser", "columns")
+_FORMER_KINDS = {"across": "hline", "upright": "vline", "strip": "vspan"}
+"""Kind of a curve by its name in files of earlier versions."""
 
 
 def _pack_curves(panel_curves: Mapping[str, Curve]) -> dict[str, Any]:
@@ -151,7 +153,10 @@ def figures_section(folder: Path) -> list[Section]:
 def _read_figure(path: Path) -> Figure | None:
     try:
         content = read_json(path)
+        for style in content["looks"].values():
+            style["kind"] = _FORMER_KINDS.get(style["kind"], style["kind"])
         for case in content["cases"]:
+            case["has_static_image"] = case.pop("still")
             case["curves"] = [
                 {
                     name[1:]: (

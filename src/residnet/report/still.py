@@ -119,7 +119,7 @@ def _draw_panel(
     axes: Any, figure: Figure, case: Case, number: int, handles: dict[str, Any]
 ) -> None:
     panel = figure.panels[number]
-    for name in figure.panel_names(number):
+    for name in figure.curve_names(number):
         style = figure.styles[name]
         if name in case.curves[number] and style.is_visible:
             x, y = (np.asarray(values, dtype=float) for values in case.curves[number][name])
@@ -208,12 +208,12 @@ def _draw_curve(axes: Any, style: GlyphStyle, x: np.ndarray, y: np.ndarray) -> A
     lower: float
     upper: float
     for lower, upper in zip(x, y, strict=True):
-        if style.kind == "strip" and np.isfinite(lower):
+        if style.kind == "vspan" and np.isfinite(lower):
             artist = axes.axvspan(lower, upper, **line, linewidth=0)
-        elif style.kind != "strip" and np.isfinite(lower) and np.isfinite(upper):
+        elif style.kind != "vspan" and np.isfinite(lower) and np.isfinite(upper):
             artist = (
                 axes.axhline(upper, **stroke)
-                if style.kind == "across"
+                if style.kind == "hline"
                 else axes.axvline(lower, **stroke)
             )
     return artist

@@ -309,7 +309,7 @@ def _error_figure(
         "train": GlyphStyle("training data", "#BFBFBF", kind="fill"),
         "test": GlyphStyle("unseen manoeuvres", BLUE, kind="fill"),
         "ci95": GlyphStyle("", width=0.8, z_order=4),
-        "noise": GlyphStyle("simulator itself (sensor noise)", dash="dotted", kind="across"),
+        "noise": GlyphStyle("simulator itself (sensor noise)", dash="dotted", kind="hline"),
         **{
             model: GlyphStyle("", MODEL_STYLES[model].color, kind="points", size=2.5)
             for model in models

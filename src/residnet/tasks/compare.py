@@ -27,8 +27,21 @@ from residnet.runs.folder import RunFolder
 _MAX_DIFFERENCES = 60
 """Maximum number of different settings on the page."""
 _ABSENT = object()
-WindowKey = tuple[str, str, float]
-"""Log, protocol and start time in s of a window."""
+"""Stands for the value of a key that a config does not have."""
+
+
+class WindowKey(NamedTuple):
+    """Identifies a window of a free run in the rollouts of several runs.
+
+    Attributes:
+        log: name of the log.
+        evaluation_protocol: name of the evaluation protocol, for example `T100`.
+        start_time: time in s at which the free run starts, rounded to 1 ms.
+    """
+
+    log: str
+    evaluation_protocol: str
+    start_time: float
 
 
 class EvaluatedRun(RunFiles):
@@ -42,7 +55,7 @@ class EvaluatedRun(RunFiles):
     def __init__(self, name: str, path: Path) -> None:
         super().__init__(RunFolder.open(path).path)
         if not (path / "metrics.json").is_file():
-            raise UsageError(f"{path}: has no metrics.json; runs of fits can be compared")
+            raise UsageError(f"{path}: has no metrics.json; compare finished runs of the task fit")
         self.name = name
         self.model = self.metrics.selected
 
@@ -51,13 +64,13 @@ class EvaluatedRun(RunFiles):
         """The evaluated free runs by log, protocol and start time."""
         stored_windows = self.read_split_windows(self.report_split)
         return {
-            (window.log, window.protocol, round(float(window.t[0]), 3)): window
+            WindowKey(window.log, window.protocol, round(float(window.t[0]), 3)): window
             for window in stored_windows
         }
 
 
 def compare_runs(paths: Sequence[Path], output_folder: Path) -> tuple[str, Path]:
-    """Compare finished fits; returns the text for the terminal and the page.
+    """Compare finished fits and return the text for the terminal and the path of the page.
 
     Args:
         paths: folders of the runs; the first run is the reference.
@@ -96,6 +109,7 @@ def compare_runs(paths: Sequence[Path], output_folder: Path) -> tuple[str, Path]
         if comparisons:
             # the top of the page shows the first protocol only
             first_protocol = {protocol: comparisons[protocol] for protocol in list(comparisons)[:1]}
+            # the first screen has space for NRMSE, difference and interval of each run only
             summary_table = _build_paired_table(runs, first_protocol).select_columns(3, 6)
             summary_table.caption = f"Selected models, {next(iter(first_protocol))}."
             sections.append(Section("", [_plot_error_growth(runs, output_folder), summary_table]))
@@ -128,7 +142,7 @@ def open_fit_runs(paths: Sequence[Path]) -> list[EvaluatedRun]:
         raise UsageError("compare: the same run is given twice")
     runs = [EvaluatedRun(name, path) for name, path in zip(names, paths, strict=True)]
     for run in runs:
-        if not common_channels([runs[0], run]):
+        if not common_velocities([runs[0], run]):
             raise UsageError(
                 f"compare: {run.name} predicts {', '.join(run.dof.active_states)}, and"
                 f" {runs[0].name} {', '.join(runs[0].dof.active_states)}; name runs that share a"
@@ -137,7 +151,7 @@ def open_fit_runs(paths: Sequence[Path]) -> list[EvaluatedRun]:
     return runs
 
 
-def common_channels(runs: Sequence[EvaluatedRun]) -> list[str]:
+def common_velocities(runs: Sequence[EvaluatedRun]) -> list[str]:
     """Return the velocities that all runs model, in the order of the first run."""
     return [
         name for name in runs[0].dof.active_states if all(name in r.dof.active_states for r in runs)
@@ -150,7 +164,7 @@ def _common_windows(runs: Sequence[EvaluatedRun]) -> dict[str, list[WindowKey]]:
     windows_by_protocol: dict[str, list[WindowKey]] = {}
     for window in sorted(common_keys):
         if len({len(run.windows_by_key[window].t) for run in runs}) == 1:
-            windows_by_protocol.setdefault(window[1], []).append(window)
+            windows_by_protocol.setdefault(window.evaluation_protocol, []).append(window)
     return windows_by_protocol
 
 
@@ -160,7 +174,7 @@ class RunComparison(NamedTuple):
     Attributes:
         windows: number of windows.
         nrmse: mean error.
-        difference: paired difference to the first run.
+        difference: paired difference from the first run.
     """
 
     windows: int
@@ -169,7 +183,7 @@ class RunComparison(NamedTuple):
 
 
 def compare_paired(runs: Sequence[EvaluatedRun]) -> dict[str, dict[str, RunComparison]]:
-    """Compute paired differences to the first run over common windows.
+    """Compute paired differences from the first run over common windows.
 
     Errors are normalised root mean square errors (NRMSE), averaged over the velocities of all runs,
     with the scales of the first run.
@@ -186,8 +200,8 @@ def compare_paired(runs: Sequence[EvaluatedRun]) -> dict[str, dict[str, RunCompa
             )
             for run in runs
         ]
-        logs = list(dict.fromkeys(window[0] for window in windows))
-        bootstrap_blocks = make_resampling_blocks([logs.index(window[0]) for window in windows])
+        logs = list(dict.fromkeys(window.log for window in windows))
+        bootstrap_blocks = make_resampling_blocks([logs.index(window.log) for window in windows])
         comparisons[protocol] = {
             run.name: RunComparison(
                 len(windows),
@@ -201,7 +215,7 @@ def compare_paired(runs: Sequence[EvaluatedRun]) -> dict[str, dict[str, RunCompa
 
 def _reference_scales(runs: Sequence[EvaluatedRun]) -> dict[str, float]:
     """Return the scales of the first run for the common velocities."""
-    return {name: runs[0].metrics.scales[name] for name in common_channels(runs)}
+    return {name: runs[0].metrics.scales[name] for name in common_velocities(runs)}
 
 
 class _PairedRow(NamedTuple):
@@ -247,7 +261,7 @@ def _build_paired_table(
             ("95 % interval", format_interval),
         ],
         caption="Selected models over the windows that all runs evaluated, with the scales of"
-        f" {reference_name}; differences to {reference_name}, negative where the run is better.",
+        f" {reference_name}; differences from {reference_name}, negative where the run is better.",
         is_selected=lambda row: row.comparison.nrmse == lowest_error[row.protocol],
         group_key=lambda row: row.protocol,
     )
@@ -278,15 +292,15 @@ def _summarize_value(value: Any) -> str:
         case float():
             return f"{value:.4g}"
         case {"kind": part_kind}:
-            return f"there (kind {part_kind})"
+            return f"set (kind {part_kind})"
         case Mapping():
             items = [f"{key} {_summarize_value(part)}" for key, part in value.items()]
             ellipsis = " ..." if len(items) > 2 else ""
-            return f"there ({', '.join(items[:2])}{ellipsis})" if items else "there"
+            return f"set ({', '.join(items[:2])}{ellipsis})" if items else "set"
         case list() | tuple():
             text = ", ".join(map(_summarize_value, value))
         case _:
-            text = "not there" if value is _ABSENT else f"{value}"
+            text = "not set" if value is _ABSENT else f"{value}"
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 

@@ -194,7 +194,7 @@ def plot_recordings(logs: Sequence[Log]) -> Figure:
         "",
         {"log": replace(SOLID_STYLE, label="measured"), "start": START_STYLE},
         [panel],
-        [Case(log.name, [log_curves(log)], still=log is logs[0]) for log in logs],
+        [Case(log.name, [log_curves(log)], has_static_image=log is logs[0]) for log in logs],
         "Recording",
     )
 

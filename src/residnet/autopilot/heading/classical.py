@@ -276,7 +276,12 @@ class RatedBangBangHeading(Policy):
 
 
 def predict_centred_rudder(
-    error: Tensor, r: Tensor, rudder_share: Tensor, force: Tensor, decay: Tensor, swing_time: float
+    error: Tensor,
+    r: Tensor,
+    normalised_rudder: Tensor,
+    max_yaw_acceleration: Tensor,
+    inverse_time_constant: Tensor,
+    swing_time: float,
 ) -> tuple[Tensor, Tensor]:
     """Predict heading error and yaw rate [B, 1] for the time when the rudder has been centred.
 
@@ -285,57 +290,66 @@ def predict_centred_rudder(
     Args:
         error: heading error [B, 1] in rad.
         r: yaw rate [B, 1] in rad/s.
-        rudder_share: rudder angle [B, 1] as a fraction of its limit.
-        force: yaw acceleration [B, 1] at full rudder in rad/s^2.
-        decay: 1/T [B, 1] in 1/s.
+        normalised_rudder: rudder angle [B, 1] as a fraction of its limit.
+        max_yaw_acceleration: yaw acceleration [B, 1] at full rudder in rad/s^2.
+        inverse_time_constant: 1/T [B, 1] in 1/s.
         swing_time: time in s that the rudder takes from amidships to its limit.
     """
-    centring_time = rudder_share.abs() * swing_time
-    centred_yaw_rate = r + centring_time * (0.5 * force * rudder_share - decay * r)
+    centring_time = normalised_rudder.abs() * swing_time
+    centred_yaw_rate = r + centring_time * (
+        0.5 * max_yaw_acceleration * normalised_rudder - inverse_time_constant * r
+    )
     return error - centring_time * (
-        r + centring_time * (force * rudder_share / 3.0 - 0.5 * decay * r)
+        r
+        + centring_time
+        * (max_yaw_acceleration * normalised_rudder / 3.0 - 0.5 * inverse_time_constant * r)
     ), centred_yaw_rate
 
 
 def braking_distance(
     r: Tensor,
-    force: Tensor,
-    decay: Tensor,
+    max_yaw_acceleration: Tensor,
+    inverse_time_constant: Tensor,
     stiffness: Tensor,
     damping_ratio: Tensor,
     swing_time: float,
 ) -> Tensor:
-    """Return the heading change [B, 1] while r_dot = -force - decay r brakes the yaw rate to zero.
+    """Return the heading change [B, 1] while full counter-rudder reduces the yaw rate to zero.
 
-    For small yaw rates the result is r / nu, joined with a continuous slope. nu is chosen so that
-    the linear closed loop, d^2 e / dt^2 + (decay + stiffness / nu) de / dt + stiffness e = 0, has
-    the damping ratio `damping_ratio`. The rudder starts and ends amidships: braking takes half a
-    rudder movement longer, or is a pulse that does not reach the limit.
+    The yaw rate follows r_dot = -a - r / T with the maximum yaw acceleration a. For small yaw rates
+    the result is r / nu, joined with a continuous slope. nu is chosen so that the linear closed
+    loop, d^2 e / dt^2 + (1 / T + stiffness / nu) de / dt + stiffness e = 0, has the damping ratio
+    `damping_ratio`. The rudder starts and ends amidships: braking takes half a rudder movement
+    longer, or is a pulse that does not reach the limit.
 
     Args:
         r: yaw rate [B, 1] in rad/s.
-        force: braking acceleration in rad/s^2.
-        decay: 1/T in 1/s.
+        max_yaw_acceleration: braking acceleration in rad/s^2.
+        inverse_time_constant: 1/T in 1/s.
         stiffness: yaw acceleration per heading error near the reference in 1/s^2.
         damping_ratio: damping ratio near the reference.
         swing_time: time in s that the rudder takes from amidships to its limit.
     """
-    linear_time = ((2.0 * damping_ratio * torch.sqrt(stiffness) - decay) / stiffness).clamp(
-        min=1e-3
-    )
+    linear_time = (
+        (2.0 * damping_ratio * torch.sqrt(stiffness) - inverse_time_constant) / stiffness
+    ).clamp(min=1e-3)
     saturated_time = (linear_time - 0.5 * swing_time).clamp(min=1e-3)
-    linear_limit = force * saturated_time / (1.0 - decay * saturated_time).clamp(min=0.1)
+    linear_limit = (
+        max_yaw_acceleration
+        * saturated_time
+        / (1.0 - inverse_time_constant * saturated_time).clamp(min=0.1)
+    )
     if swing_time > 0.0:
         linear_limit = torch.where(
             linear_time < 1.5 * swing_time,
-            (linear_time / 1.5).square() * force / swing_time,
+            (linear_time / 1.5).square() * max_yaw_acceleration / swing_time,
             linear_limit,
         )
     yaw_rate_size = r.abs()
     saturated_rate = torch.maximum(yaw_rate_size, linear_limit)
     saturated_distance = (
-        _stopping_angle(saturated_rate, force, decay, swing_time)
-        - _stopping_angle(linear_limit, force, decay, swing_time)
+        _stopping_angle(saturated_rate, max_yaw_acceleration, inverse_time_constant, swing_time)
+        - _stopping_angle(linear_limit, max_yaw_acceleration, inverse_time_constant, swing_time)
         + linear_limit * linear_time
     )
     return r.sign() * torch.where(
@@ -343,16 +357,29 @@ def braking_distance(
     )
 
 
-def _stopping_angle(r: Tensor, force: Tensor, decay: Tensor, swing_time: float) -> Tensor:
+def _stopping_angle(
+    r: Tensor, max_yaw_acceleration: Tensor, inverse_time_constant: Tensor, swing_time: float
+) -> Tensor:
     """Return the heading change [B, 1] until a yaw rate r > 0 is zero.
 
-    It is the integral of r dr / (force + decay r) plus the contribution of the rudder movement.
+    It is the integral of r dr / (a + r / T), with the maximum yaw acceleration a, plus the
+    contribution of the rudder movement.
     """
-    braking_angle = (r - force / decay * torch.log1p(decay * r / force)) / decay
+    braking_angle = (
+        r
+        - max_yaw_acceleration
+        / inverse_time_constant
+        * torch.log1p(inverse_time_constant * r / max_yaw_acceleration)
+    ) / inverse_time_constant
     if swing_time == 0.0:
         return braking_angle
-    pulse_angle = r * torch.sqrt(r * swing_time / force) - 0.5 * r.square() / force
-    return braking_angle + torch.where(r < force * swing_time, pulse_angle, 0.5 * swing_time * r)
+    pulse_angle = (
+        r * torch.sqrt(r * swing_time / max_yaw_acceleration)
+        - 0.5 * r.square() / max_yaw_acceleration
+    )
+    return braking_angle + torch.where(
+        r < max_yaw_acceleration * swing_time, pulse_angle, 0.5 * swing_time * r
+    )
 
 
 class HeadingLaw(nn.Module, ABC):
@@ -369,9 +396,9 @@ class HeadingLaw(nn.Module, ABC):
         self,
         error: Tensor,
         r: Tensor,
-        rudder_share: Tensor,
-        force: Tensor,
-        decay: Tensor,
+        normalised_rudder: Tensor,
+        max_yaw_acceleration: Tensor,
+        inverse_time_constant: Tensor,
         constants: list[Tensor],
     ) -> Tensor:
         """Return the desired rudder [B, 1] as a fraction of its limit, not yet saturated.
@@ -379,9 +406,9 @@ class HeadingLaw(nn.Module, ABC):
         Args:
             error: heading error [B, 1] in rad.
             r: yaw rate [B, 1] in rad/s.
-            rudder_share: rudder angle plus disturbance [B, 1] as a fraction of the limit.
-            force: yaw acceleration [B, 1] at full rudder in rad/s^2.
-            decay: 1/T [B, 1] in 1/s.
+            normalised_rudder: rudder angle plus disturbance [B, 1] as a fraction of the limit.
+            max_yaw_acceleration: yaw acceleration [B, 1] at full rudder in rad/s^2.
+            inverse_time_constant: 1/T [B, 1] in 1/s.
             constants: constants of the law, [1] or [B, 1] each.
         """
 
@@ -404,13 +431,16 @@ class RegulatorLaw(HeadingLaw):
         self,
         error: Tensor,
         r: Tensor,
-        rudder_share: Tensor,
-        force: Tensor,
-        decay: Tensor,
+        normalised_rudder: Tensor,
+        max_yaw_acceleration: Tensor,
+        inverse_time_constant: Tensor,
         constants: list[Tensor],
     ) -> Tensor:
         heading, rate = regulator_gains(
-            constants[0], constants[1], force / (decay * self.limit), 1.0 / decay
+            constants[0],
+            constants[1],
+            max_yaw_acceleration / (inverse_time_constant * self.limit),
+            1.0 / inverse_time_constant,
         )
         return (heading * error - rate * r) / self.limit
 
@@ -448,9 +478,9 @@ class ProximateTimeOptimalLaw(HeadingLaw):
         self,
         error: Tensor,
         r: Tensor,
-        rudder_share: Tensor,
-        force: Tensor,
-        decay: Tensor,
+        normalised_rudder: Tensor,
+        max_yaw_acceleration: Tensor,
+        inverse_time_constant: Tensor,
         constants: list[Tensor],
     ) -> Tensor:
         """Return steepness times the heading error [B, 1] that remains after braking."""
@@ -463,9 +493,19 @@ class ProximateTimeOptimalLaw(HeadingLaw):
             # the command depends on the rudder angle with a gain above one, which only the rate
             # limit keeps stable: gradients through this loop would grow from step to step
             predicted_error, predicted_rate = predict_centred_rudder(
-                error, r, rudder_share.detach(), force, decay, self.swing_time
+                error,
+                r,
+                normalised_rudder.detach(),
+                max_yaw_acceleration,
+                inverse_time_constant,
+                self.swing_time,
             )
         stopping_angle = braking_distance(
-            predicted_rate, share * force, decay, steepness * force, damping_ratio, self.swing_time
+            predicted_rate,
+            share * max_yaw_acceleration,
+            inverse_time_constant,
+            steepness * max_yaw_acceleration,
+            damping_ratio,
+            self.swing_time,
         )
         return steepness * (predicted_error - stopping_angle)

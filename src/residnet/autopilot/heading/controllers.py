@@ -21,11 +21,11 @@ from residnet.autopilot.heading.classical import (
     regulator_gains,
 )
 from residnet.autopilot.heading.policies import (
-    SIGHT_CONSTANTS,
+    LOS_CONSTANTS,
     AnglePolicy,
     DepthPolicy,
     NetworkPolicy,
-    ObservedPolicy,
+    ObserverPolicy,
 )
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.heading.vessels import SteeredVessel
@@ -366,15 +366,15 @@ class ObservedConfig(TunableConfig, ABC):
     def build_law(self, limit: float, rate: float | None) -> HeadingLaw:
         """Build the law for a rudder limit in rad and a rudder rate in rad/s (None: no limit)."""
 
-    def build(self, task: ControlTask) -> ObservedPolicy:
+    def build(self, task: ControlTask) -> ObserverPolicy:
         return self.build_batched(self.complete_parameters(), task)
 
     def build_batched(
         self, parameters: Mapping[str, float | Tensor], task: ControlTask
-    ) -> ObservedPolicy:
+    ) -> ObserverPolicy:
         """Build the policy without a network; each constant is a scalar or [B]."""
         vessel = task.vessel
-        return ObservedPolicy(
+        return ObserverPolicy(
             vessel.state,
             nomoto=task.nomoto,
             law=self.build_law(task.limit, vessel.rate),
@@ -466,10 +466,10 @@ class DepthConfig(TunableConfig):
 
     @property
     def batched_parameters(self) -> tuple[str, ...]:
-        return ("constants", *(f"law.{name}" for name in self.pitch.batched_parameters))
+        return ("constants", *(f"inner_policy.{name}" for name in self.pitch.batched_parameters))
 
     def parameter_values(self) -> dict[str, float | None]:
-        """Return the parameters of the line of sight and of the inner law."""
+        """Return the parameters of the line of sight and of the inner policy."""
         return super().parameter_values() | self.pitch.parameter_values()
 
     def search_ranges(self, nomoto: NomotoModel) -> dict[str, SearchRange]:
@@ -477,9 +477,7 @@ class DepthConfig(TunableConfig):
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Self:
         """Return a copy with parameter values, including the inner law."""
-        sight_parameters = {
-            name: parameters[name] for name in SIGHT_CONSTANTS if name in parameters
-        }
+        sight_parameters = {name: parameters[name] for name in LOS_CONSTANTS if name in parameters}
         law_parameters = {
             name: value for name, value in parameters.items() if name not in sight_parameters
         }
@@ -558,7 +556,7 @@ class _PolicySpec(Stored):
         return NomotoModel(self.gain, self.time, self.speed, self.righting)
 
 
-class ObservedPolicySpec(_PolicySpec):
+class ObserverPolicySpec(_PolicySpec):
     """Stored specification of a heading policy with observer, predictor and recurrent network.
 
     Attributes:
@@ -573,9 +571,9 @@ class ObservedPolicySpec(_PolicySpec):
     law: AnyObservedLaw
     units: int = Field(ge=0, le=10_000)
 
-    def build(self) -> ObservedPolicy:
+    def build(self) -> ObserverPolicy:
         """Build the policy with an untrained network."""
-        return ObservedPolicy(
+        return ObserverPolicy(
             self.state,
             nomoto=self.nomoto,
             law=self.law.build_law(self.limit, self.rate),
@@ -585,7 +583,7 @@ class ObservedPolicySpec(_PolicySpec):
             rate=self.rate,
             lag=self.law.lag,
             units=self.units,
-            trained_at=self.trained_at,
+            training_time_step=self.trained_at,
         )
 
 
@@ -611,24 +609,24 @@ class NetworkPolicySpec(_PolicySpec):
             dt=self.dt,
             rate=self.rate,
             units=self.units,
-            trained_at=self.trained_at,
+            training_time_step=self.trained_at,
         )
 
 
 class DepthPolicySpec(Stored):
-    """Stored specification of a depth policy with an observed inner law and a recurrent network.
+    """Stored specification of a depth policy whose inner policy has an observer and a recurrent network.
 
     Attributes:
         schema_name: name and version of the format.
-        law: inner law on the dive angle.
+        law: inner policy on the dive angle.
         steepest: largest desired dive angle in rad.
-        sight: initial values of `SIGHT_CONSTANTS` in the training.
+        sight: initial values of `LOS_CONSTANTS` in the training.
     """
 
     schema_name: Literal["residnet.depth_policy/1"] = Field(
         default="residnet.depth_policy/1", alias="schema"
     )
-    law: ObservedPolicySpec
+    law: ObserverPolicySpec
     steepest: float = Field(gt=0)
     sight: dict[str, Positive]
 
@@ -647,8 +645,8 @@ class DepthPolicySpec(Stored):
         )
 
 
-RecurrentSpec = ObservedPolicySpec | NetworkPolicySpec | DepthPolicySpec
-RecurrentPolicy = ObservedPolicy | NetworkPolicy | DepthPolicy
+RecurrentSpec = ObserverPolicySpec | NetworkPolicySpec | DepthPolicySpec
+RecurrentPolicy = ObserverPolicy | NetworkPolicy | DepthPolicy
 
 
 def load_recurrent(folder: Path, spec_type: type[RecurrentSpec]) -> RecurrentPolicy:

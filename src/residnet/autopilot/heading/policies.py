@@ -1,6 +1,8 @@
 """Learned steering policies: observer and control law with a recurrent network, or network alone.
 
-A policy controls the heading. As the inner loop of a depth policy it controls the dive angle.
+A policy controls the heading. As the inner loop of a depth policy it controls the dive angle. The
+vessel is Nomoto's model T r_dot + r = K (delta + d) with the yaw rate r, the rudder angle delta and
+a yaw disturbance d. The disturbance is expressed as the rudder angle in rad that would cause it.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from residnet.autopilot.heading.classical import HeadingLaw
 from residnet.autopilot.heading.steering_variation import DEPTH, HEADING, Axis
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.core.frames import wrap_angle
+from residnet.core.renamed_state import RenamedStateModule
 
 
 class AnglePolicy(Policy, ABC):
@@ -31,24 +34,24 @@ class AnglePolicy(Policy, ABC):
     dt: float
 
     def set_state_columns(self, state: Sequence[str]) -> None:
-        """Set the columns of heading, yaw rate and speed for a state with these names."""
-        self.psi = state.index("psi")
-        self.u = state.index("u")
-        self.r = state.index("r")
+        """Set the columns of heading, yaw rate and speed in a state with these names."""
+        self.psi_column = state.index("psi")
+        self.u_column = state.index("u")
+        self.r_column = state.index("r")
 
     def set_step(self, dt: float) -> None:
         """Set the time step to dt seconds."""
         self.dt = dt
 
 
-class HeadingPolicy(AnglePolicy, ABC):
+class SteeringPolicy(AnglePolicy, ABC):
     """A steering policy that can be exported: it knows its measurements, rudder and memory ranges.
 
     Attributes:
         axis: controlled axis.
         measured: names of the measurements with their units; the controlled state comes first.
         gain: Nomoto gain K of the vessel in 1/s.
-        time: Nomoto time constant T of the vessel in s.
+        time_constant: Nomoto time constant T of the vessel in s.
         speed: speed in m/s that K and T refer to.
         limit: rudder limit in rad.
         rate: rudder rate in rad/s; infinite for a rudder without a rate limit.
@@ -64,7 +67,7 @@ class HeadingPolicy(AnglePolicy, ABC):
         super().__init__()
         self.set_state_columns(state)
         self.gain = nomoto.gain
-        self.time = nomoto.time
+        self.time_constant = nomoto.time
         self.speed = nomoto.speed
         self.limit = limit
         self.rate = math.inf if rate is None else rate
@@ -78,7 +81,9 @@ class HeadingPolicy(AnglePolicy, ABC):
     def memory_ranges(
         self, max_yaw_rate: float, max_rudder: float
     ) -> dict[str, tuple[float, float]]:
-        """Return the ranges (low, high) of the entries of the memory by name, with a margin.
+        """Return the plausible range (lower, upper) of each entry of the memory by name.
+
+        An export resets a memory that leaves these ranges; they include a margin for rounding.
 
         Args:
             max_yaw_rate: largest measured yaw rate in rad/s.
@@ -88,7 +93,7 @@ class HeadingPolicy(AnglePolicy, ABC):
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """Return the structure of the policy for the card of its export."""
+        """Return the structure of the policy, which exports store in their metadata (card)."""
 
 
 @final
@@ -102,8 +107,8 @@ class OddGRUCell(nn.Module):
     Args:
         features: number of features.
         units: number of units.
-        dt: time step of training in s.
-        hidden: units of an odd layer before the output; 0 for none.
+        dt: time step in s at which the network is trained.
+        hidden: units of an odd layer before the output; 0 for no layer.
     """
 
     def __init__(self, features: int, units: int, dt: float, hidden: int = 0) -> None:
@@ -119,7 +124,7 @@ class OddGRUCell(nn.Module):
         # a zero output at first, so that training starts from the control law alone
         nn.init.zeros_(self.out.weight)
         self.units = units
-        self.trained_at = dt
+        self.training_time_step = dt
 
     def forward(self, features: Tensor, memory: Tensor, dt: float) -> tuple[Tensor, Tensor]:
         """Return the output [B, 1] and the memory [B, units] after a step of dt seconds."""
@@ -127,9 +132,9 @@ class OddGRUCell(nn.Module):
         magnitudes = torch.cat((features, memory), dim=1).abs()
         update, reset = torch.sigmoid(self.gates(magnitudes)).chunk(2, dim=1)
         retention = (1.0 - update).clamp(min=1e-6)
-        if dt != self.trained_at:
+        if dt != self.training_time_step:
             # exponential decay: n steps of dt retain as much as one step of n dt
-            retention = retention.pow(dt / self.trained_at)
+            retention = retention.pow(dt / self.training_time_step)
         candidate = torch.tanh(self.candidate(torch.cat((features, reset * memory), dim=1)))
         memory = candidate + retention * (memory - candidate)
         output_features = torch.cat((features, memory), dim=1)
@@ -142,9 +147,24 @@ class OddGRUCell(nn.Module):
 
 
 OBSERVER_CONSTANTS = ("heading_rate", "yaw_rate_rate", "push_rate", "cross_rate")
-"""Gains of the observer: from innovations to heading, yaw rate and disturbance in 1/s, and from the
-heading innovation to the yaw rate in 1/s^2.
-"""
+"""Keys of the observer gains in configs and stored policies, in the order of `ObserverGains`."""
+
+
+class ObserverGains(NamedTuple):
+    """Gains of the observer, [1] or [B, 1] each.
+
+    Attributes:
+        heading: gain from the heading innovation to the heading in 1/s.
+        yaw_rate: gain from the yaw-rate innovation to the yaw rate in 1/s.
+        disturbance: gain from the yaw-rate innovation to the disturbance in 1/s.
+        heading_to_yaw_rate: gain from the heading innovation to the yaw rate in 1/s^2.
+    """
+
+    heading: Tensor
+    yaw_rate: Tensor
+    disturbance: Tensor
+    heading_to_yaw_rate: Tensor
+
 
 _MAX_INNOVATION = 0.35
 """Heading innovation in rad above which the observer is reset to the measurement."""
@@ -155,7 +175,7 @@ class ObserverEstimate(NamedTuple):
 
     Attributes:
         heading, r: estimated heading and yaw rate.
-        disturbance_rudder: estimated yaw disturbance as a rudder angle.
+        disturbance_rudder: estimated yaw disturbance d, the rudder angle that would cause it.
         predicted_heading, predicted_r: prediction for the time when all pending commands act.
         heading_innovation, r_innovation: measurement minus one-step prediction.
     """
@@ -173,11 +193,11 @@ class ObserverEstimate(NamedTuple):
 class HeadingObserver(nn.Module):
     """Luenberger observer of T r_dot + r = K (delta + d - c psi) with a dead-time predictor.
 
-    d is a constant disturbance as a rudder angle. A command acts after `lag` seconds; the predictor
-    adds the effect of the pending commands in closed form (Smith predictor). K is proportional to
-    the speed, T inversely proportional; the restoring coefficient c, which is zero except for a
-    dive angle, decreases with the square of the speed. After a large innovation the observer is
-    reset to the measurement.
+    d is a yaw disturbance, assumed constant, as a rudder angle. A command acts after `lag` seconds;
+    the predictor adds the effect of the pending commands in closed form (Smith predictor). K is
+    proportional to the speed, T inversely proportional; the restoring coefficient c, which is zero
+    except for a dive angle, decreases with the square of the speed. After a large innovation the
+    observer is reset to the measurement.
 
     Args:
         nomoto: K, T, c and speed of the vessel on a straight course.
@@ -189,7 +209,7 @@ class HeadingObserver(nn.Module):
     def __init__(self, nomoto: NomotoModel, limit: float, lag: float, dt: float) -> None:
         super().__init__()
         self.gain = nomoto.gain
-        self.time = nomoto.time
+        self.time_constant = nomoto.time
         self.restoring = nomoto.restoring
         self.limit = limit
         self.lag = lag
@@ -217,7 +237,7 @@ class HeadingObserver(nn.Module):
         disturbance: Tensor,
         pending: Tensor,
         ratio: Tensor,
-        constants: list[Tensor],
+        gains: ObserverGains,
     ) -> ObserverEstimate:
         """Update the estimate with a measurement.
 
@@ -226,7 +246,7 @@ class HeadingObserver(nn.Module):
             heading, yaw_rate, disturbance: one-step predictions [B, 1].
             pending: pending rudder angles [B, n_pending], the oldest first.
             ratio: speed [B, 1] divided by the speed that K and T refer to.
-            constants: `OBSERVER_CONSTANTS`, [1] or [B, 1] each.
+            gains: gains of the observer.
         """
         heading_innovation = wrap_angle(psi - heading)
         r_innovation = r - yaw_rate
@@ -242,17 +262,19 @@ class HeadingObserver(nn.Module):
         heading_innovation = torch.where(is_lost, zero_innovation, heading_innovation)
         r_innovation = torch.where(is_lost, zero_innovation, r_innovation)
         # exact gains of a first-order filter, below one for any time step
-        filter_gains = [1.0 - torch.exp(-self.dt * rate) for rate in constants[:2]]
-        rate_correction = (
-            filter_gains[1] * r_innovation + self.dt * constants[3] * heading_innovation
+        heading_gain = 1.0 - torch.exp(-self.dt * gains.heading)
+        yaw_rate_gain = 1.0 - torch.exp(-self.dt * gains.yaw_rate)
+        yaw_rate_correction = (
+            yaw_rate_gain * r_innovation + self.dt * gains.heading_to_yaw_rate * heading_innovation
         )
-        heading = heading + filter_gains[0] * heading_innovation
-        yaw_rate = yaw_rate + rate_correction
+        heading = heading + heading_gain * heading_innovation
+        yaw_rate = yaw_rate + yaw_rate_correction
         # from T r_dot = K d with K ~ speed and T ~ 1 / speed
-        rudder_per_rate = self.time / (self.gain * ratio.square())
-        disturbance = (disturbance + constants[2] * rudder_per_rate * rate_correction).clamp(
-            -self.limit, self.limit
+        rudder_per_yaw_acceleration = self.time_constant / (self.gain * ratio.square())
+        disturbance_correction = (
+            gains.disturbance * rudder_per_yaw_acceleration * yaw_rate_correction
         )
+        disturbance = (disturbance + disturbance_correction).clamp(-self.limit, self.limit)
         predicted_heading = heading
         predicted_r = yaw_rate
         if self.n_pending > 0:
@@ -271,7 +293,7 @@ class HeadingObserver(nn.Module):
         )
 
     def with_restoring(self, disturbance: Tensor, heading: Tensor, ratio: Tensor) -> Tensor:
-        """Return the disturbance [B, 1] plus the restoring moment, as a rudder angle in rad."""
+        """Add the restoring moment to the disturbance [B, 1], both as rudder angles in rad."""
         return (
             disturbance
             if self.restoring == 0.0
@@ -282,7 +304,7 @@ class HeadingObserver(nn.Module):
         self, heading: Tensor, r: Tensor, disturbance: Tensor, pending: Tensor, ratio: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Predict heading and yaw rate [B, 1] for the time when all pending commands have acted."""
-        time_constant = self.time / ratio
+        time_constant = self.time_constant / ratio
         # each pending command acts for one step, then its effect decays until the end of the dead
         # time
         step_response = 1.0 - torch.exp(-self.dt / time_constant)
@@ -302,7 +324,7 @@ class HeadingObserver(nn.Module):
         self, heading: Tensor, r: Tensor, disturbance: Tensor, rudder: Tensor, ratio: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Predict heading in [-pi, pi) and yaw rate [B, 1] after one step at a rudder angle."""
-        time_constant = self.time / ratio
+        time_constant = self.time_constant / ratio
         steady_rate = self.gain * ratio * (rudder + disturbance)
         rate_change = (1.0 - torch.exp(-self.dt / time_constant)) * (steady_rate - r)
         return wrap_angle(
@@ -311,21 +333,25 @@ class HeadingObserver(nn.Module):
 
 
 OBSERVER_MEMORY = ("heading", "yaw_rate", "push", "rudder", "last_command")
-"""First entries of the memory of an observed policy, before pending commands and network units."""
+"""First entries of the memory of an `ObserverPolicy`: predicted heading, yaw rate and disturbance
+(`push`), rudder angle and last command. Pending commands and network units follow.
+"""
+_ROUNDING_MARGIN = 1.001
+"""Factor of the bounds of a memory that allows for rounding errors."""
 _N_FEATURES = 11
-"""Number of features of the network, see `ObservedPolicy.forward`."""
-_DEGREE = math.pi / 180.0
+"""Number of features of the network, see `ObserverPolicy.forward`."""
+_RADIANS_PER_DEGREE = math.pi / 180.0
 
 
 @final
-class ObservedPolicy(HeadingPolicy):
+class ObserverPolicy(SteeringPolicy):
     """Heading policy with a disturbance observer, a control law and a recurrent residual network.
 
-    The command is clamp(limit (law + network) - d). An observer estimates heading, yaw rate and
-    disturbance d, and predicts them over the dead time. The law acts on the prediction. The
-    disturbance and the restoring moment of a dive angle are compensated by feed-forward. The
-    network is odd, so that port and starboard are treated symmetrically, and its initial output is
-    zero.
+    The command is limit * clamp(law + network - d / limit, -1, 1), in which law and network are
+    fractions of the rudder limit. An observer estimates heading, yaw rate and disturbance d, and
+    predicts them over the dead time. The law acts on the prediction. Subtracting d, which includes
+    the restoring moment of a dive angle, is a feed-forward compensation. The network is odd, so
+    that port and starboard are treated symmetrically, and its initial output is zero.
 
     Memory s [B, 5 + n_pending + units]: `OBSERVER_MEMORY` in rad and rad/s, pending rudder angles
     with the oldest first, and the units of the network.
@@ -340,7 +366,7 @@ class ObservedPolicy(HeadingPolicy):
         rate: rudder rate in rad/s; None for a rudder without a rate limit.
         lag: dead time in s between a command and the rudder; 0 for no predictor.
         units: units of the network; 0 for no network.
-        trained_at: time step of training in s.
+        training_time_step: time step of training in s.
     """
 
     def __init__(
@@ -355,21 +381,24 @@ class ObservedPolicy(HeadingPolicy):
         rate: float | None = None,
         lag: float = 0.0,
         units: int = 0,
-        trained_at: float = 0.04,
+        training_time_step: float = 0.04,
     ) -> None:
         super().__init__(state, nomoto, limit, rate)
         self.units = units
-        self.radians_per_degree = _DEGREE
+        self.radians_per_degree = _RADIANS_PER_DEGREE
         self.law = law
         self.observer = HeadingObserver(nomoto, limit, lag, dt)
         self.constant_names = (*law.constants, *OBSERVER_CONSTANTS)
         self.n_law_constants = len(law.constants)
+        self.n_observer_entries = len(OBSERVER_MEMORY)
         values = [
             torch.as_tensor(constants[name], dtype=torch.float32) for name in self.constant_names
         ]
         self.constants = torch.nn.Parameter(torch.stack(values, dim=-1).log())
-        self.network = OddGRUCell(_N_FEATURES, max(units, 1), trained_at).requires_grad_(units > 0)
-        self.trained_at = trained_at
+        self.network = OddGRUCell(_N_FEATURES, max(units, 1), training_time_step).requires_grad_(
+            units > 0
+        )
+        self.training_time_step = training_time_step
         self.set_step(dt)
 
     def set_step(self, dt: float) -> None:
@@ -377,8 +406,8 @@ class ObservedPolicy(HeadingPolicy):
         self.observer.set_step(dt)
         self.n_state = len(OBSERVER_MEMORY) + self.observer.n_pending + self.units
 
-    def without_network(self) -> ObservedPolicy:
-        """Return a copy with zero network output: the law with its trained constants."""
+    def without_network(self) -> ObserverPolicy:
+        """Return a copy whose network output is zero: observer and law with trained constants."""
         policy = copy.deepcopy(self)
         torch.nn.init.zeros_(policy.network.out.weight)
         return policy
@@ -388,8 +417,8 @@ class ObservedPolicy(HeadingPolicy):
         constants = torch.exp(self.constants.detach()).tolist()
         return dict(zip(self.constant_names, constants, strict=True))
 
-    def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
-        pending_end = 5 + self.observer.n_pending
+    def replace_rudder_in_memory(self, s: Tensor, rudder: Tensor) -> Tensor:
+        pending_end = self.n_observer_entries + self.observer.n_pending
         parts = (s[:, :3], rudder, s[:, 4:pending_end])
         if self.observer.n_pending > 0:
             parts = (s[:, :3], rudder, torch.cat((s[:, 4 : pending_end - 1], rudder), dim=1))
@@ -398,9 +427,9 @@ class ObservedPolicy(HeadingPolicy):
     def memory_ranges(
         self, max_yaw_rate: float, max_rudder: float
     ) -> dict[str, tuple[float, float]]:
-        disturbance = 1.001 * self.limit
-        max_pending = 1.001 * max_rudder
-        half_turn = 1.001 * math.pi
+        disturbance = _ROUNDING_MARGIN * self.limit
+        max_pending = _ROUNDING_MARGIN * max_rudder
+        half_turn = _ROUNDING_MARGIN * math.pi
         upper_limits = dict(
             zip(
                 OBSERVER_MEMORY,
@@ -409,7 +438,7 @@ class ObservedPolicy(HeadingPolicy):
             )
         )
         upper_limits |= {f"pending_{k}": max_pending for k in range(self.observer.n_pending)}
-        upper_limits |= {f"unit_{k}": 1.001 for k in range(self.units)}
+        upper_limits |= {f"unit_{k}": _ROUNDING_MARGIN for k in range(self.units)}
         return {name: (-upper, upper) for name, upper in upper_limits.items()}
 
     def describe(self) -> dict[str, Any]:
@@ -419,57 +448,58 @@ class ObservedPolicy(HeadingPolicy):
             "constants": self.constant_values(),
             "lag": self.observer.lag,
             "units": self.units,
-            "trained_at": self.trained_at,
+            "trained_at": self.training_time_step,
         }
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the initial memory: measured heading and yaw rate, rudder amidships."""
-        heading = wrap_angle(x[:, self.psi : self.psi + 1])
+        heading = wrap_angle(x[:, self.psi_column : self.psi_column + 1])
         zero_memory = torch.zeros(x.shape[0], self.n_state - 2, dtype=x.dtype)
-        return torch.cat((heading, x[:, self.r : self.r + 1], zero_memory), dim=-1)
+        return torch.cat((heading, x[:, self.r_column : self.r_column + 1], zero_memory), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        n_fixed = 5
+        n_observer_entries = self.n_observer_entries
         n_pending = self.observer.n_pending
         rudder = s[:, 3:4]
         last_command = s[:, 4:5]
-        pending = s[:, n_fixed : n_fixed + n_pending]
+        pending = s[:, n_observer_entries : n_observer_entries + n_pending]
         constants = list(torch.exp(self.constants).split(1, dim=-1))
-        ratio = (x[:, self.u : self.u + 1] / self.speed).clamp(0.3, 3.0)
-        psi = x[:, self.psi : self.psi + 1]
+        ratio = (x[:, self.u_column : self.u_column + 1] / self.speed).clamp(0.3, 3.0)
+        psi = x[:, self.psi_column : self.psi_column + 1]
         estimate = self.observer(
             psi,
-            x[:, self.r : self.r + 1],
+            x[:, self.r_column : self.r_column + 1],
             s[:, 0:1],
             s[:, 1:2],
             s[:, 2:3],
             pending,
             ratio,
-            constants[self.n_law_constants :],
+            ObserverGains(*constants[self.n_law_constants :]),
         )
         error = wrap_angle(reference - estimate.predicted_heading)
-        decay = ratio / self.time
-        force = decay * self.gain * ratio * self.limit
+        inverse_time_constant = ratio / self.time_constant
+        max_yaw_acceleration = inverse_time_constant * self.gain * ratio * self.limit
         effective_disturbance = self.observer.with_restoring(
             estimate.disturbance_rudder, estimate.predicted_heading, ratio
         )
-        rudder_share = (rudder + effective_disturbance) / self.limit
-        law_share = self.law(
+        normalised_rudder = (rudder + effective_disturbance) / self.limit
+        law_output = self.law(
             error,
             estimate.predicted_r,
-            rudder_share,
-            force,
-            decay,
+            normalised_rudder,
+            max_yaw_acceleration,
+            inverse_time_constant,
             constants[: self.n_law_constants],
         )
-        law_share = law_share - effective_disturbance / self.limit
-        memory = s[:, n_fixed + n_pending :]
-        unlimited_share = law_share
+        law_output = law_output - effective_disturbance / self.limit
+        memory = s[:, n_observer_entries + n_pending :]
+        unsaturated_command = law_output
         if self.units > 0:
             max_yaw_rate = self.gain * ratio * self.limit
             # innovations of white noise grow with 1 / sqrt(dt), and features must have the same
             # size as in training
-            noise_scale = math.sqrt(self.dt / self.trained_at)
+            noise_scale = math.sqrt(self.dt / self.training_time_step)
+            # constant factors scale the features to a similar magnitude in typical manoeuvres
             features = torch.cat(
                 (
                     # several scales of the error: saturated ones resolve small errors, the linear
@@ -484,13 +514,13 @@ class ObservedPolicy(HeadingPolicy):
                     (3.0 * noise_scale / self.radians_per_degree) * estimate.heading_innovation,
                     (52.0 * noise_scale) * estimate.r_innovation / max_yaw_rate,
                     last_command / self.limit,
-                    torch.tanh(law_share),
+                    torch.tanh(law_output),
                 ),
                 dim=1,
             )
             correction, memory = self.network(features, memory, self.dt)
-            unlimited_share = law_share + correction
-        command = self.limit * unlimited_share.clamp(-1.0, 1.0)
+            unsaturated_command = law_output + correction
+        command = self.limit * unsaturated_command.clamp(-1.0, 1.0)
         next_rudder = rudder + (command - rudder).clamp(-self.max_rudder_step, self.max_rudder_step)
         queue = torch.cat((pending, next_rudder), dim=1)
         effective_disturbance = self.observer.with_restoring(
@@ -515,7 +545,7 @@ class ObservedPolicy(HeadingPolicy):
 
 
 @final
-class NetworkPolicy(HeadingPolicy):
+class NetworkPolicy(SteeringPolicy):
     """Heading policy that is a recurrent network alone: the command is clamp(limit network).
 
     The network is a gated recurrent unit followed by an odd layer, so that port and starboard are
@@ -531,7 +561,7 @@ class NetworkPolicy(HeadingPolicy):
         dt: time step in s; `set_step` changes it.
         rate: rudder rate in rad/s; None for a rudder without a rate limit.
         units: units of the network, at least one.
-        trained_at: time step of training in s.
+        training_time_step: time step of training in s.
     """
 
     def __init__(
@@ -543,13 +573,13 @@ class NetworkPolicy(HeadingPolicy):
         dt: float,
         rate: float | None = None,
         units: int,
-        trained_at: float = 0.04,
+        training_time_step: float = 0.04,
     ) -> None:
         super().__init__(state, nomoto, limit, rate)
         self.units = units
-        self.radians_per_degree = _DEGREE
-        self.trained_at = trained_at
-        self.network = OddGRUCell(8, units, trained_at, hidden=units)
+        self.radians_per_degree = _RADIANS_PER_DEGREE
+        self.training_time_step = training_time_step
+        self.network = OddGRUCell(8, units, training_time_step, hidden=units)
         self.n_state = 2 + units
         self.set_step(dt)
 
@@ -557,27 +587,32 @@ class NetworkPolicy(HeadingPolicy):
         """Return an empty mapping, because the policy has no control law."""
         return {}
 
-    def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
+    def replace_rudder_in_memory(self, s: Tensor, rudder: Tensor) -> Tensor:
         return torch.cat((rudder, s[:, 1:]), dim=1)
 
     def memory_ranges(
         self, max_yaw_rate: float, max_rudder: float
     ) -> dict[str, tuple[float, float]]:
-        upper_limits = dict.fromkeys(("rudder", "last_command"), 1.001 * max_rudder)
-        upper_limits |= {f"unit_{k}": 1.001 for k in range(self.units)}
+        upper_limits = dict.fromkeys(("rudder", "last_command"), _ROUNDING_MARGIN * max_rudder)
+        upper_limits |= {f"unit_{k}": _ROUNDING_MARGIN for k in range(self.units)}
         return {name: (-upper, upper) for name, upper in upper_limits.items()}
 
     def describe(self) -> dict[str, Any]:
         """Return the units of the network and the time step of its training."""
-        return {"kind": "network", "units": self.units, "trained_at": self.trained_at}
+        return {"kind": "network", "units": self.units, "trained_at": self.training_time_step}
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         rudder = s[:, 0:1]
         last_command = s[:, 1:2]
         memory = s[:, 2:]
-        ratio = (x[:, self.u : self.u + 1] / self.speed).clamp(0.3, 3.0)
-        error = wrap_angle(reference - x[:, self.psi : self.psi + 1]) / self.radians_per_degree
-        relative_yaw_rate = x[:, self.r : self.r + 1] / (self.gain * ratio * self.limit)
+        ratio = (x[:, self.u_column : self.u_column + 1] / self.speed).clamp(0.3, 3.0)
+        error = (
+            wrap_angle(reference - x[:, self.psi_column : self.psi_column + 1])
+            / self.radians_per_degree
+        )
+        relative_yaw_rate = x[:, self.r_column : self.r_column + 1] / (
+            self.gain * ratio * self.limit
+        )
         features = torch.cat(
             (
                 torch.tanh(error),
@@ -591,15 +626,15 @@ class NetworkPolicy(HeadingPolicy):
             ),
             dim=1,
         )
-        unlimited_share, memory = self.network(features, memory, self.dt)
-        command = self.limit * unlimited_share.clamp(-1.0, 1.0)
+        unsaturated_command, memory = self.network(features, memory, self.dt)
+        command = self.limit * unsaturated_command.clamp(-1.0, 1.0)
         next_rudder = rudder + (command - rudder).clamp(-self.max_rudder_step, self.max_rudder_step)
         return command, torch.cat((next_rudder, command, memory), dim=1)
 
 
-SIGHT_CONSTANTS = ("lookahead", "depth_rate", "drift_rate")
-"""Constants of a depth policy: look-ahead distance in m, and observer gains of depth and drift in
-1/s.
+LOS_CONSTANTS = ("lookahead", "depth_rate", "drift_rate")
+"""Keys of the constants of line-of-sight (LOS) depth control: look-ahead distance in m, and
+observer gains of depth and drift in 1/s.
 """
 MAX_DEPTH = 1.2e4
 """Largest accepted depth in m; no sea is deeper."""
@@ -608,28 +643,29 @@ _MAX_DRIFT_SHARE = 0.5
 
 
 @final
-class DepthPolicy(HeadingPolicy):
+class DepthPolicy(RenamedStateModule, SteeringPolicy):
     """Depth policy with stern planes: line-of-sight guidance and an inner loop on the dive angle.
 
     The desired dive angle is atan((z_d - z) / lookahead) - d / u, limited to `steepest` (line of
     sight: T. I. Fossen, Handbook of Marine Craft, 2nd ed. 2021, section 12.4). An observer of
     z_dot = u sin(dive angle) + d estimates depth z and drift d, which contains the effects of
-    buoyancy and angle of attack. The inner law receives the dive angle -theta as heading and -q as
-    yaw rate.
+    buoyancy and angle of attack. The inner policy receives the dive angle -theta as heading and -q
+    as yaw rate.
 
-    Memory s [B, 2 + k]: predicted depth in m, d in m/s, then the k entries of the inner law.
+    Memory s [B, 2 + k]: predicted depth in m, d in m/s, then the k entries of the inner policy.
 
     Args:
         state: names of the state.
-        nomoto: K, T, c and speed of the dive angle.
-        law: policy of the dive angle.
-        constants: `SIGHT_CONSTANTS`, all positive.
+        nomoto: Nomoto's model of the dive angle and the speed that it refers to.
+        law: policy of the dive angle, the inner loop.
+        constants: `LOS_CONSTANTS`, all positive.
         steepest: largest desired dive angle in rad.
         limit: limit of the stern planes in rad.
         dt: time step in s.
         rate: rate of the stern planes in rad/s; None for no rate limit.
     """
 
+    legacy_parameter_names: ClassVar[Mapping[str, str]] = {"law": "inner_policy"}
     axis = DEPTH
     measured: ClassVar[Mapping[str, str]] = {"z": "m", "u": "m/s", "theta": "rad", "q": "rad/s"}
 
@@ -646,11 +682,11 @@ class DepthPolicy(HeadingPolicy):
         rate: float | None = None,
     ) -> None:
         super().__init__(state, nomoto, limit, rate)
-        self.law = law
+        self.inner_policy = law
         self.steepest = steepest
         self.max_drift_share = _MAX_DRIFT_SHARE
-        law.set_state_columns(tuple(HeadingPolicy.measured))
-        values = [torch.as_tensor(constants[name], dtype=torch.float32) for name in SIGHT_CONSTANTS]
+        law.set_state_columns(tuple(SteeringPolicy.measured))
+        values = [torch.as_tensor(constants[name], dtype=torch.float32) for name in LOS_CONSTANTS]
         self.constants = torch.nn.Parameter(torch.stack(values, dim=-1).log())
         self.set_step(dt)
 
@@ -660,76 +696,83 @@ class DepthPolicy(HeadingPolicy):
 
     def set_step(self, dt: float) -> None:
         super().set_step(dt)
-        self.law.set_step(dt)
-        self.n_state = 2 + self.law.n_state
+        self.inner_policy.set_step(dt)
+        self.n_state = 2 + self.inner_policy.n_state
 
     def without_network(self) -> DepthPolicy:
-        """Return a copy whose law has no network."""
+        """Return a copy whose inner policy has a network output of zero."""
         policy = copy.deepcopy(self)
-        law = self.law
-        assert isinstance(law, ObservedPolicy)
-        policy.law = law.without_network()
+        inner_policy = self.inner_policy
+        assert isinstance(inner_policy, ObserverPolicy)
+        policy.inner_policy = inner_policy.without_network()
         return policy
 
     def constant_values(self) -> dict[str, float]:
-        """Return the constants by name, including the constants of an observed inner law."""
+        """Return the constants by name, including those of an inner policy with an observer."""
         constants = dict(
-            zip(SIGHT_CONSTANTS, torch.exp(self.constants.detach()).tolist(), strict=True)
+            zip(LOS_CONSTANTS, torch.exp(self.constants.detach()).tolist(), strict=True)
         )
         return constants | (
-            self.law.constant_values() if isinstance(self.law, ObservedPolicy) else {}
+            self.inner_policy.constant_values()
+            if isinstance(self.inner_policy, ObserverPolicy)
+            else {}
         )
 
     def memory_ranges(
         self, max_yaw_rate: float, max_rudder: float
     ) -> dict[str, tuple[float, float]]:
-        assert isinstance(self.law, HeadingPolicy)
+        assert isinstance(self.inner_policy, SteeringPolicy)
+        # the drift is limited at a speed of at most three times the nominal speed
         max_drift = 3.1 * self.max_drift_share * self.speed
         depth_ranges = {
             "depth": (-1.01 * MAX_DEPTH, 1.01 * MAX_DEPTH),
             "drift": (-max_drift, max_drift),
         }
-        return depth_ranges | self.law.memory_ranges(max_yaw_rate, max_rudder)
+        return depth_ranges | self.inner_policy.memory_ranges(max_yaw_rate, max_rudder)
 
     def describe(self) -> dict[str, Any]:
-        """Return constants, largest dive angle and the description of the inner law."""
-        assert isinstance(self.law, HeadingPolicy)
+        """Return constants, largest dive angle and the description of the inner policy."""
+        assert isinstance(self.inner_policy, SteeringPolicy)
         return {
             "kind": "depth",
             "constants": dict(
-                zip(SIGHT_CONSTANTS, torch.exp(self.constants.detach()).tolist(), strict=True)
+                zip(LOS_CONSTANTS, torch.exp(self.constants.detach()).tolist(), strict=True)
             ),
             "steepest": self.steepest,
-            "law": self.law.describe(),
+            "law": self.inner_policy.describe(),
         }
 
-    def with_applied_rudder(self, s: Tensor, rudder: Tensor) -> Tensor:
-        return torch.cat((s[:, :2], self.law.with_applied_rudder(s[:, 2:], rudder)), dim=1)
+    def replace_rudder_in_memory(self, s: Tensor, rudder: Tensor) -> Tensor:
+        return torch.cat(
+            (s[:, :2], self.inner_policy.replace_rudder_in_memory(s[:, 2:], rudder)), dim=1
+        )
 
     def _to_angle_state(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return depth [B, 1], and dive angle, speed and dive rate [B, 3] for the inner law."""
+        """Return the depth [B, 1], and dive angle, speed and dive rate [B, 3] as a state."""
         z, u, theta, q = x[:, self.state_columns].split(1, dim=1)
         return z, torch.cat((-theta, u, -q), dim=1)
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the initial memory: measured depth, no drift."""
         z, angle_state = self._to_angle_state(x)
-        return torch.cat((z, torch.zeros_like(z), self.law.initial_state(angle_state)), dim=-1)
+        return torch.cat(
+            (z, torch.zeros_like(z), self.inner_policy.initial_state(angle_state)), dim=-1
+        )
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         z, angle_state = self._to_angle_state(x)
-        lookahead, depth_rate, drift_rate = torch.exp(self.constants).split(1, dim=-1)
+        lookahead, depth_gain, drift_gain = torch.exp(self.constants).split(1, dim=-1)
         u = angle_state[:, 1:2].clamp(0.3 * self.speed, 3.0 * self.speed)
         innovation = z - s[:, 0:1]
         # no vessel moves this far in one step: the depth is reset, the drift is not changed
         innovation = torch.where(innovation.abs() > u, torch.zeros_like(z), innovation)
         predicted_depth = z - innovation
-        depth = predicted_depth + (1.0 - torch.exp(-self.dt * depth_rate)) * innovation
+        depth = predicted_depth + (1.0 - torch.exp(-self.dt * depth_gain)) * innovation
         max_drift = self.max_drift_share * u
-        drift = s[:, 1:2] + (self.dt * depth_rate * drift_rate) * innovation
+        drift = s[:, 1:2] + (self.dt * depth_gain * drift_gain) * innovation
         drift = torch.minimum(torch.maximum(drift, -max_drift), max_drift)
         target_angle = torch.atan((reference - depth) / lookahead) - drift / u
         target_angle = target_angle.clamp(-self.steepest, self.steepest)
-        command, memory = self.law(angle_state, target_angle, s[:, 2:])
+        command, memory = self.inner_policy(angle_state, target_angle, s[:, 2:])
         next_depth = depth + self.dt * (u * torch.sin(angle_state[:, 0:1]) + drift)
         return command, torch.cat((next_depth, drift, memory), dim=1)

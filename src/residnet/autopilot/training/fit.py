@@ -21,7 +21,7 @@ from residnet.autopilot.heading.conditions import (
     count_excess_overshoots,
     with_nominal_rows,
 )
-from residnet.autopilot.heading.policies import HeadingPolicy
+from residnet.autopilot.heading.policies import SteeringPolicy
 from residnet.autopilot.heading.vessels import SteeredVessel
 from residnet.autopilot.training.config import PolicyTraining
 from residnet.core.errors import ExportError
@@ -61,7 +61,7 @@ class PolicyFit(EpochTraining):
 
     def __init__(
         self,
-        policy: HeadingPolicy,
+        policy: SteeringPolicy,
         vessel: SteeredVessel,
         settings: PolicyTraining,
         conditions: ConditionsConfig,
@@ -342,7 +342,7 @@ def _warn_not_compiled(error: ExportError) -> None:
 
 def train_policy(
     name: str,
-    policy: HeadingPolicy,
+    policy: SteeringPolicy,
     vessel: SteeredVessel,
     settings: PolicyTraining,
     conditions: ConditionsConfig,

@@ -503,9 +503,9 @@ def learning_figure(run: RunFiles) -> Figure | None:
         {
             "loss": GlyphStyle("training loss", BLUE),
             "validation": GlyphStyle("validation", BLUE),
-            "baseline": replace(baseline, kind="across"),
+            "baseline": replace(baseline, kind="hline"),
             "best": replace(_RING_STYLE, label="best epoch"),
-            "stage": GlyphStyle("next stage", "#7F7F7F", width=0.8, kind="upright", z_order=1),
+            "stage": GlyphStyle("next stage", "#7F7F7F", width=0.8, kind="vline", z_order=1),
         },
         [
             Panel("training loss [-]", height=200, y_log=True),

@@ -166,7 +166,7 @@ def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | 
                 title,
                 traces,
                 note,
-                still=any(window is window_shown for window_shown in static_windows),
+                has_static_image=any(window is window_shown for window_shown in static_windows),
             )
         )
     return Figure(

@@ -66,7 +66,7 @@ def parallel_coordinates(content: SweepFile) -> Figure:
         "Trials over their keys",
         "Every line is a finished trial: its values, and at the right what is sought. Beneath"
         " each axis has its limits as labels. The best trial is the thick line.",
-        {"axes": GlyphStyle("", "#999999", width=0.8, kind="upright", z_order=1)}
+        {"axes": GlyphStyle("", "#999999", width=0.8, kind="vline", z_order=1)}
         | {label: style for label, _, _, style in _RANK_GROUPS},
         [
             Panel(

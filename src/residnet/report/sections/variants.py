@@ -102,7 +102,7 @@ def plot_differences(rows: Sequence[VariantRow], reference: str) -> Figure:
         f"Free-run error of each variant minus that of {reference}, mean over windows and seeds."
         " The bars are 95 % intervals over logs.",
         {
-            "zero": GlyphStyle("", "#666666", width=0.8, kind="upright", z_order=1),
+            "zero": GlyphStyle("", "#666666", width=0.8, kind="vline", z_order=1),
             "interval": GlyphStyle("95 % interval", width=1.2),
             "difference": GlyphStyle("difference", BLUE, kind="points", size=4.5, z_order=4),
         },

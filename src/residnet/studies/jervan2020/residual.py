@@ -818,7 +818,7 @@ def _order_figure(
     """
     colors = dict(zip(errors_by_samples, (BLUE, VERMILLION), strict=True))
     styles = {label: GlyphStyle(label, color) for label, color in colors.items()}
-    styles["chosen"] = GlyphStyle("this model", GREY, "dashed", 1.0, kind="upright")
+    styles["chosen"] = GlyphStyle("this model", GREY, "dashed", 1.0, kind="vline")
     panels_shown = []
     for axis in range(3):
         panel = {"chosen": (np.array([float(chosen_order)]), np.zeros(1))}

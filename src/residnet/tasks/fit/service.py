@@ -257,8 +257,8 @@ def write_monitoring_page(folder: Path, logs: Sequence[MonitoredLog]) -> Path:
         "Largest score of all causes after each window; a score above the threshold is an alarm.",
         {
             "score": replace(SOLID_STYLE, label="largest score"),
-            "threshold": replace(DASHED_STYLE, label="threshold", kind="across"),
-            "logs": replace(ZERO_LINE_STYLE, label="end of a log", kind="upright", dash="dotted"),
+            "threshold": replace(DASHED_STYLE, label="threshold", kind="hline"),
+            "logs": replace(ZERO_LINE_STYLE, label="end of a log", kind="vline", dash="dotted"),
         },
         [Panel("score [-]", "time of the logs [min]", height=MAX_PREVIEW_HEIGHT)],
         [Case("", [score_curves])],

@@ -17,7 +17,7 @@ from residnet.autopilot.heading.controllers import (
     DepthPolicySpec,
     NetworkPolicySpec,
     ObservedConfig,
-    ObservedPolicySpec,
+    ObserverPolicySpec,
     RecurrentSpec,
     TunableConfig,
     angle_law_of,
@@ -322,7 +322,7 @@ class AutopilotConfig(PackageTask, ComputingTask):
         """Return the class of the stored description of a policy."""
         if self.test.depth is not None:
             return DepthPolicySpec
-        return NetworkPolicySpec if self.policies[name].start is None else ObservedPolicySpec
+        return NetworkPolicySpec if self.policies[name].start is None else ObserverPolicySpec
 
     def provenance_seed(self) -> int:
         """Return the seed of weights, batches and random vessels."""

@@ -48,7 +48,7 @@ from residnet.autopilot.heading.controllers import (
     angle_law_of,
     load_recurrent,
 )
-from residnet.autopilot.heading.policies import SIGHT_CONSTANTS, DepthPolicy, ObservedPolicy
+from residnet.autopilot.heading.policies import LOS_CONSTANTS, DepthPolicy, ObserverPolicy
 from residnet.autopilot.heading.vessels import SteeredPlant
 from residnet.autopilot.report.heading import (
     CONDITIONS_FILE,
@@ -115,7 +115,7 @@ def execute(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
         # what it is compared with: itself untrained, and without its network
         if policy_config.units > 0:
             ablations[f"{name} untrained"] = ("untrained", untrained_policy)
-            if isinstance(policy, ObservedPolicy | DepthPolicy):
+            if isinstance(policy, ObserverPolicy | DepthPolicy):
                 ablations[f"{name} network off"] = ("network_off", policy.without_network())
     folder.write_json(
         folder.path / "controllers.json",
@@ -239,9 +239,7 @@ def _train_policy_or_resume(
         **({"law": observed_law.model_dump()} if isinstance(observed_law, ObservedConfig) else {}),
     }
     if isinstance(base_law, DepthConfig):
-        depth_law_settings = {
-            name: base_law.complete_parameters()[name] for name in SIGHT_CONSTANTS
-        }
+        depth_law_settings = {name: base_law.complete_parameters()[name] for name in LOS_CONSTANTS}
         spec_fields = {
             "law": spec_fields,
             "steepest": base_law.steepest,

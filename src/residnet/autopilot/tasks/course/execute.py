@@ -33,7 +33,7 @@ from residnet.autopilot.guidance import (
     WheelOver,
 )
 from residnet.autopilot.heading.controllers import ControlTask
-from residnet.autopilot.heading.policies import HeadingPolicy
+from residnet.autopilot.heading.policies import SteeringPolicy
 from residnet.autopilot.heading.steering_variation import NOMINAL, Vessels
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.report.course import COURSES_FILE, SPREAD_FILE, TRACKS_FILE, tables_text
@@ -223,7 +223,7 @@ def open_autopilot_run(config: CourseTaskConfig, folder: RunFolder) -> Autopilot
     )
 
 
-def load_policy(autopilot_run: AutopilotRun, name: str) -> HeadingPolicy:
+def load_policy(autopilot_run: AutopilotRun, name: str) -> SteeringPolicy:
     """Return a trained policy of the autopilot run, with the time step of the course.
 
     Raises:

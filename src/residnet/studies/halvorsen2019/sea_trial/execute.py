@@ -506,7 +506,7 @@ def _trial_figure(name: str, trial: TrialSamples) -> Figure:
         f"trial_{name}",
         ("Simulated sea trial", caption),
         {
-            "validation": GlyphStyle("validation", "#D9D9D9", kind="strip", z_order=0),
+            "validation": GlyphStyle("validation", "#D9D9D9", kind="vspan", z_order=0),
             "line": GlyphStyle("", BLUE, width=0.6),
         },
         t,

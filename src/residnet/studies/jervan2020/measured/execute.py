@@ -414,7 +414,7 @@ def _score_figure(rows: Sequence[StudyResults]) -> Figure:
     One panel for each force; errors are in % of its mean square.
     """
     styles = {
-        "zero": replace(ZERO_LINE_STYLE, kind="upright"),
+        "zero": replace(ZERO_LINE_STYLE, kind="vline"),
         "better interval": GlyphStyle("", BLUE),
         "better": GlyphStyle("better than the believed model", BLUE, kind="points", size=4.5),
         "other interval": GlyphStyle("", GREY),
