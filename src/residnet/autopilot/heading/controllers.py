@@ -614,7 +614,7 @@ class NetworkPolicySpec(_PolicySpec):
 
 
 class DepthPolicySpec(Stored):
-    """Stored specification of a depth policy whose inner policy has an observer and a recurrent network.
+    """Stored specification of a depth policy; its inner policy has an observer and a network.
 
     Attributes:
         schema_name: name and version of the format.
