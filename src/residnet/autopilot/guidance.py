@@ -1,6 +1,6 @@
 """Guidance laws that compute a desired heading from way-points or a planned course.
 
-The guidance of a ferry crossing feeds a reference filter (document 002 section 2.2.2).
+The guidance of a ferry crossing feeds a reference filter (Jervan 2020, section 2.2.2).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Course manoeuvres: way-points with an autopilot, and the four-corner course of document 002."""
+"""Course manoeuvres: way-points with an autopilot, and the four-corner course of Jervan 2020."""
 
 from __future__ import annotations
 
@@ -111,8 +111,8 @@ class Waypoints(Manoeuvre):
 
 _RIGHT_ANGLE = math.pi / 2
 _HALF_RIGHT_ANGLE = math.pi / 4
-# Table 4.1 prints the twelve poses twice (correction J12); headings are not wrapped, so that the
-# vessel turns in the direction written in the table (J13)
+# Table 4.1 prints the twelve poses twice (correction J12 in docs/documents/corrections.md);
+# headings are not wrapped, so that the vessel turns in the direction written in the table (J13)
 SEGMENTS: tuple[Waypoint, ...] = (
     (0.0, -15.0, -_RIGHT_ANGLE),
     (15.0, -15.0, 0.0),
@@ -133,7 +133,7 @@ class FourCorner(Manoeuvre):
     """A sequence of poses, smoothed by a reference filter and followed by a PID controller.
 
     The twelve segments of the document excite surge, sway and yaw, alone and combined. The vessel
-    must have commands for all three forces. Source: document 002 section 4.1, Table 4.1.
+    must have commands for all three forces. Source: Jervan 2020, section 4.1, Table 4.1.
 
     Attributes:
         poses: poses (north, east, heading); by default the twelve of the document.

@@ -1,6 +1,7 @@
 """Motion control in three degrees of freedom: reference filter, PID, and feed-forward.
 
-Source: document 002 sections 2.2 and 2.2.1, eq. (2.15), corrections J7, J9, J13.
+Source: Jervan 2020, sections 2.2 and 2.2.1, eq. (2.15). docs/documents/corrections.md says how
+undefined symbols, the bandwidth and the headings are read (J7, J9, J13).
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ class MotionPIDConfig(Config):
 class ActuatorLag(Config):
     """Second-order lag of forces: tau'' + 2 zeta omega tau' + omega^2 tau = omega^2 tau_c.
 
-    tau_c is taken at t - delay (document 002 eq. (4.3)).
+    tau_c is taken at t - delay (Jervan 2020, eq. (4.3)).
 
     Attributes:
         frequency: omega in rad/s.

@@ -26,8 +26,8 @@ class FixedBaseline(Baseline):
         coefficients_by_axis: coefficients of u_dot, v_dot and r_dot by term; other states have no
             terms.
         names: channels of the model.
-        is_fitted: whether the coefficients were fitted to other data (correction E9 of document
-            000).
+        is_fitted: whether the coefficients were fitted to other data. If so, their number counts in
+            criteria such as BIC (see E9 in docs/documents/corrections.md).
     """
 
     def __init__(

@@ -85,10 +85,10 @@ class AxisCoefficients(Config):
 class EquationsConfig(AxisCoefficients, FixedBaselineConfig):
     """Published equations of the accelerations, whose coefficients are not fitted.
 
-    Examples are eqs. (6.24)-(6.32) and (7.2)-(7.7) of document 000.
+    Examples are eqs. (6.24)-(6.32) and (7.2)-(7.7) of Halvorsen 2019.
 
     Attributes:
-        units: units of channels in the equations if not SI (document 000 has revolutions in rpm).
+        units: units of channels in the equations if not SI (Halvorsen 2019 has revolutions in rpm).
         source: reference of the equations.
     """
 
@@ -166,7 +166,7 @@ class HullEquations(AxisCoefficients):
 
 
 class BelievedConfig(FixedBaselineConfig):
-    """Hull of a vessel file with fixed parameters (document 002 section 4.1.1).
+    """Hull of a vessel file with fixed parameters (Jervan 2020, section 4.1.1).
 
     A scale factor on the mass, Coriolis and damping matrices introduces a known model error. The
     model needs the channels tau_x, tau_y and tau_n, as inputs or computed by `signals.forces`.

@@ -42,7 +42,8 @@ class RegressorsConfig(IdentifiedConfig):
             `linear`; `fossen` (linear and quadratic damping, Coriolis products, propeller and
             rudder); `abkowitz` (third-order Taylor series about straight-ahead motion); `astern`
             (additional terms for astern revolutions); `wind`; `polynomial_1` and `polynomial_2`
-            (all products of velocities and inputs, the ridge models of document 001 section 2.2).
+            (all products of velocities and inputs, the ridge models of Moreno-Salinas et al. 2019,
+            section 2.2).
         terms: additional regressors of every axis, or per axis `u`, `v`, `r` (with roll also `p`;
             in six degrees of freedom also `w`, `p`, `q`). Without sets and terms, the regressors
             are the constant and every channel.

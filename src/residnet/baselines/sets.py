@@ -142,9 +142,9 @@ WIND_TERMS = (
 def _fossen_terms(roles: ChannelRoles) -> list[str]:
     """Return the terms of the manoeuvring model of Fossen.
 
-    The terms are Coriolis products, linear and quadratic damping (document 002 eq. (2.4), document
-    003 eqs. (7)-(9)). A model with roll also has roll damping, the effect of speed on damping and
-    restoring, and nonlinear restoring (document 004).
+    The terms are Coriolis products, linear and quadratic damping (Jervan 2020, eq. (2.4),
+    Woo et al. 2018, eqs. (7)-(9)). A model with roll also has roll damping, the effect of speed on
+    damping and restoring, and nonlinear restoring (Gouletas 2020).
     """
     if "z" in roles.dynamic_states:
         return submerged_terms(roles)

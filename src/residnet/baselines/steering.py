@@ -1,8 +1,8 @@
-"""First-order models of speed and steering: Nomoto models and the linear model of document 003.
+"""First-order models of speed and steering: Nomoto models and the linear model of Woo et al. 2018.
 
-Nomoto models (document 003 eqs. (12)-(15), document 004 section 5.1.2) are identified by least
-squares on derivatives, the linear model (document 003 sections 2.2, 4.2.1, 4.2.2) from steady
-states.
+Nomoto models (Woo et al. 2018, eqs. (12)-(15), Gouletas 2020, section 5.1.2) are identified by
+least squares on derivatives, the linear model (Woo et al. 2018, sections 2.2, 4.2.1, 4.2.2) from
+steady states.
 """
 
 from __future__ import annotations

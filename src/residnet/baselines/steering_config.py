@@ -135,7 +135,7 @@ class NomotoBaselineConfig(NomotoLagConfig):
 
 
 class NomotoSideslipBaselineConfig(NomotoLagConfig):
-    """Nomoto model with sideslip (document 003 eqs. (14), (15)).
+    """Nomoto model with sideslip (Woo et al. 2018, eqs. (14), (15)).
 
     T_beta beta_dot + beta = -K_beta r + b_beta, formulated for v = u beta.
     """
@@ -156,8 +156,8 @@ class SteadyStateBlock(NamedTuple):
 class LinearSteadyConfig(SteeringBaselineConfig):
     """Linear models u_dot = a u + k tau + c and (v, r)_dot = A (v, r) + B tau + C.
 
-    The equations are (12) and (16) of document 003. Steady states of constant-input manoeuvres give
-    x_ss = Phi tau + Phi_bias by least squares (eqs. (24), (32)). Then x_dot = A (x - Phi tau -
+    The equations are (12) and (16) of Woo et al. 2018. Steady states of constant-input manoeuvres
+    give x_ss = Phi tau + Phi_bias by least squares (eqs. (24), (32)). Then x_dot = A (x - Phi tau -
     Phi_bias) gives A by least squares on derivatives (eq. (29)), and B = -A Phi (eq. (28)). Nomoto
     models are identified by the same method.
 

@@ -33,7 +33,7 @@ def to_body(north: Tensor, east: Tensor, psi: Tensor) -> tuple[Tensor, Tensor]:
         east: component along east.
         psi: heading [rad].
 
-    Source: document 003 eq. (4), transposed.
+    Source: Woo et al. 2018, eq. (4), transposed.
     """
     cos_psi = psi.cos()
     sin_psi = psi.sin()
@@ -48,7 +48,7 @@ def to_earth(forward: Tensor, starboard: Tensor, psi: Tensor) -> tuple[Tensor, T
         starboard: component along body y.
         psi: heading [rad].
 
-    Source: document 003 eq. (4).
+    Source: Woo et al. 2018, eq. (4).
     """
     cos_psi = psi.cos()
     sin_psi = psi.sin()
@@ -191,7 +191,7 @@ def rotate(
     """Rotate vectors [T] by angles [T] in rad.
 
     The heading as the angle rotates from body axes to NED, minus the heading from NED to body axes.
-    Source: document 003 eq. (4).
+    Source: Woo et al. 2018, eq. (4).
     """
     c = np.cos(angle)
     s = np.sin(angle)

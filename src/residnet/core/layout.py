@@ -491,7 +491,7 @@ def to_horizontal_plane(nu: np.ndarray) -> np.ndarray:
     """Return surge, sway and yaw rate of the horizontal plane [..., 3] from dynamic states.
 
     With roll only these are u, v cos(phi) and r cos(phi).
-    Source: document 004 without heave and pitch; Fossen 2021, eq. (2.41) with them.
+    Source: Gouletas 2020 without heave and pitch; Fossen 2021, eq. (2.41) with them.
 
     Args:
         nu: dynamic states [..., n].
@@ -519,7 +519,7 @@ def to_horizontal_plane(nu: np.ndarray) -> np.ndarray:
 
 
 ROLLING_LAYOUT = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))
-"""Surge, sway, roll and yaw, without heave and pitch (document 004 and its corrections)."""
+"""Surge, sway, roll and yaw, without heave and pitch (Gouletas 2020 and its corrections)."""
 SUBMERGED_LAYOUT = StateLayout(
     ("x", "y", "z", "phi", "theta", "psi"), ("u", "v", "w", "p", "q", "r")
 )

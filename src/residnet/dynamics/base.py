@@ -100,7 +100,7 @@ class Dynamics(nn.Module, ABC):
     def kinematics(self, x: Tensor) -> Tensor:
         """Return the derivative of the pose [B, 3] of states [B, nx].
 
-        Source: document 003 eq. (1), and document 004 for a vessel that rolls.
+        Source: Woo et al. 2018, eq. (1), and Gouletas 2020 for a vessel that rolls.
         """
         if self.spatial:
             # `rotation_vector_derivative` turns the angular velocities into rates of the attitude

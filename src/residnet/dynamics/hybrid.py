@@ -1,4 +1,4 @@
-"""The hybrid model, nu_dot = baseline + residual (document 003 eq. (19)), and its innovations.
+"""The hybrid model, nu_dot = baseline + residual (Woo et al. 2018, eq. (19)), and its innovations.
 
 A residual in force space acts through the head's mass. A head may receive the filtered one-step
 prediction error (innovation) of the measured past, from which it can infer unmeasured wind: the

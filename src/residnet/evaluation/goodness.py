@@ -1,4 +1,4 @@
-"""Goodness of fit of one-step predictions (document 000, appendix E); repeatability of logs."""
+"""Goodness of fit of one-step predictions (Halvorsen 2019, appendix E); repeatability of logs."""
 
 from __future__ import annotations
 
@@ -425,12 +425,13 @@ def _block_sums(segments: Segments, max_block_length: int) -> tuple[np.ndarray, 
 
 
 def independent_confidence_interval(values: np.ndarray) -> tuple[float, float]:
-    """Return the 95 % interval of the mean as document 000 Listing 9.1 prints it.
+    """Return the 95 % interval of the mean as Halvorsen 2019, Listing 9.1 prints it.
 
     Student's t times the standard error of independent samples.
 
-    The resampling of the listing moves only the centre, by noise (correction E8); here it is the
-    mean itself. Far too narrow for correlated values.
+    The resampling of the listing only moves the centre of the interval at random; here the centre
+    is the mean. For correlated values the interval is far too narrow (E8 in
+    docs/documents/corrections.md).
     """
     n = len(values)
     half_width = (
@@ -481,7 +482,7 @@ class OneStepResiduals:
 
 
 class FitMeasures(NamedTuple):
-    """Measures of a regression; equations (9.11) to (9.16) of document 000.
+    """Measures of a regression; equations (9.11) to (9.16) of Halvorsen 2019.
 
     Attributes:
         rmse: root mean square residual.
@@ -505,7 +506,7 @@ def goodness_of_fit_measures(
 ) -> FitMeasures:
     """Return RMSE (9.11), R^2 (9.15), adjusted R^2 (9.16), C_p (9.12), AIC (9.13), BIC (9.14).
 
-    Equations of document 000, with sums of squares in place of means.
+    Equations of Halvorsen 2019, with sums of squares in place of means.
 
     Args:
         residuals: measured minus predicted, [m].

@@ -609,7 +609,7 @@ class MaeDifference(Record):
 
 
 class GoodnessRow(Record):
-    """Goodness of fit of one model on one axis; criteria of document 000, section 9.
+    """Goodness of fit of one model on one axis; criteria of Halvorsen 2019, section 9.
 
     Attributes:
         model: name of the model.

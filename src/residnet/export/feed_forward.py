@@ -1,6 +1,6 @@
 """Export of a force-space model as a controller's feed-forward tau = F(nu_dot, nu).
 
-Source: document 002 eq. (3.24).
+Source: Jervan 2020, eq. (3.24).
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ class BasisConfig(ClosedFormConfig, ABC):
             velocities, and its terms are affine in the accelerations.
         terms: names of basis functions (see `residnet.physics.terms`) of features scaled by their
             standard deviations. If empty, all products of the features up to `degree` and x|x| of
-            the velocities; in force space the thirty terms of document 002 (4.12).
+            the velocities; in force space the thirty terms of Jervan 2020, eq. (4.12).
         degree: maximum degree of the products if `terms` is empty.
         choose: criterion of the complexity. `free_run` is the error of free runs on validation
             data, with no residual as a candidate; `one_step` is the cross-validated error of the

@@ -1,7 +1,7 @@
 """Heads that correct the force model of a hull, with the residual eps = tau - F(nu_dot, nu).
 
-The residual is affine in nu_dot, so that the model can be solved for nu_dot in a free run (document
-002 (3.19)-(3.24)).
+The residual is affine in nu_dot, so that the model can be solved for nu_dot in a free run
+(Jervan 2020, eqs. (3.19)-(3.24)).
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class ForceHead(RenamedStateModule, ClosedFormHead):
     def residual_samples(self, samples: Samples, baseline_acceleration: Tensor) -> Samples:
         """Return samples of accelerations and channels whose target is the force residual.
 
-        The target is tau - F(nu_dot, nu) = M (nu_dot_0 - nu_dot) (document 002 (3.20)).
+        The target is tau - F(nu_dot, nu) = M (nu_dot_0 - nu_dot) (Jervan 2020, eq. (3.20)).
         """
         force = (baseline_acceleration - samples.target) @ self.mass.T
         return Samples(

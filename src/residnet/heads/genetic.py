@@ -1,4 +1,4 @@
-"""Residual equation found by genetic programming (document 000)."""
+"""Residual equation found by genetic programming (Halvorsen 2019)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Ridge regression (document 001 section 2.2, correction M4) and PLSR on basis functions."""
+"""Ridge regression and partial least squares (PLSR) on basis functions.
+
+Sources: Moreno-Salinas et al. 2019, section 2.2, and Jervan 2020, section 3.2.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +49,7 @@ class LinearBasisConfig(BasisConfig, ABC):
             require_inertia_matrix(has_inertia_matrix=has_inertia_matrix)
 
     def _with_force_defaults(self) -> Self:
-        """Return the config with the features and terms of document 002 where none are given."""
+        """Return the config with the features and terms of Jervan 2020 where none are given."""
         force_defaults = {
             "features": self.features or MOTION_CHANNELS,
             "terms": self.terms or FERRY_TERMS,

@@ -167,7 +167,7 @@ def find_best_delay(
     """Select the delay of minimum least-squares error; return it and the error profile.
 
     The profile [max_delay + 1] is the mean over the targets of ln(RSS) for each delay, evaluated on
-    the same samples for all delays (document 000 section 5.3.4).
+    the same samples for all delays (Halvorsen 2019, section 5.3.4).
 
     Args:
         samples: samples in segments.

@@ -135,8 +135,8 @@ def find_reference_names(models: Iterable[FittedModel]) -> dict[str, str]:
 def compute_residual_samples(model: HybridDynamics, samples: Samples) -> Samples:
     """Return samples whose target is the residual of the model's baseline.
 
-    The residual is an acceleration (document 003 (19)) or a force (document 002 (3.20)), depending
-    on the head.
+    The residual is an acceleration (Woo et al. 2018, eq. (19)) or a force (Jervan 2020, eq.
+    (3.20)), depending on the head.
 
     Args:
         model: model with a fitted baseline.

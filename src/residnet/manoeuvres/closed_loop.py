@@ -44,7 +44,7 @@ _ANGLE_TOLERANCE = 0.05
 class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
     """Zigzag: the steering is reversed whenever the heading has changed by `heading` to its side.
 
-    Source: document 003 section 4.2.2. The memory is the side of the command (+1 starboard, -1
+    Source: Woo et al. 2018, section 4.2.2. The memory is the side of the command (+1 starboard, -1
     port), the heading at the start and the number of reversals.
 
     Attributes:

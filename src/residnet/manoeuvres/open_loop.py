@@ -1,6 +1,6 @@
 """Manoeuvres of demands that are known in advance: steps, levels, random steps, sines, replays.
 
-Source: document 003 section 4.2.2.
+Source: Woo et al. 2018, section 4.2.2.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Wind loads and waves: spectra, irregular waves as a sum of sines, and forces on a box.
 
-Waves follow document 004 eqs. (5.30)-(5.34).
+Waves follow Gouletas 2020, eqs. (5.30)-(5.34).
 """
 
 from __future__ import annotations

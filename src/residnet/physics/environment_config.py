@@ -234,7 +234,7 @@ class WavesConfig(Config):
         spectrum: wave spectrum.
         significant_height: significant wave height, 4 sqrt(m0).
         peak_period: peak period, 2 pi / omega_p.
-        direction: direction TO which the waves travel, clockwise from north (document 004 section
+        direction: direction TO which the waves travel, clockwise from north (Gouletas 2020, section
             5.2.2.4); 0 deg are following seas on a northerly course.
         hull: dimensions of the underwater hull.
         frequencies: number N of frequency intervals between 0.5 and 4 omega_p.

@@ -1,6 +1,6 @@
 """Force models tau = F(nu_dot, nu): a prior hull model and corrections to it.
 
-Source: document 002 eqs. (3.19)-(3.27).
+Source: Jervan 2020, eqs. (3.19)-(3.27).
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ Above this value one axis has less than a hundredth of the mass of another, whic
 def weighted_column_std(terms: Sequence[str], x: Tensor) -> Tensor:
     """Return the scales beta std(x) [J] of the columns x [N, J] of basis functions.
 
-    The order beta reduces the weight of high orders (document 002 (4.8), (4.9), correction J15).
+    The order beta reduces the weight of high orders (Jervan 2020, eqs. (4.8), (4.9)). The article's
+    eq. (3.12) prints the divisor for beta = 2 only (J15 in docs/documents/corrections.md).
 
     Raises:
         FitError: if a column is constant.
@@ -77,7 +78,9 @@ class ForceCorrectionSum(nn.Module):
 
 @final
 class ForceModel(nn.Module):
-    """Prior hull model with a list of corrections, F_k = F_(k-1) + Theta phi (document 002 (3.26)).
+    """Prior hull model with a list of corrections, F_k = F_(k-1) + Theta phi.
+
+    Source: Jervan 2020, eq. (3.26).
 
     Attributes:
         earth_force: constant external force in earth axes [2] (north, east) in N.
@@ -133,7 +136,7 @@ class ForceModel(nn.Module):
     def force_residual(self, tau: Tensor, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
         """Return the force residual eps = tau - F(nu_dot, nu) [..., 3].
 
-        Source: document 002 eqs. (3.20), (3.25).
+        Source: Jervan 2020, eqs. (3.20), (3.25).
         """
         return tau - self.thruster_force(nu_dot, nu, psi)
 

@@ -1,6 +1,6 @@
 """Basis functions of force models.
 
-Source: document 002 eqs. (4.8)-(4.12).
+Source: Jervan 2020, eqs. (4.8)-(4.12).
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ FERRY_TERMS: tuple[str, ...] = (
     *(f"{name}^2" for name in VELOCITY_NAMES),
     *_CROSS_TERMS,
 )
-"""The 30 basis functions of document 002, (4.10)-(4.12)."""
+"""The 30 basis functions of Jervan 2020, eqs. (4.10)-(4.12)."""
 
 
 def term_order(term: str) -> int:
     """Return the order of a basis function, its number of factors.
 
-    The order is beta in document 002 section 4.3.4.
+    The order is beta in Jervan 2020, section 4.3.4.
     """
     return max(sum(abs(factor.power) for factor in parse_term(term, MOTION_CHANNELS)), 1)
 

@@ -13,7 +13,7 @@ from residnet.physics.parameters import GRAVITY
 SpeedRegime = Literal["displacement", "semi_displacement", "planing"]
 SPEED_REGIMES: tuple[SpeedRegime, ...] = ("displacement", "semi_displacement", "planing")
 REGIME_BOUNDARIES = (0.4, 1.0)
-"""Froude numbers at the boundaries of the speed regimes (document 000, appendix D).
+"""Froude numbers at the boundaries of the speed regimes (Halvorsen 2019, appendix D).
 
 In the document, planing begins between 1.0 and 1.2.
 """

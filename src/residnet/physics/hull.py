@@ -1,7 +1,8 @@
 """Vessel files of hulls: rigid body, added mass and terms of forces or accelerations.
 
-Sources: document 003 eqs. (5)-(9), corrections W1, W2; document 002 eqs. (2.3)-(2.6), appendix A;
-document 000 eqs. (6.6)-(6.8), corrections H1 to H5; document 004, section 5.2 with corrections.
+Sources: Woo et al. 2018, eqs. (5)-(9); Jervan 2020, eqs. (2.3)-(2.6) and appendix A; Halvorsen
+2019, eqs. (6.6)-(6.8); Gouletas 2020, section 5.2. Wrong signs, symbols and missing terms are
+corrected as listed in docs/documents/corrections.md (W1, W2, J1 to J4, H1 to H5, G1 to G7).
 """
 
 from __future__ import annotations
@@ -239,7 +240,7 @@ class HullConfig(HullVessel, ABC):
 
     Attributes:
         scale: common factor of M, C and D, which defines a plant that differs from the prior model
-            of its `base` (document 002 eq. (4.2)).
+            of its `base` (Jervan 2020, eq. (4.2)).
         damping: terms of D(nu) nu of each axis; positive coefficients damp.
     """
 
@@ -349,7 +350,7 @@ class MassMatrixConfig(HullConfig):
     Attributes:
         mass: entries of the mass matrix.
 
-    Source: document 002 eqs. (2.3)-(2.6), appendix A.
+    Source: Jervan 2020, eqs. (2.3)-(2.6), appendix A.
     """
 
     kind: Literal["mass_matrix"]
@@ -365,7 +366,7 @@ class MassMatrixConfig(HullConfig):
         ]
 
     def sway_yaw_coupling(self) -> float:
-        """Return m23, as in document 002 (2.5) (correction J4)."""
+        """Return m23, as in Jervan 2020, eq. (2.5), whose mass matrix is not symmetric."""
         return self.mass.m23.value
 
 
@@ -486,7 +487,7 @@ class RollingHullConfig(HullVessel):
         return {"u": self.speed}
 
     def hull_coefficients(self) -> HullCoefficients:
-        """Return the coefficients with the inertia about the origin (document 004 eq. (5.12)).
+        """Return the coefficients with the inertia about the origin (Gouletas 2020, eq. (5.12)).
 
         Coriolis forces of the added mass are included only as terms of the source (X_vr).
         """

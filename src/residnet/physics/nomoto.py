@@ -1,6 +1,6 @@
 """Nomoto steering models at constant speed: first and second order, and with sideslip.
 
-Source: document 004, section 5.1.
+Source: Gouletas 2020, section 5.1.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Configuration of Nomoto steering models at constant speed.
 
-Source: document 004, section 5.1.
+Source: Gouletas 2020, section 5.1.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class NomotoVesselConfig(VesselFile, ABC):
 
 
 class NomotoConfig(NomotoVesselConfig):
-    """First-order model T r_dot + r = K delta without sideslip (document 004 eq. (5.9)).
+    """First-order model T r_dot + r = K delta without sideslip (Gouletas 2020, eq. (5.9)).
 
     Attributes:
         T: time constant in s.
@@ -121,7 +121,7 @@ class SecondOrderSteeringConfig(NomotoVesselConfig, ABC):
         T2: second time constant of the denominator in s.
         T3: time constant of the numerator in s.
 
-    Source: document 004 eq. (5.3).
+    Source: Gouletas 2020, eq. (5.3).
     """
 
     pole_names = ("T1", "T2")
@@ -139,8 +139,8 @@ class SecondOrderSteeringConfig(NomotoVesselConfig, ABC):
 class SecondOrderNomotoConfig(SecondOrderSteeringConfig):
     """Second-order model of the yaw rate without sideslip.
 
-    T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot): document 004 eq. (5.5) with
-    correction G12.
+    T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot): Gouletas 2020, eq. (5.5),
+    with the missing time derivatives (G12 in docs/documents/corrections.md).
 
     The internal state q = r_dot - K T3 / (T1 T2) delta avoids the derivative of the rudder angle.
     """
@@ -163,9 +163,9 @@ class SecondOrderNomotoConfig(SecondOrderSteeringConfig):
 class SideslipNomotoConfig(SecondOrderSteeringConfig):
     """Second-order model in yaw and sway, given by its transfer functions.
 
-    M nu_dot + N(u) nu = b delta with nu = (v, r) (document 004 eq. (5.1)) has the transfer
-    functions (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2 s)), (5.4) with
-    correction G12.
+    M nu_dot + N(u) nu = b delta with nu = (v, r) (Gouletas 2020, eq. (5.1)) has the transfer
+    functions (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2 s)), (5.4), in
+    which the document prints u for v (G12 in docs/documents/corrections.md).
 
     Attributes:
         K_v: steady sway velocity per rudder angle in m/s per rad.

@@ -144,7 +144,7 @@ class Hull(nn.Module):
     def required_force(self, nu_dot: Tensor, motion: Tensor) -> Tensor:
         """Compute the external forces [..., n] for the acceleration nu_dot [..., n].
 
-        Source: document 002 eq. (2.10).
+        Source: Jervan 2020, eq. (2.10).
         """
         return nu_dot @ self.mass.to(motion.dtype).T - self.hydrodynamic_force(motion)
 
@@ -304,7 +304,7 @@ class HullPlant(Plant):
         return torch.cat((nu, pose[..., 2:3]), dim=-1) if self.has_roll else nu
 
     def _pose_derivative(self, pose: Tensor, nu: Tensor) -> Tensor:
-        """Return the derivative [B, n] of the pose (document 003 eq. (1), document 004).
+        """Return the derivative [B, n] of the pose (Woo et al. 2018, eq. (1), Gouletas 2020).
 
         In six degrees of freedom the derivatives of the angles are p, q and r.
         """

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 TERM_FUNCTIONS = ("sin", "cos", "sqrt", "ssqrt", "inv")
 """Functions of a channel.
 
-`sqrt` is sqrt|x|, `ssqrt` is sign(x) sqrt|x|, and `inv` is 1/x with the value 0 at x = 0 (document
-001 section 2.4: protected division and square root).
+`sqrt` is sqrt|x|, `ssqrt` is sign(x) sqrt|x|, and `inv` is 1/x with the value 0 at x = 0
+(Moreno-Salinas et al. 2019, section 2.4: protected division and square root).
 """
 EVEN_FUNCTIONS = ("cos", "sqrt")
 """Even functions; the others are odd."""
@@ -155,8 +155,8 @@ class CandidatesConfig(Config):
 
     The candidates are all products of motions, with magnitudes of any factors, and all products of
     inputs, multiplied by products of coupled motions and by 1 or the sine or cosine of an angle.
-    The candidates of document 000 eqs. (6.21)-(6.23) are inputs rpm up to degree 2, coupling u up
-    to degree 2, and angle nozzle.
+    The candidates of Halvorsen 2019, eqs. (6.21)-(6.23) are inputs rpm up to degree 2, coupling u
+    up to degree 2, and angle nozzle.
 
     Attributes:
         motions: channels of the motion; those that the model does not have are ignored.

@@ -161,7 +161,7 @@ class OutlierMask(MaskRule):
     exceeded. The standard deviation has a robust estimate over the complete channel as its lower
     bound, because ten samples alone would mark 2 % of normal noise as outliers.
 
-    Source: document 002, section 5.2.
+    Source: Jervan 2020, section 5.2.
 
     Attributes:
         channels: channels to check.

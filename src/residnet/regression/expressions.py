@@ -1,8 +1,8 @@
 """Expressions in normal form: sums of products of channels and of functions of such sums.
 
 Genetic programming creates trees. The normal form of a tree is a sum of products whose terms get a
-coefficient each (document 000 sections 5.1.1 and 5.1.3). A product is a tuple of indices of atoms,
-so that trees of equal meaning compare equal and share their columns and their fit.
+coefficient each (Halvorsen 2019, sections 5.1.1 and 5.1.3). A product is a tuple of indices of
+atoms, so that trees of equal meaning compare equal and share their columns and their fit.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _MIN_ROOT_ARGUMENT = 1e-24
 Function = Literal["sum", "abs", "sin", "cos", "sqrt", "inv"]
 """Functions of a sum: brackets, magnitude, sine, cosine, protected square root and inverse.
 
-Source of the protected functions: document 001 section 2.4.
+Source of the protected functions: Moreno-Salinas et al. 2019, section 2.4.
 """
 FUNCTIONS: tuple[Function, ...] = ("sum", "abs", "sin", "cos", "sqrt", "inv")
 

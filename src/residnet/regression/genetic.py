@@ -1,4 +1,4 @@
-"""Genetic programming of equations by the method of document 000 (chapters 4 to 6), with DEAP.
+"""Genetic programming of equations by the method of Halvorsen 2019 (chapters 4 to 6), with DEAP.
 
 Individuals are trees of channels and operators. The expression of a tree is split at + and - into
 terms, after expansion of products if `split` is `expand`. Least squares gives every term a
@@ -55,7 +55,7 @@ Terms = tuple[Product, ...]
 _SINGULARITY_TOLERANCE = 1e-13
 """Squared pivot of the Cholesky factor below which a Gram matrix counts as singular.
 
-Source: document 000 section 5.1.2.
+Source: Halvorsen 2019, section 5.1.2.
 """
 _MIN_MEAN_SQUARE = 1e-300
 """Lower bound of the mean square of a target in a denominator."""
@@ -79,7 +79,7 @@ class FitnessEvaluator:
 
     Each distinct set of terms is fitted once per search. The new sets of a generation share the
     columns of their terms, and Gram matrices, Cholesky factors and residuals are computed in
-    batches (document 000 eqs. (5.4)-(5.6)).
+    batches (Halvorsen 2019, eqs. (5.4)-(5.6)).
     """
 
     def __init__(

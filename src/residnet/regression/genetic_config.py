@@ -22,7 +22,7 @@ class EvolutionConfig(Config):
         population: number of individuals.
         generations: maximum number of generations after the initial population.
         operators: operators of the trees. `/` returns 0 for a divisor of 0 and `sqrt` uses the
-            magnitude of its argument (document 001 section 2.4).
+            magnitude of its argument (Moreno-Salinas et al. 2019, section 2.4).
         constants: range of random constants in trees; None for no constants. Coefficients of terms
             are fitted, so constants matter only as arguments of functions.
         tournament: number of individuals in a selection tournament.
@@ -31,8 +31,9 @@ class EvolutionConfig(Config):
             0 to 2. The remaining offspring are copies.
         depth: maximum depth of a tree.
         first_depth: minimum and maximum depth of the initial trees (ramped half-and-half).
-        genes: number of trees per individual (multigene form of document 001, which uses 5 trees
-            of depth 3). With several trees, half of the crossovers exchange whole trees.
+        genes: number of trees per individual (multigene form of Moreno-Salinas et al. 2019, which
+            uses 5 trees of depth 3). With several trees, half of the crossovers exchange whole
+            trees.
         split: the parts of an individual that get a coefficient: every tree (`gene`), every summand
             of a tree without expansion (`sum`, section 5.1.1), or every summand after expansion
             (`expand`, section 5.1.3).

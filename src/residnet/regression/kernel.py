@@ -1,4 +1,8 @@
-"""Kernel ridge regression (document 001 section 3.2, corrections M4, M5)."""
+"""Kernel ridge regression.
+
+Source: Moreno-Salinas et al. 2019, section 3.2. The article misprints the inverse matrix of the
+solution and the exponent of the radial kernel (`docs/documents/corrections.md`, M4 and M5).
+"""
 
 from __future__ import annotations
 
@@ -59,7 +63,7 @@ def fit_dual_path(
     """Solve kernel ridge regressions alpha = (K + lambda I)^-1 Y for every penalty lambda.
 
     The errors on a fold f need no refit: with the smoother H = K (K + lambda I)^-1 they are
-    (I - H_ff)^-1 (Y - H Y)_f (document 001 section 3.2, correction M4).
+    (I - H_ff)^-1 (Y - H Y)_f (Moreno-Salinas et al. 2019, section 3.2, correction M4).
 
     Args:
         kernel: kernel matrix K of all samples [N, N].
@@ -230,7 +234,7 @@ class Kernel(ResizableModule, ABC):
 class RbfKernel(Kernel):
     """Sum of Gaussian radial basis functions, f_k(x) = sum_i c_ik exp(-gamma_k |x - x_i|^2).
 
-    gamma = 1 / (2 sigma), where sigma is a squared length (document 001 section 3.2,
+    gamma = 1 / (2 sigma), where sigma is a squared length (Moreno-Salinas et al. 2019, section 3.2,
     correction M5).
     """
 
@@ -317,7 +321,7 @@ class RbfKernel(Kernel):
 
 @final
 class PolynomialKernel(Kernel):
-    """Polynomial kernel (slope x'x' + constant)^degree (document 001 section 3.2).
+    """Polynomial kernel (slope x'x' + constant)^degree (Moreno-Salinas et al. 2019, section 3.2).
 
     The kernel is an inner product of finitely many weighted monomials, so the primal ridge
     regression on these is exact for any number of samples.
@@ -406,9 +410,9 @@ def kmeans_plus_plus_indices(x: Tensor, n_points: int, seed: int) -> Tensor:
 class SingleStateFreeRun:
     """Errors of free runs in which one state is integrated and all other inputs are measured.
 
-    This is the first approach of document 001 section 4. It tunes every output alone; the coupled
-    free run may still diverge, which is why the document abandons the approach. Uninterrupted
-    segments are padded to equal length and integrated as a batch.
+    This is the first approach of Moreno-Salinas et al. 2019, section 4. It tunes every output
+    alone; the coupled free run may still diverge, which is why the document abandons the approach.
+    Uninterrupted segments are padded to equal length and integrated as a batch.
 
     Args:
         z: inputs of the fit [N, nz].
@@ -493,8 +497,8 @@ class KernelRidge(Estimator):
 
     Args:
         kernel: kernel module with its candidate settings.
-        penalties: candidate penalties per sample; lambda of document 001 and `alpha` of
-            scikit-learn are the penalty times the number of samples.
+        penalties: candidate penalties per sample; lambda of Moreno-Salinas et al. 2019 and `alpha`
+            of scikit-learn are the penalty times the number of samples.
         folds: number of folds of the cross-validation; None for a fold per group.
         scoring: computes the errors by which setting and penalty are chosen per output; None for
             the cross-validated errors.

@@ -1,7 +1,7 @@
 """Surface analysis: PLSR by model order and number of basis functions.
 
 Backward elimination removes the basis function with the smallest coefficient until two remain
-(document 002 section 4.5).
+(Jervan 2020, section 4.5).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class ErrorSurface:
         return [j for j in range(self.removal.shape[2]) if j not in removed]
 
     def minimum_error_model(self, output: int) -> tuple[int, int]:
-        """Return (order, number of terms) of the minimum error of an output, as document 002 does.
+        """Return (order, number of terms) of the minimum error of an output, as Jervan 2020 does.
 
         The estimate of the error is optimistic if the same folds also evaluate the result.
         """
@@ -226,7 +226,7 @@ class _NormalEquations:
 class SurfacePLSR(Estimator):
     """PLSR fitted per output, with surface analysis for the order and the basis functions.
 
-    Source: document 002 section 4.5.1.
+    Source: Jervan 2020, section 4.5.1.
 
     Args:
         selection_rule: `simplest` for the one-standard-error rule, `least` for the minimum error.

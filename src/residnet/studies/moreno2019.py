@@ -1,4 +1,4 @@
-"""Document 001 (Moreno-Salinas et al. 2019): additional section in the report of a fit.
+"""Moreno-Salinas et al. 2019: additional section in the report of a fit.
 
 The document prints root mean square errors of u, v, r in free runs over whole records on training,
 validation and test data (Tables 2 and 3). This module adds confidence intervals by moving blocks
@@ -139,7 +139,7 @@ def sections(files: RunFiles) -> list[Section]:
         blocks.insert(
             0, Text(f"Not run: {_MODEL_LABELS[_OPTIONAL_MODEL]}, which needs the extra gp.")
         )
-    return [Section("Document 001 (Moreno-Salinas et al. 2019)", blocks)]
+    return [Section("Moreno-Salinas et al. 2019", blocks)]
 
 
 def _velocity_column(
@@ -217,7 +217,7 @@ def _difference_row(
 def _record_figure(records: Sequence[StoredWindow]) -> Figure:
     """Return measured and predicted velocities of the longest test record (Figure 8)."""
     record = max(records, key=lambda window: len(window.t))
-    title = "Figure 8 of document 001: test record in free run"
+    title = "Figure 8 of Moreno-Salinas et al. 2019: test record in free run"
     caption = "One free run over the whole record, without the wind as an input."
     return plot_time_series(
         "8",
@@ -312,7 +312,8 @@ def grid_figures(notes: Mapping[str, Any]) -> list[Figure]:
         figures.append(
             Figure(
                 str(5 + parameter_index),
-                f"Figure {5 + parameter_index} of document 001: error over {parameter_text}",
+                f"Figure {5 + parameter_index} of Moreno-Salinas et al. 2019: error over"
+                f" {parameter_text}",
                 "Left: free runs over the validation record, mean of the normalised errors of u, v,"
                 " r. Right: cross-validated one-step error on the training records, relative to"
                 " the smallest one of each axis, mean of the axes. All three outputs have"
@@ -327,7 +328,7 @@ def grid_figures(notes: Mapping[str, Any]) -> list[Figure]:
 
 
 class Moreno2019Study(FitStudy):
-    """Figures 5, 6 and 8 of document 001 for a fit of its models."""
+    """Figures 5, 6 and 8 of Moreno-Salinas et al. 2019 for a fit of its models."""
 
     name: ClassVar[str] = "moreno2019"
     models: ClassVar[tuple[str, ...]] = (

@@ -1,4 +1,4 @@
-"""Document 003 (Woo et al. 2018): section in the report of configs/studies/woo2018/woo2018.yaml.
+"""Woo et al. 2018: section in the report of configs/studies/woo2018/woo2018.yaml.
 
 The document shows the steady states of constant manoeuvres (Figure 9) and single runs: simplified
 steering models in a zigzag (13), surge in an acceleration-deceleration test (14), sway and yaw rate
@@ -73,7 +73,7 @@ _RATIO_CAPTION = (
 
 
 def sections(files: RunFiles) -> list[Section]:
-    """Write study.json, draw the figures of document 003 and return the section of the report.
+    """Write study.json, draw the figures of Woo et al. 2018 and return the section of the report.
 
     Raises:
         UsageError: if the run lacks a kind of manoeuvre.
@@ -111,7 +111,7 @@ def sections(files: RunFiles) -> list[Section]:
         " the LSTM. The document prints one figure for each velocity.",
     )
     blocks: list[Block] = [explanation, steady_state_table(files), figures[0], table]
-    return [Section("Document 003 (Woo et al. 2018)", [*blocks, *figures[1:]])]
+    return [Section("Woo et al. 2018", [*blocks, *figures[1:]])]
 
 
 def error_changes(files: RunFiles, model: str) -> dict[str, float | None]:
@@ -259,7 +259,7 @@ def _numbered_figure(
 ) -> Figure:
     """Return a figure with the document's figure number, from panels and curves."""
     panels, traces = zip(*panels_and_traces, strict=True)
-    title = f"Figure {number} of document 003: {title_text}"
+    title = f"Figure {number} of Woo et al. 2018: {title_text}"
     return Figure(str(number), title, caption, styles, panels, [Case("", traces)], columns=columns)
 
 
@@ -369,7 +369,7 @@ def _error_figure(
 
 
 class Woo2018Study(FitStudy):
-    """The figures of document 003 for a fit of its models."""
+    """The figures of Woo et al. 2018 for a fit of its models."""
 
     name: ClassVar[str] = "woo2018"
     models: ClassVar[tuple[str, ...]] = (

@@ -112,7 +112,7 @@ class MachineConfig(Config):
 
 
 class OneStep(Config):
-    """Settings of the teacher-forced stage on residual accelerations (document 003 eq. (20)).
+    """Settings of the teacher-forced stage on residual accelerations (Woo et al. 2018, eq. (20)).
 
     Attributes:
         epochs: number of epochs of `steps` batches each.

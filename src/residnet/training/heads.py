@@ -45,7 +45,7 @@ def one_step_loss(
     scale: Tensor,
     process_mean: ProcessMean = single_process_mean,
 ) -> Tensor:
-    """Return the mean squared error of accelerations along windows (document 003 eq. (20)).
+    """Return the mean squared error of accelerations along windows (Woo et al. 2018, eq. (20)).
 
     The error is in units of the standard deviation of the residual.
 

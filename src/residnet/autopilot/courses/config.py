@@ -132,7 +132,8 @@ def buoy_feasibility(
 ) -> list[dict[str, float | bool]]:
     """Compare the radius of each buoy with the smallest turning radius in m.
 
-    Both courses of document 004 have radii below it (correction G18).
+    Both courses of Gouletas 2020 have radii below it (correction G18 in
+    docs/documents/corrections.md).
     """
     return [
         {

@@ -47,7 +47,7 @@ class HeadingPD(Policy):
         damping: float,
         limit: float,
     ) -> HeadingPD:
-        """Design a PD law for T r_dot + r = K delta by pole placement (document 004 eq. (5.9)).
+        """Design a PD law for T r_dot + r = K delta by pole placement (Gouletas 2020, eq. (5.9)).
 
         Args:
             state: names of the state.
@@ -72,7 +72,7 @@ class HeadingPD(Policy):
 
 @final
 class BangBangHeading(Policy):
-    """Time-optimal bang-bang control of T r_dot + r = K delta (document 004 eq. (5.9)).
+    """Time-optimal bang-bang control of T r_dot + r = K delta (Gouletas 2020, eq. (5.9)).
 
     Full counter-rudder d stops a yaw rate r within T r - T K d ln(1 + r / (K d)) of heading. The
     sign of the heading error minus this angle selects the side of the rudder. In a boundary layer
@@ -142,7 +142,7 @@ _N_BISECTIONS = 40
 
 @final
 class RatedBangBangHeading(Policy):
-    """Time-optimal control of T r_dot + r = K delta with a rudder rate (document 004 eq. (5.9)).
+    """Time-optimal control of T r_dot + r = K delta with a rudder rate (Gouletas 2020, eq. (5.9)).
 
     The law applies full rudder towards the reference until braking has to start. Braking moves the
     rudder to the opposite side, holds it if it reaches the limit, and returns it amidships, so that

@@ -1,6 +1,6 @@
-"""The predictive heading autopilot of document 004 (Gouletas 2020): law, predictors, configs.
+"""The predictive heading autopilot of Gouletas 2020: law, predictors, configs.
 
-Source: sections 6.1.1 to 6.1.3 and 6.2, eqs. (6.3), (6.4), corrections of document 004. This
+Source: sections 6.1.1 to 6.1.3 and 6.2, eqs. (6.3), (6.4), and docs/documents/corrections.md. This
 module does not import Lightning, so that `residnet check` is fast.
 """
 
@@ -41,7 +41,7 @@ class Predictor(nn.Module, ABC):
         Args:
             x: states [B, nx].
             heading: current reference [B], from which the predicted error is computed as in the
-                listing of the source (correction G22).
+                listing of the source (see G22 in docs/documents/corrections.md).
             rudder: candidates [C] in rad.
         """
 
@@ -173,7 +173,7 @@ class DocumentAutopilot(Policy):
 
     The source uses 41 candidates between -5 and 5 deg, a weight of 0.2 and a horizon of one step of
     0.01 s. With this horizon d_e is saturated and d_r stops the yaw, so that the vessel turns at
-    only 0.011 deg/s (corrections of document 004). A horizon of seconds avoids this.
+    only 0.011 deg/s (see docs/documents/corrections.md). A horizon of seconds avoids this.
 
     Args:
         predictor: prediction for the candidates.
@@ -262,11 +262,11 @@ class _PredictiveLawConfig(Config):
 
 
 class DocumentConfig(_PredictiveLawConfig, ControllerConfig):
-    """The predictive law of document 004 with an exact predictor of the nominal vessel.
+    """The predictive law of Gouletas 2020 with an exact predictor of the nominal vessel.
 
     Attributes:
         horizon: horizon of the prediction in s; the heading does not settle with the 0.01 s of the
-            source (corrections of document 004).
+            source (see docs/documents/corrections.md).
         candidates: number of rudder angles.
         weight: weight of the angle with the smallest heading error.
     """
@@ -306,7 +306,7 @@ class PredictorSpec(Stored):
 class PredictorTraining(OneStage):
     """Settings of the supervised training on random states and their simulated changes.
 
-    Document 004, 6.1.1 and 6.2.1.
+    Gouletas 2020, 6.1.1 and 6.2.1.
 
     Attributes:
         states: number of states for training; a fifth of this number is used for validation.
@@ -329,14 +329,14 @@ class PredictorTraining(OneStage):
 
 
 class PredictiveConfig(_PredictiveLawConfig):
-    """The predictive autopilot of document 004: a trained predictor and the control law (6.4).
+    """The predictive autopilot of Gouletas 2020: a trained predictor and the control law (6.4).
 
     The predictor is a perceptron. It predicts heading error and yaw rate for each candidate rudder
     angle; the law is a weighted mean of the angles that minimise the one and the other.
 
     Attributes:
         horizon: horizon of the prediction, in s; the heading does not settle with the
-            document's 0.01 s (corrections, "The controller of document 004").
+            document's 0.01 s (see docs/documents/corrections.md).
         candidates: number of rudder angles that are compared, evenly spaced between the limits.
         weight: weight in (6.4) of the angle with the smallest heading error, from 0 to 1.
         hidden: widths of the hidden layers; the document has 20 units for Nomoto's model and 30 for

@@ -188,7 +188,7 @@ still oscillated with a share of 0.1 of simulations without noise and disturbanc
 with 0.25.
 """
 _REFERENCE_TIME_STEP = 0.02
-"""Step in s of the vessel of document 004, which `pace` multiplies."""
+"""Step in s of the vessel of Gouletas 2020, which `pace` multiplies."""
 
 
 class SteeringDescription(NamedTuple):

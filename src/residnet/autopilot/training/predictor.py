@@ -1,4 +1,4 @@
-"""Training of the predictor of document 004: a perceptron learns responses to rudder angles.
+"""Training of the predictor of Gouletas 2020: a perceptron learns responses to rudder angles.
 
 Source: sections 6.1.1, 6.1.2, 6.2.1 and 6.2.2.
 """

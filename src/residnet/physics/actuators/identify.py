@@ -1,6 +1,6 @@
 """Identification of actuators from tests: throttle map, rate limit, dead time, thrust curves.
 
-Source: document 003 section 4.1.
+Source: Woo et al. 2018, section 4.1.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Rudders with propellers, fins and water jets.
 
-Sources: the MMG standard method (Yasukawa and Yoshimura 2015); document 004, section 5.2.2.3;
-document 000 eqs. (6.12)-(6.16), corrections H10 to H16.
+Sources: the MMG standard method (Yasukawa and Yoshimura 2015); Gouletas 2020, section 5.2.2.3;
+Halvorsen 2019, eqs. (6.12)-(6.16), with the missing values and
+misprints listed in docs/documents/corrections.md (H10 to H16, G8 to G11).
 """
 
 from __future__ import annotations
@@ -153,8 +154,8 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
     """Coupled stern rudders with propellers whose thrust is commanded.
 
     Commands are cmd_delta [rad] and cmd_thrust [N]; delta [rad] is a state if the rudder has
-    dynamics. Y = -L, K = z L, N = -x L, X = T - D, where delta > 0 turns to starboard (document 004
-    eqs. (5.26)-(5.29), signs by corrections G9, G10).
+    dynamics. Y = -L, K = z L, N = -x L, X = T - D, where delta > 0 turns to starboard (Gouletas
+    2020, eqs. (5.26)-(5.29), where two signs are wrong: G9, G10 in docs/documents/corrections.md).
 
     Attributes:
         x: longitudinal position of the centre of pressure of the rudders in m, negative aft of the
@@ -208,8 +209,8 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
 class FoilRuddersConfig(SternRuddersConfig):
     """Rudders modelled as foils, with a correction for the slipstream of the propellers.
 
-    Document 004 eqs. (5.20)-(5.25), corrections G8, G11. The drag at zero angle is part of the
-    calm-water resistance of the hull.
+    Gouletas 2020, eqs. (5.20)-(5.25), without its misprints (G8, G11). The drag at zero angle is
+    part of the calm-water resistance of the hull.
 
     Attributes:
         rudders: number of rudders with equal lift.
@@ -263,7 +264,7 @@ class FoilRuddersConfig(SternRuddersConfig):
 class LinearRuddersConfig(SternRuddersConfig):
     """Rudders with the side force Y_delta_uu u^2 delta, without drag and slipstream.
 
-    Source: document 004, Table 5.3.
+    Source: Gouletas 2020, Table 5.3.
 
     Attributes:
         Y_delta_uu: coefficient of all rudders in kg/m per rad.
@@ -363,7 +364,7 @@ class WaterJetsConfig(SteeredConfig):
     def jet_thrust(self, n: Tensor, u: Tensor) -> Tensor:
         """Compute the thrust [N] of one jet at revolutions n [1/s] and speed u [m/s], any shape.
 
-        Source: document 000 eq. (6.16).
+        Source: Halvorsen 2019, eq. (6.16).
         """
         speed_curve = self.speed
         revolutions_curve = self.revolutions

@@ -29,7 +29,8 @@ _NEWTON_STEPS = 4
 class ThrusterForces(nn.Module):
     """Forces tau [..., 3] in N, N, N m of fixed thrusters at revolutions n [..., c] in 1/s.
 
-    Source: document 003 eqs. (6), (21), (22), clipped by correction W5.
+    Source: Woo et al. 2018, eqs. (6), (21), (22). The thrust is clipped to the sign of n, because
+    the printed polynomials jump at n = 0 (W5 in docs/documents/corrections.md).
     """
 
     def __init__(self, thrusters: Sequence[ThrusterConfig]) -> None:
@@ -87,7 +88,7 @@ class Thrusters(ActuatorSystem):
         """Return the revolutions [..., c] for drive and steer, limited to n_max.
 
         With differential thrust, drive is the mean and steer the difference of the revolutions
-        (document 003 eqs. (30), (31)).
+        (Woo et al. 2018, eqs. (30), (31)).
         """
         shares = torch.stack((drive, steer), dim=-1) @ self.demand_map.to(drive.dtype)
         return shares.clamp(-1.0, 1.0) * self.n_max.to(drive.dtype)
@@ -99,7 +100,7 @@ class Thrusters(ActuatorSystem):
 
 @final
 class AzimuthThrusters(ForceActuators):
-    """Forces tau [..., 3] of k azimuth thrusters (document 002 eqs. (5.1), (5.2))."""
+    """Forces tau [..., 3] of k azimuth thrusters (Jervan 2020, eqs. (5.1), (5.2))."""
 
     def __init__(self, config: AzimuthThrustersConfig) -> None:
         super().__init__(*config.servo_specs())

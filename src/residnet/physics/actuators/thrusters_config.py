@@ -106,10 +106,10 @@ class ThrustersConfig(ActuatorConfig):
 
 
 class DifferentialThrustConfig(ThrustConfig, ActuatorConfig):
-    """Two fixed thrusters for differential thrust (document 003 section 4.1).
+    """Two fixed thrusters for differential thrust (Woo et al. 2018, section 4.1).
 
     The thrust curve is clipped to the sign of the rotation, which removes the discontinuity of the
-    published polynomials at zero (correction W5).
+    published polynomials at zero (W5 in docs/documents/corrections.md).
 
     Attributes:
         spacing: lateral distance between the thrusters in m.

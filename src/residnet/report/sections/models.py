@@ -331,7 +331,7 @@ def _join_truncated(names: Sequence[str]) -> str:
 
 
 def term_figures(run: RunFiles) -> Iterator[Figure]:
-    """Draw the equation of every model along a log, term by term (document 000, 6.4.2)."""
+    """Draw the equation of every model along a log, term by term (Halvorsen 2019, 6.4.2)."""
     frame = run.read_parquet("terms.parquet")
     if frame is None:
         return

@@ -1,1 +1,1 @@
-"""Document 000 (Halvorsen 2019): symbolic regression and the USV Odin."""
+"""Halvorsen 2019: symbolic regression and the USV Odin."""

@@ -1,9 +1,9 @@
-"""The standard model of document 000 and its fit to accelerations (section 7.5.1).
+"""The standard model of Halvorsen 2019 and its fit to accelerations (section 7.5.1).
 
-M nu_dot + C(nu) nu + D(nu) nu = tau with a known mass: appendix C.2, (9.4)-(9.9), corrections H17
-to H21. The document counts 14 unknown parameters and lists 13; the fourteenth is N_v of (9.8),
-which its table lacks (correction H20). The centre of gravity is amidships (x_g of (9.6) is not in
-the table either).
+M nu_dot + C(nu) nu + D(nu) nu = tau with a known mass: appendix C.2, (9.4)-(9.9), with the
+missing values and signs of H17 to H21 in docs/documents/corrections.md. The document counts 14
+unknown parameters and lists 13; the fourteenth is N_v of (9.8), which its table lacks (correction
+H20). The centre of gravity is amidships (x_g of (9.6) is not in the table either).
 """
 
 from __future__ import annotations
@@ -258,7 +258,7 @@ def true_parameters(vessel: AccelerationHullConfig, mass: float) -> dict[str, fl
     """Return the true parameters of a vessel whose accelerations are known as terms.
 
     Terms that are not in the standard model are ignored. The result is exact for a vessel
-    without added mass and with the Coriolis terms v r and -u r, as in document 000.
+    without added mass and with the Coriolis terms v r and -u r, as in Halvorsen 2019.
     """
     gain = [1.0 / parameter.value for parameter in (vessel.gains.x, vessel.gains.y, vessel.gains.n)]
     acceleration_terms = coefficient_rows(vessel.terms)

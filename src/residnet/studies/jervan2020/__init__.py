@@ -1,1 +1,1 @@
-"""Document 002 (Jervan 2020): force residuals of the ferry milliAmpere."""
+"""Jervan 2020: force residuals of the ferry milliAmpere."""

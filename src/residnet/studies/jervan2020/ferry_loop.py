@@ -1,6 +1,6 @@
 """A ferry in closed loop: the true plant, a controller with a believed model, and the log.
 
-Source: document 002, chapter 4.
+Source: Jervan 2020, chapter 4.
 """
 
 from __future__ import annotations
@@ -64,7 +64,8 @@ class LoopConfig(Config):
     """A PID controller with critically damped poles, and the sampling of its log.
 
     The gains are Kp = m omega^2, Kd = 2 m omega and Ki = integral omega Kp, with m the believed
-    mass of each axis. The document does not print its gains (correction J10).
+    mass of each axis. The document does not print its gains; J10 in
+    docs/documents/corrections.md says how they were identified.
 
     Attributes:
         frequency: omega of surge, sway and yaw in rad/s.

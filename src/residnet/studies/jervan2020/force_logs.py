@@ -1,6 +1,6 @@
 """Measured logs of force and motion, their cross-validation folds, thruster lag and sensor checks.
 
-Source: document 002, chapter 5.
+Source: Jervan 2020, chapter 5.
 """
 
 from __future__ import annotations

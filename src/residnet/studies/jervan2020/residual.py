@@ -1,4 +1,4 @@
-"""Residual forces of a known hull and their identification, for both studies of document 002.
+"""Residual forces of a known hull and their identification, for both studies of Jervan 2020.
 
 The residual is the force that the hull model does not explain: tau - F(nu_dot, nu) (3.19), (3.20).
 It is regressed on basis functions of the motion (chapters 3 and 4); a model runs forward in time by
@@ -152,7 +152,7 @@ class RegressionConfig(Config):
 
     Attributes:
         kind: `plsr`, PLSR of the three axes together; `surface`, PLSR of each axis separately with
-            surface analysis (document 002 section 4.5.1); `ols`, ordinary least squares; `ridge`,
+            surface analysis (Jervan 2020, section 4.5.1); `ols`, ordinary least squares; `ridge`,
             `lasso` or `elastic_net` with the penalty of the smallest cross-validation error.
         order: number of latent variables of `plsr`; null for the smallest cross-validation error.
         choose: selection rule of `surface`. `test`, as in the document: smallest error on the test
@@ -199,7 +199,8 @@ class RegressionConfig(Config):
         e, f, mean_x, mean_y, std_y = data.standardised
         groups = data.fold if needs_folds else None
         first_fit = estimator.fit(e, f, groups, names=data.terms, outputs=_FORCE_NAMES)[0]
-        # Theta_post = diag(scale)^-1 Theta_pre diag(std y) (3.12), correction J15
+        # Theta_post = diag(scale)^-1 Theta_pre diag(std y), which eq. (3.12) misprints (J15 in
+        # docs/documents/corrections.md)
         coefficients = first_fit.coefficients / data.scale[:, None] * std_y
         notes = first_fit.hyperparameters or first_fit.notes
         if self.kind == "ridge":
@@ -639,8 +640,8 @@ def derive_forward_equations(believed: str, model: ForceModel, label: str) -> Hu
 def missing_coefficients(plant_name: str, believed: str) -> dict[str, list[float]]:
     """Return the exact coefficients of a residual by basis function: surge, sway, yaw.
 
-    They are the plant's coefficients minus the believed ones; document 002 misprints the cross
-    terms (correction J19).
+    They are the plant's coefficients minus the believed ones; Jervan 2020 misprints the cross
+    terms (J19 in docs/documents/corrections.md).
     """
 
     def factors(term: str) -> tuple[Any, ...]:
@@ -649,7 +650,7 @@ def missing_coefficients(plant_name: str, believed: str) -> dict[str, list[float
     names = {factors(term): term for term in FERRY_TERMS}
 
     def force_coefficients(vessel: str) -> dict[str, Tensor]:
-        """Return the coefficients [3] of F(nu_dot, nu) by basis function of document 002."""
+        """Return the coefficients [3] of F(nu_dot, nu) by basis function of Jervan 2020."""
         columns = _coefficients_by_term(
             BelievedConfig(vessel=vessel).hull_equations().axis_coefficients()
         )

@@ -175,12 +175,12 @@ class AutopilotConfig(PackageTask, ComputingTask):
         turning_time: time in s until a turn at this angle is steady.
         pace: factor on all times in `test`, `conditions` and the trainings of `policies`, except
             delays; `vessel` for the turning time of the vessel divided by the turning time of the
-            vessel of document 004.
+            vessel of Gouletas 2020.
         test: step test of all controllers, over the vessels of `conditions.stated`.
         conditions: conditions of the tuning, training and evaluation; null to compare peers with
             given constants in `test` only.
         policies: learned policies by name.
-        predictive: predictive autopilots of document 004 by name.
+        predictive: predictive autopilots of Gouletas 2020 by name.
         peers: classical controllers by name; constants that are not given are tuned.
         floor: peer with exact knowledge of the vessel (time-optimal); settling times are reported
             as multiples of its settling time.
@@ -473,7 +473,7 @@ _PUSH_STD_FACTOR = 2.0
 """Standard deviations of the slow push that the rudder must be able to hold."""
 _REFERENCE_STEP = math.radians(30.0)
 REFERENCE_STEERING = NomotoModel(3.47, 3.94, 3.2), math.radians(5.0)
-"""K, T and rudder of the vessel of document 004; times in configs refer to it at a pace of one."""
+"""K, T and rudder of the vessel of Gouletas 2020; times in configs refer to it at a pace of one."""
 
 
 def minimum_turn_time(

@@ -1,1 +1,1 @@
-"""Task `breeding`: genetic programming on a mass-spring-damper (document 000, chapter 5)."""
+"""Task `breeding`: genetic programming on a mass-spring-damper (Halvorsen 2019, chapter 5)."""

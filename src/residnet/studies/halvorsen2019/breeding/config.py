@@ -1,4 +1,4 @@
-"""Task `breeding`: genetic programming on a mass-spring-damper (document 000, chapter 5)."""
+"""Task `breeding`: genetic programming on a mass-spring-damper (Halvorsen 2019, chapter 5)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ MASS = 10.0
 DAMPING = 13.0
 STIFFNESS = 5.0
 """The system m x_ddot + d x_dot + k x = tau (4.1) in kg, kg/s and N/m (section 5.3, (5.13)); the
-system of (4.3) has other values: 20 kg, 10 kg/s, 12 N/m (correction H24).
+system of (4.3) has other values: 20 kg, 10 kg/s, 12 N/m (correction H24 in
+docs/documents/corrections.md).
 """
 TRUE_COEFFICIENTS = {"tau_x": 1.0 / MASS, "u": -DAMPING / MASS, "x": -STIFFNESS / MASS}
 """True coefficients of u_dot (4.2) by term."""
@@ -29,7 +30,7 @@ TRUE_COEFFICIENTS = {"tau_x": 1.0 / MASS, "u": -DAMPING / MASS, "x": -STIFFNESS 
 class RecordConfig(Config):
     """A record of the mass-spring-damper under a square wave of a force of 1 N, from rest.
 
-    Section 5.3.1 and Figure 5.3 of document 000.
+    Section 5.3.1 and Figure 5.3 of Halvorsen 2019.
 
     Attributes:
         length: length of the record in s.

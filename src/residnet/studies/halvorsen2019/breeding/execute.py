@@ -1,4 +1,4 @@
-"""Task `breeding`: genetic programming on a mass-spring-damper (document 000, chapter 5)."""
+"""Task `breeding`: genetic programming on a mass-spring-damper (Halvorsen 2019, chapter 5)."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def summarize(config: BreedingTaskConfig, results: StudyResults) -> list[str]:
             sum(row[key] for row in published_rows) for key in ("found", "published_found")
         )
         sentences.append(
-            f"Document 000 finds it in {n_published:g} of the"
+            f"Halvorsen 2019 finds it in {n_published:g} of the"
             f" {_PUBLISHED_RUNS * len(published_rows)} runs"
             f" of the same table; here it is {n_found} of {config.repeats * len(published_rows)}."
         )

@@ -1,1 +1,1 @@
-"""Task `sea_trial`: models of Odin by phase (document 000, section 7.5)."""
+"""Task `sea_trial`: models of Odin by phase (Halvorsen 2019, section 7.5)."""

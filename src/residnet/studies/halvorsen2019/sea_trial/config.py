@@ -1,4 +1,4 @@
-"""Task `sea_trial`: models of Odin by phase, on a simulated sea trial (document 000, section 7.5).
+"""Task `sea_trial`: models of Odin by phase, on simulated trials (Halvorsen 2019, section 7.5).
 
 The log is interpolated to a uniform grid, filtered forward and backward by a Butterworth low-pass,
 and differentiated by differences (7.1). The standard model is compared with equations found from
@@ -96,7 +96,7 @@ class PreparationConfig(Config):
         interval: shortest and longest time between two samples of the log, in s.
         step: time step of the uniform grid in s.
         cutoff: cut-off frequency of the Butterworth filter as a share of the Nyquist frequency
-            (correction H27).
+            (correction H27 in docs/documents/corrections.md).
         order: order of the filter, which is run forward and backward.
         filter_inputs: whether commands and forces are filtered like the velocities. The document
             filters only the velocities; equations then also learn the filter and have smaller

@@ -1,4 +1,4 @@
-"""Task `sea_trial`: models of Odin by phase, on a simulated sea trial (document 000, section 7.5).
+"""Task `sea_trial`: models of Odin by phase, on simulated trials (Halvorsen 2019, section 7.5).
 
 The log is interpolated to a uniform grid, filtered forward and backward by a Butterworth low-pass,
 and differentiated by differences (7.1). The standard model is compared with equations found from

@@ -1,1 +1,1 @@
-"""Task `ferry_study`: residual models of a ferry in closed loop (document 002, chapter 4)."""
+"""Task `ferry_study`: residual models of a ferry in closed loop (Jervan 2020, chapter 4)."""

@@ -1,4 +1,4 @@
-"""Task `ferry_study`: residual models of a ferry in closed loop (document 002, chapter 4).
+"""Task `ferry_study`: residual models of a ferry in closed loop (Jervan 2020, chapter 4).
 
 The plant follows a course under a controller with a believed model. Residual models are identified
 from this run, and the course is repeated with them as feed-forward.
@@ -34,7 +34,7 @@ BELIEVED_NAME = "believed"
 
 
 class PublishedFigures(Config):
-    """Published figures of document 002 for one model.
+    """Published figures of Jervan 2020 for one model.
 
     Numbers are as printed, unless a correction of the document applies. Null if the document has
     none.
@@ -52,7 +52,7 @@ class PublishedFigures(Config):
         crossing_heading_mae: mean heading error in the crossing in deg (Table 4.12).
         alone: mean square error of u, v, r and of their derivatives against the desired motion
             without feedback, in (m/s)^2, (m/s)^2, (rad/s)^2 and the same per second squared
-            (Table 4.8, correction J21).
+            (Table 4.8, correction J21 in docs/documents/corrections.md).
         crossing_power: mean power in W for position and heading control in the crossing (Table
             4.13).
         coefficients: coefficients of the basis functions in surge, sway and yaw in SI units

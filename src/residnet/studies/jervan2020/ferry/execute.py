@@ -1,4 +1,4 @@
-"""Task `ferry_study`: residual models of a ferry in closed loop (document 002, chapter 4).
+"""Task `ferry_study`: residual models of a ferry in closed loop (Jervan 2020, chapter 4).
 
 The plant follows a course under a controller with a believed model. Residual models are identified
 from this run, and the course is repeated with them as feed-forward.

@@ -1,1 +1,1 @@
-"""Task `force_residual`: residual models of measured forces (document 002, chapter 5)."""
+"""Task `force_residual`: residual models of measured forces (Jervan 2020, chapter 5)."""

@@ -1,4 +1,4 @@
-"""Task `force_residual`: residual models of measured forces (document 002, chapter 5).
+"""Task `force_residual`: residual models of measured forces (Jervan 2020, chapter 5).
 
 Every model is cross-validated and compared with two references: zero force and the believed hull.
 """
