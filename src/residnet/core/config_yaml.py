@@ -125,13 +125,13 @@ class _ConfigDumper(yaml.SafeDumper):
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
-    def represent_list(self, data: Sequence[Any]) -> Node:
+    def represent_python_list(self, data: Sequence[Any]) -> Node:
         # a list of scalars is written on one line, [a, b]; nested values have a line each
         is_flat = not any(isinstance(item, (dict, list)) for item in data)
         return self.represent_sequence(_TAG_PREFIX + "seq", data, flow_style=is_flat)
 
 
-_ConfigDumper.add_representer(list, _ConfigDumper.represent_list)
+_ConfigDumper.add_representer(list, _ConfigDumper.represent_python_list)
 
 
 def parse_yaml(text: str, source: str, *, show_location: bool = True) -> tuple[Any, Node | None]:

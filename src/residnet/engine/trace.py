@@ -36,7 +36,9 @@ _DATA_MOVEMENT: Final = {
     ),
     "slice_scatter": (0, 1), "select_scatter": (0, 1), "index_copy": (0, 3),
 }  # fmt: skip
-"""Operations that only move numbers, with the positions of the arguments that they move."""
+"""Operations that only move entries of tensors, with the positions of the tensors among their
+arguments.
+"""
 _SHAPE_ONLY: Final = frozenset(
     (
         "full_like", "zeros_like", "ones_like", "empty_like", "new_zeros", "new_ones", "new_full",
@@ -96,7 +98,7 @@ def lower(
     step: Callable[..., Any],
     arguments: Sequence[tuple[str, int]],
     results: Sequence[str],
-    what: str,
+    model_name: str,
 ) -> ca.Function:
     """Lower a step in torch to a CasADi function of one row in float64.
 
@@ -104,23 +106,23 @@ def lower(
         step: function of tensors [1, size] that returns one tensor for each of `results`.
         arguments: names and sizes of the arguments.
         results: names of the results.
-        what: name of the model, for messages.
+        model_name: name of the model, for messages.
 
     Raises:
         ExportError: if an operation is not supported, or Python branches on values.
     """
     examples = [torch.zeros(1, size, dtype=torch.float64) for _, size in arguments]
     symbols = [ca.MX.sym(name, size) for name, size in arguments]
-    graph = record_graph(step, examples, what)
-    _require_deterministic(graph, what)
+    graph = record_graph(step, examples, model_name)
+    _require_deterministic(graph, model_name)
     values = dict(zip(_get_placeholders(graph), map(_TracedValue, examples, symbols), strict=True))
-    results_columns = _lower_graph(graph, values, what)
+    results_columns = _lower_graph(graph, values, model_name)
     return ca.Function(
         "step", symbols, results_columns, [name for name, _ in arguments], list(results)
     )
 
 
-def _require_deterministic(graph: Graph, what: str) -> None:
+def _require_deterministic(graph: Graph, model_name: str) -> None:
     """Refuse a step that draws random numbers, such as dropout in training.
 
     Raises:
@@ -128,7 +130,7 @@ def _require_deterministic(graph: Graph, what: str) -> None:
     """
     for node in graph.nodes:
         if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
-            raise ExportError(f"{what}: its step draws random numbers ({node.target})")
+            raise ExportError(f"{model_name}: its step draws random numbers ({node.target})")
 
 
 def _get_placeholders(graph: Graph) -> list[Node]:
@@ -138,16 +140,17 @@ def _get_placeholders(graph: Graph) -> list[Node]:
 def _lower_graph(
     graph: Graph,
     values: dict[Node, Any],
-    what: str,
+    model_name: str,
     replacement: Callable[[Node, Any], Any] | None = None,
 ) -> list[Any]:
-    """Return the CasADi columns of the results of a graph.
+    """Convert the operations of a graph and return the CasADi columns of its results.
 
     Args:
         graph: the recorded graph.
         values: values of some nodes; the values of all other nodes are added.
-        what: name of the model, for messages.
-        replacement: returns the value of a node from its arguments, or None for the usual value.
+        model_name: name of the model, for messages.
+        replacement: function of a node and its arguments that returns a value for the node, or None
+            if the operation of the node is to be converted as usual.
     """
     for node in graph.nodes:
         if node in values:
@@ -164,7 +167,7 @@ def _lower_graph(
             )
             value = replacement(node, args) if replacement else None
             values[node] = (
-                _lower_operation(node.target, args, keyword_arguments, what)
+                _lower_operation(node.target, args, keyword_arguments, model_name)
                 if value is None
                 else value
             )
@@ -177,8 +180,8 @@ class RowProduct:
 
     Attributes:
         n_repeats: number of vectors of a row that are multiplied with the matrix.
-        n_inputs: length of such a vector.
-        n_outputs: length of its product; the matrix is [n_inputs, n_outputs].
+        n_inputs: length of a vector.
+        n_outputs: length of a product; the matrix is [n_inputs, n_outputs].
         matrix_index: index of the tensor with the matrix in the results of `StepParts.prepare`.
         matrix_member: index of the matrix in this tensor, where it holds several.
         activation: name of the elementwise function in place of a product; empty for a product.
@@ -230,7 +233,7 @@ def split_step(
     rows: Sequence[tuple[str, Tensor]],
     shared: Sequence[Tensor],
     results: Sequence[str],
-    what: str,
+    model_name: str,
 ) -> StepParts:
     """Split a step into the parts of `StepParts`.
 
@@ -239,13 +242,13 @@ def split_step(
         rows: names and examples [1, size] of the arguments of a row.
         shared: tensors of any shape that all rows share.
         results: names of the results of the step.
-        what: name of the model, for messages.
+        model_name: name of the model, for messages.
 
     Raises:
-        ExportError: as of `lower`.
+        ExportError: if an operation is not supported, or Python branches on values.
     """
-    graph = record_graph(step, [*(example for _, example in rows), *shared], what)
-    _require_deterministic(graph, what)
+    graph = record_graph(step, [*(example for _, example in rows), *shared], model_name)
+    _require_deterministic(graph, model_name)
     shared_part = _extract_shared_part(graph, [example for _, example in rows], shared)
     columns = [ca.MX.sym(name, example.shape[1]) for name, example in rows]
     theta = ca.MX.sym(
@@ -259,7 +262,7 @@ def split_step(
     }
     values |= shared_part.bind_to(theta)
     extraction = _ProductExtraction(shared_part)
-    outputs = _lower_graph(graph, values, what, extraction.replace_operation)
+    outputs = _lower_graph(graph, values, model_name, extraction.replace_operation)
     detached_columns = [column for _, column in extraction.detached]
     results_columns = extraction.drop_unused_units(
         [*extraction.factors, *outputs, *detached_columns]
@@ -294,11 +297,11 @@ class _SharedPart:
 
     Attributes:
         nodes: nodes of this part.
-        boundary: those of them that other nodes use; `prepare` returns their values.
-        prepare: computes these values from the shared tensors.
-        tensors: the values at the examples.
-        theta_indices: indices in `boundary` of what is concatenated to `theta`: all but the
-            matrices of products, which are stored as tables.
+        boundary: shared nodes whose values nodes outside this part use.
+        prepare: computes the values of `boundary` from the shared tensors.
+        tensors: values of `boundary` at the examples.
+        theta_indices: indices in `boundary` of the values that are concatenated to `theta`: all but
+            the matrices of products, which are stored as tables.
     """
 
     nodes: Mapping[Node, None]
@@ -387,9 +390,10 @@ def _extract_shared_part(
 
 
 class _ProductExtraction:
-    """Collects matrix products, activations and detached values while a graph is lowered.
+    """Replaces matrix products, activations and detached values by symbols.
 
-    Each becomes a symbol, so that the remaining step is a small function of scalars.
+    It is used while a graph is converted. The remaining step is a small function of scalars, and a
+    caller computes the replaced values with loops.
 
     Attributes:
         symbols: symbols of the results of the products, in order of execution.
@@ -544,7 +548,7 @@ def to_scalar_function(function: ca.Function) -> ca.Function:
     return ca.Function("step", symbols, results, function.name_in(), function.name_out())
 
 
-def record_graph(step: Callable[..., Any], examples: Sequence[Tensor], what: str) -> Graph:
+def record_graph(step: Callable[..., Any], examples: Sequence[Tensor], model_name: str) -> Graph:
     """Record the operations of a step on examples as a graph.
 
     The constants of the graph are buffers of the module that owns it.
@@ -564,7 +568,7 @@ def record_graph(step: Callable[..., Any], examples: Sequence[Tensor], what: str
         message_lines = str(error).strip().splitlines()
         reason = message_lines[0] if message_lines else type(error).__name__
         raise ExportError(
-            f"{what}: its step cannot be recorded as a fixed sequence of operations ({reason});"
+            f"{model_name}: its step cannot be recorded as a fixed sequence of operations ({reason});"
             " write it with operations on tensors alone, torch.where instead of `if`"
         ) from error
 
@@ -627,7 +631,7 @@ class _Recorder(TorchDispatchMode):
         return result
 
     def _register(self, node: Node, result: Any) -> None:
-        """Associate the result of a node with it."""
+        """Record that the tensors of a result are computed by a node."""
         if isinstance(result, Tensor):
             self._nodes[id(result)] = node, result
         elif isinstance(result, list | tuple):
@@ -680,7 +684,7 @@ class _TracedValue:
 
 
 def _select(column: Any, indices: Tensor) -> Any:
-    """Return the entries of a column at constant indices."""
+    """Return the entries of a column at constant indices, in the order of `indices`."""
     order = indices.reshape(-1).tolist()
     if order == list(range(column.shape[0])):
         return column
@@ -710,7 +714,7 @@ def _lower_elementwise(operation: str, example: Tensor, *values: Any) -> _Traced
     )
 
 
-def _lower_operation(target: Any, args: Any, keyword_arguments: Any, what: str) -> Any:
+def _lower_operation(target: Any, args: Any, keyword_arguments: Any, model_name: str) -> Any:
     """Return the result of an operation of torch.
 
     Raises:
@@ -757,7 +761,7 @@ def _lower_operation(target: Any, args: Any, keyword_arguments: Any, what: str) 
     if name in _REDUCTIONS:
         return _lower_reduction(name, example, *args, **keyword_arguments)
     raise ExportError(
-        f"{what}: its step uses torch's operation '{name}', which this format does not"
+        f"{model_name}: its step uses torch's operation '{name}', which this format does not"
         " support; export it as torchscript"
     )
 
@@ -797,7 +801,7 @@ def _lower_data_movement(
 
 
 def _reduction_rows(value: _TracedValue, dim: Any) -> tuple[Tensor, int]:
-    """Return the indices [rows, n] of the entries that a reduction combines, and n."""
+    """Return the indices [rows, n] of the entries that a reduction along `dim` combines, and n."""
     indices = value.indices
     dimensions = list(range(indices.dim()))
     requested = [dim] if isinstance(dim, int) else dim
@@ -817,6 +821,15 @@ def _lower_reduction(
     keepdim: bool = False,
     **_: Any,
 ) -> _TracedValue:
+    """Return a sum, mean, extremum, product or logical combination along dimensions.
+
+    Args:
+        name: key of `_REDUCTIONS`.
+        example: result at the examples.
+        value: tensor that is reduced.
+        dim: dimension or dimensions; None for all.
+        keepdim: ignored, because the shape of `example` has the answer.
+    """
     rows, size = _reduction_rows(value, dim)
     if name in ("sum", "mean"):
         # one matrix operation instead of a chain of additions
@@ -844,7 +857,7 @@ def _lower_extremum(
 
 
 def _scale(operand: Any, factor: float) -> Any:
-    """Return an operand times the factor `alpha` or `beta` of an operation of torch."""
+    """Multiply an operand by the argument `alpha` or `beta` of an operation of torch."""
     value = _to_traced_value(operand)
     return (
         operand
@@ -897,7 +910,7 @@ def _lower_cast(example: Tensor, value: _TracedValue, *_: Any, **_settings: Any)
 def _lower_copy(
     example: Tensor, value: _TracedValue, source: _TracedValue, *_: Any
 ) -> _TracedValue:
-    """Return a source broadcast and cast to the shape and type of a value."""
+    """Return a source that is broadcast and cast to shape and type of `value`, as `copy_`."""
     return _lower_cast(
         example, _lower_elementwise("add", source.example.expand(example.shape), source, 0.0)
     )
@@ -911,6 +924,7 @@ def _lower_product(
     beta: float = 1,
     alpha: float = 1,
 ) -> _TracedValue:
+    """Return beta start + alpha a b for matrices a [m, k] and b [k, n], as `torch.addmm`."""
     (m, k), n = a.example.shape, b.example.shape[1]
     # columns are in row order, and CasADi reshapes by columns: matrices are transposed
     transposed_b = (
@@ -927,7 +941,7 @@ def _lower_product(
 
 
 def _lower_batched_products(example: Tensor, a: _TracedValue, b: _TracedValue) -> _TracedValue:
-    """Return the products of two batches of matrices, one after the other."""
+    """Return the matrix products of two batches of matrices, as `torch.bmm`."""
 
     def matrix(value: _TracedValue, i: int) -> _TracedValue:
         column = None if value.expression is None else _select(value.column, value.indices[i])
@@ -945,7 +959,7 @@ def _select_row(table: Any, indices: Tensor, position: Any) -> Any:
     Args:
         table: column of the entries.
         indices: indices of the entries of each row [n, k].
-        position: row; clamped to the table.
+        position: CasADi expression of the index of the row; clamped to the table.
     """
     rows, size = indices.shape
     if rows > _MAX_TABLE_ROWS:
