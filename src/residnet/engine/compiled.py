@@ -1,9 +1,10 @@
-"""Rollouts and their gradients as compiled C, for many rows at once.
+"""Rollouts and their gradients as compiled C, for a batch of rows at once.
 
 One step of a rollout becomes a CasADi function of scalars, and products with the matrices that all
-rows share. The step and its vector-Jacobian product are written for blocks of rows with the vector
-types of gcc and clang, compiled for this machine and called for all steps of a run. Gradients of
-matrices follow from the stored factors and cotangents of the steps, in one product each.
+rows share. The step and its vector-Jacobian product (VJP) are written for blocks of rows with the
+vector types of gcc and clang, compiled for this machine and called for all steps of a run. A
+cotangent is the derivative of the loss with respect to a quantity. The gradient of a matrix follows
+from the stored factors and cotangents of all steps, in one product.
 """
 
 from __future__ import annotations
@@ -36,16 +37,17 @@ from residnet.engine.trace import RowProduct, StepParts, split_step, to_scalar_f
 
 _MAX_INSTRUCTIONS = 20_000
 """Largest number of scalar operations of a step: for more, compilation takes minutes."""
-_CARRIED = ("x", "s", "q")
+_STATE_NAMES = ("x", "s", "q")
 """Arguments that a step updates: state x, memory s of the model and memory q of the source."""
-_LABEL = "rollout"
+_MODEL_NAME = "rollout"
 """Name of the model in messages."""
+# functions of the C library with two arguments
 _BINARY_FUNCTIONS = ("atan2", "hypot", "pow", "fmod", "copysign")
 
 
 _PRELUDE, FORWARD_LOOP, BACKWARD_LOOP = (
     resources.files("residnet.engine").joinpath(name).read_text()
-    for name in ("lanes.h", "fly.c", "back.c")
+    for name in ("lanes.h", "forward.c", "backward.c")
 )
 _SCALAR_FUNCTIONS = {
     name: f"static __attribute__((noinline)) V v_{name}"
@@ -54,7 +56,7 @@ _SCALAR_FUNCTIONS = {
     " return o; }\n"
     for name in sorted(set(FUNCTIONS.values()))
 }
-"""Functions of the C library, which are called for each row."""
+"""C code of functions that call the C library for each row of a block."""
 
 
 def _write_horner(x: str, *coefficients: float) -> str:
@@ -142,11 +144,16 @@ _VECTOR_FUNCTIONS = {
     torch.float64: _write_vector_functions(13, 52, 1023, 710.0, 12),
 }
 _N_ACCUMULATORS = 8
-"""Accumulators of a matrix product that are kept in registers."""
+"""Number of entries of a matrix product that are computed together, in registers."""
 
 
 def _write_accumulators(count: int, entry: str) -> str:
-    """Return a loop in C that computes this many entries of a product at once."""
+    """Return a loop in C that computes `count` entries of a product together.
+
+    Args:
+        count: number of entries.
+        entry: format of the matrix entry for column j + {0} of the result.
+    """
     indices = range(count)
     declarations = "".join(f" V c{q} = {{0}};" for q in indices)
     additions = "".join(f" c{q} += v * {entry.format(q)};" for q in indices)
@@ -206,8 +213,10 @@ def _write_prelude(dtype: torch.dtype) -> str:
 
 
 Calls = Mapping[str, Sequence[tuple[str, str]]]
-"""For each result of a step, the quantities computed from it by loops, and their statements."""
-_STEP_ARGUMENTS = ("x", "w", "s", "q", "own", "theta")
+"""For each result of a step, pairs of a quantity that a loop computes from the result and the C
+statement that calls the loop.
+"""
+_STEP_ARGUMENTS = ("x", "w", "s", "q", "row_values", "theta")
 """Arguments of a step before the products.
 
 They are state, inputs, memories of model and source, tensors that differ from row to row, and the
@@ -238,29 +247,27 @@ class _LaneWriter(FunctionWriter):
     def __init__(self, function: ca.Function, strides: Mapping[str, str], calls: Calls) -> None:
         self.strides = strides
         self.calls = calls
-        self.n_outputs = list(function.name_out())
-        super().__init__(function, Tables(""), _LABEL)
+        self.result_names = list(function.name_out())
+        super().__init__(function, Tables(""), _MODEL_NAME)
 
     def write_literal(self, value: float) -> str:
         return f"ALL({write_literal(value)})"
 
-    def matrix_index(self, name: str, place: int) -> str:
-        """Return the address of an entry."""
-        return f"(U *)({name} + {place} * {self.strides.get(name, 'LANES')})"
+    def address(self, name: str, position: int) -> str:
+        """Return the C expression of the address of an entry of an argument or result."""
+        return f"(U *)({name} + {position} * {self.strides.get(name, 'LANES')})"
 
-    def argument_expression(self, name: str, place: int) -> str:
+    def argument_expression(self, name: str, position: int) -> str:
         return (
-            f"ALL({name}[{place}])" if name == "theta" else f"(*{self.matrix_index(name, place)})"
+            f"ALL({name}[{position}])" if name == "theta" else f"(*{self.address(name, position)})"
         )
 
     def store_result(self, result: int, column: Any) -> None:
         super().store_result(result, column)
-        name = self.n_outputs[result]
+        name = self.result_names[result]
         expressions = self.results[result]
         if name in self.calls and len(expressions) == self.function.numel_out(result):
-            stores = [
-                f"*{self.matrix_index(name, i)} = {cell};" for i, cell in enumerate(expressions)
-            ]
+            stores = [f"*{self.address(name, i)} = {cell};" for i, cell in enumerate(expressions)]
             for name_of_call, text in self.calls[name]:
                 self.lines.append((name_of_call, " ".join((*stores, text))))
                 stores = []
@@ -291,10 +298,11 @@ def _write_function(
     Args:
         name: name of the C function.
         function: function of scalars.
-        strides: as of `_LaneWriter`.
-        calls: as of `_LaneWriter`.
-        declarations: statements that declare arguments and results which are no parameters.
-        accumulated: results that are added to the present values.
+        strides: strides of arguments and results, see `_LaneWriter`.
+        calls: calls of loops over products, see `_LaneWriter`.
+        declarations: statements that declare the arguments and results which are local variables of
+            the C function and not its parameters.
+        accumulated: results that are added to the stored values.
     """
     body = _LaneWriter(function, strides, calls)
     stores = [f"(void){call_result};" for call_result, _ in chain(*calls.values())]
@@ -302,7 +310,7 @@ def _write_function(
         if result not in calls:
             sign = "+=" if result in accumulated else "="
             stores += [
-                f"*{body.matrix_index(result, i)} {sign} {cell};"
+                f"*{body.address(result, i)} {sign} {cell};"
                 for i, cell in enumerate(expressions)
                 if result not in accumulated or cell != body.zero_literal
             ]
@@ -310,7 +318,9 @@ def _write_function(
     result_parameters = [
         f"REAL *restrict {name}" for name in function.name_out() if name not in declarations
     ]
-    common_parameters = "const REAL *tables, REAL *held, REAL *pulled, const long stride"
+    common_parameters = (
+        "const REAL *tables, REAL *history, REAL *product_cotangents, const long stride"
+    )
     head = f"static void {name}({', '.join((*parameters, *result_parameters, common_parameters))})"
     return (
         head + " {\n" + "\n".join((*declarations.values(), *body.used_statements(stores))) + "\n}\n"
@@ -325,18 +335,18 @@ def _write_source(
     *,
     has_row_gradients: bool,
 ) -> tuple[str, dict[str, slice], dict[str, slice]]:
-    """Write the C file with the functions `fly` (forward) and `back` (gradient).
+    """Write the C file with the functions `run_forward` and `run_backward` (gradient).
 
     Args:
         parts: the split step.
-        sizes: number of entries of each argument, and `a` of the applied inputs.
+        sizes: number of entries of each argument, and of the applied inputs `a`.
         trained_indices: indices in `theta` that have a gradient; None for no gradient.
         dtype: precision of the file.
         has_row_gradients: whether each row has its own gradient of the matrices.
 
     Returns:
-        The source, the layout of what a step stores for its gradient, and the layout of the
-        cotangents of products.
+        The C code, the layout of the values that a step stores for its gradient, and the layout of
+        the cotangents of products.
     """
     step = to_scalar_function(parts.function)
     if not step.is_a("SXFunction") or step.n_instructions() > _MAX_INSTRUCTIONS:
@@ -351,10 +361,10 @@ def _write_source(
         f"{name}_{k}{suffix}": product.n_repeats * count
         for k, product in products.items()
         for name, count in (("product", product.n_outputs), ("factor", product.n_inputs))
-        for suffix in ("", "_slope")
+        for suffix in ("", "_cotangent")
     }
     strides = dict.fromkeys(
-        ("x", "w", "s", "q", "own", "x_after", "s_after", "q_after", "a"), "stride"
+        ("x", "w", "s", "q", "row_values", "x_after", "s_after", "q_after", "a"), "stride"
     )
 
     def build_layout(array: str, names: Sequence[str]) -> tuple[dict[str, slice], dict[str, str]]:
@@ -368,8 +378,8 @@ def _write_source(
             },
         )
 
-    def slope_of(k: int) -> str:
-        return shared_slopes.get(name := f"product_{k}_slope", name)
+    def cotangent_of(k: int) -> str:
+        return shared_cotangents.get(name := f"product_{k}_cotangent", name)
 
     def local(name: str) -> str:
         return f"REAL {name}[{sizes_by_name[name]} * LANES] __attribute__((aligned(BYTES)));"
@@ -379,7 +389,7 @@ def _write_source(
             products,
             sizes_by_name,
             table_offsets,
-            shared_slopes,
+            shared_cotangents,
             function_name,
             source_format,
             target_format,
@@ -388,47 +398,51 @@ def _write_source(
     forward_storage = dict[str, slice]()
     backward_storage = dict[str, slice]()
     stored_pointers = dict[str, str]()
-    shared_slopes = dict[str, str]()
+    shared_cotangents = dict[str, str]()
     backward = list[str]()
     if trained_indices is not None:
         single_products = [k for k in matrices if products[k].n_repeats == 1]
-        slope_function, shared_slopes = _vector_jacobian_function(
+        vjp_function, shared_cotangents = _vector_jacobian_function(
             step, sizes, len(products), trained_indices, single_products
         )
-        symbols = _make_symbols(slope_function)
-        jacobian = ca.veccat(*slope_function.call(symbols))
+        symbols = _make_symbols(vjp_function)
+        jacobian = ca.veccat(*vjp_function.call(symbols))
         # the gradient does not depend on products of affine layers: these are not stored
         is_needed = {f"product_{k}": bool(product.activation) for k, product in products.items()}
         is_needed |= {
             name: is_needed[name] or ca.depends_on(jacobian, product)
-            for name, product in zip(slope_function.name_in(), symbols, strict=True)
+            for name, product in zip(vjp_function.name_in(), symbols, strict=True)
             if name in is_needed
         }
         forward_storage, stored_pointers = build_layout(
-            "held",
+            "history",
             [name for name, needed in is_needed.items() if needed]
-            + [f"factor_{k}" for k in sorted(matrices, key=slope_of)],
+            + [f"factor_{k}" for k in sorted(matrices, key=cotangent_of)],
         )
         backward_storage, declarations = build_layout(
-            "pulled", [*dict.fromkeys(map(slope_of, matrices))]
+            "product_cotangents", [*dict.fromkeys(map(cotangent_of, matrices))]
         )
-        backward_storage |= {f"product_{k}_slope": backward_storage[slope_of(k)] for k in matrices}
+        backward_storage |= {
+            f"product_{k}_cotangent": backward_storage[cotangent_of(k)] for k in matrices
+        }
         declarations |= {name: stored_pointers.get(name, "") for name in is_needed}
         declarations |= {
-            n: local(n) for n in sizes_by_name if n.endswith("_slope") and n not in declarations
+            n: local(n) for n in sizes_by_name if n.endswith("_cotangent") and n not in declarations
         }
         backward = [
             _write_function(
-                "slope",
-                slope_function,
-                strides | dict.fromkeys(("x_slope", "a_slope", "x_before"), "stride"),
-                calls("back_times", "product_{}_slope", "factor_{}_slope"),
+                "step_vjp",
+                vjp_function,
+                strides | dict.fromkeys(("x_cotangent", "a_cotangent", "x_before"), "stride"),
+                calls("back_times", "product_{}_cotangent", "factor_{}_cotangent"),
                 declarations,
-                ("x_before", "total"),
+                ("x_before", "gradient"),
             )
         ]
     forward = stored_pointers | {
-        n: local(n) for n in sizes_by_name if n not in stored_pointers and not n.endswith("_slope")
+        n: local(n)
+        for n in sizes_by_name
+        if n not in stored_pointers and not n.endswith("_cotangent")
     }
     step_code = _write_function(
         "step",
@@ -439,20 +453,20 @@ def _write_source(
     )
     n_theta = len(trained_indices or ())
     outer = "".join(
-        "outer(KEPT(held, N_HELD, k)"
+        "outer(STORED(history, N_HISTORY, k)"
         f" + {forward_storage[f'factor_{k}'].start + r * product.n_inputs} * LANES,"
-        f" {product.n_inputs}, KEPT(pulled, N_PULLED, k)"
-        f" + {backward_storage[f'product_{k}_slope'].start + r * product.n_outputs} * LANES,"
+        f" {product.n_inputs}, STORED(product_cotangents, N_PRODUCT_COTANGENTS, k)"
+        f" + {backward_storage[f'product_{k}_cotangent'].start + r * product.n_outputs} * LANES,"
         f" {product.n_outputs},"
-        f" total + at * N_TOTAL + {n_theta + table_offsets[k]} * LANES);\n"
+        f" gradient + at * N_GRADIENT + {n_theta + table_offsets[k]} * LANES);\n"
         for k, product in products.items()
         for r in range(product.n_repeats)
         if has_row_gradients and not product.activation
     )
     counts = dict(sizes) | {
-        "held": _storage_size(forward_storage),
-        "pulled": _storage_size(backward_storage),
-        "total": n_theta + has_row_gradients * table_offsets[-1],
+        "history": _storage_size(forward_storage),
+        "product_cotangents": _storage_size(backward_storage),
+        "gradient": n_theta + has_row_gradients * table_offsets[-1],
     }
     text = "".join(f"#define N_{name.upper()} {value}L\n" for name, value in counts.items())
     if trained_indices is not None:
@@ -470,7 +484,7 @@ def _write_product_calls(
     products: Mapping[int, RowProduct],
     sizes: Mapping[str, int],
     table_offsets: Sequence[int],
-    shared_slopes: Mapping[str, str],
+    shared_cotangents: Mapping[str, str],
     function_name: str,
     source_format: str,
     target_format: str,
@@ -481,7 +495,7 @@ def _write_product_calls(
         products: the products of the step by number.
         sizes: number of entries of each quantity.
         table_offsets: offset of the matrix of each product in the table.
-        shared_slopes: quantity that stands for an equal cotangent.
+        shared_cotangents: for a cotangent that equals another one, the name of the other one.
         function_name: `times`, or `back_times` for the vector-Jacobian product.
         source_format: format of the name of the multiplied vector, with the number of the product.
         target_format: format of the name of the result.
@@ -493,7 +507,7 @@ def _write_product_calls(
     for k, product in products.items():
         source = source_format.format(k)
         target = target_format.format(k)
-        source = shared_slopes.get(source, source)
+        source = shared_cotangents.get(source, source)
         n_source = sizes[source] // product.n_repeats
         n_target = sizes[target] // product.n_repeats
         text = "".join(
@@ -532,7 +546,7 @@ def _forward_function(step: ca.Function, products: int) -> ca.Function:
     """Return the step as a function that also computes the values it detaches."""
     symbols = _make_symbols(step)
     n_arguments = len(_STEP_ARGUMENTS) + products
-    names = step.name_out()[: products + len(_CARRIED) + 1]
+    names = step.name_out()[: products + len(_STATE_NAMES) + 1]
     outputs = step.call(symbols)
     parts = [
         _substitute_detached(output, symbols[n_arguments:], outputs[len(names) :])
@@ -569,18 +583,19 @@ def _vector_jacobian_function(
     symbols = _make_symbols(step)
     n_arguments = len(_STEP_ARGUMENTS) + n_products
     x, _, s, q, _, theta, *product_values = symbols[:n_arguments]
-    # suffix `_slope`: cotangent, the derivative of the loss with respect to the quantity
     outputs = step.call(symbols)
     factors = outputs[:n_products]
-    results = outputs[n_products : n_products + len(_CARRIED) + 1]
-    slopes = [ca.SX.sym(f"{name}_slope", sizes[name]) for name in (*_CARRIED, "a")]
-    factor_slopes = [ca.SX.sym(f"factor_{k}_slope", part.numel()) for k, part in enumerate(factors)]
+    results = outputs[n_products : n_products + len(_STATE_NAMES) + 1]
+    cotangents = [ca.SX.sym(f"{name}_cotangent", sizes[name]) for name in (*_STATE_NAMES, "a")]
+    factor_cotangents = [
+        ca.SX.sym(f"factor_{k}_cotangent", part.numel()) for k, part in enumerate(factors)
+    ]
     variables = [*product_values, x, s, q, theta[list(trained_indices)]]
     # transposed Jacobian times the cotangents of results and factors
     pullback = ca.jtimes(
         ca.vertcat(*results, *factors),
         ca.vertcat(*variables),
-        ca.vertcat(*slopes, *factor_slopes),
+        ca.vertcat(*cotangents, *factor_cotangents),
         True,
     )
     pullback = _substitute_detached(
@@ -590,26 +605,26 @@ def _vector_jacobian_function(
     parts = [pullback[a:b] for a, b in pairwise(offsets)]
     # later products first: their cotangents are needed for those of earlier products
     order = [*range(n_products)[::-1], *range(n_products, len(parts))]
-    names = [f"product_{k}_slope" for k in range(n_products)]
-    names += [*(f"{name}_before" for name in _CARRIED), "total"]
-    slope_of_name = dict(
+    names = [f"product_{k}_cotangent" for k in range(n_products)]
+    names += [*(f"{name}_before" for name in _STATE_NAMES), "gradient"]
+    cotangent_by_name = dict(
         zip((names[k] for k in order), ca.cse([parts[k] for k in order]), strict=True)
     )
     representative = dict[str, str]()
     name_of_hash = dict[tuple[int, ...], str]()
     for name in (names[k] for k in order if k in single_products):
         # products whose results are added have the same expression as cotangent
-        hashes = tuple(cell.element_hash() for cell in slope_of_name[name].elements())
+        hashes = tuple(cell.element_hash() for cell in cotangent_by_name[name].elements())
         representative[name] = name_of_hash.setdefault(hashes, name)
-    result_names = [name for name in slope_of_name if representative.get(name, name) == name]
+    result_names = [name for name in cotangent_by_name if representative.get(name, name) == name]
     function = ca.Function(
-        "slope",
-        [*symbols[:n_arguments], *slopes, *factor_slopes],
-        [slope_of_name[name] for name in result_names],
+        "step_vjp",
+        [*symbols[:n_arguments], *cotangents, *factor_cotangents],
+        [cotangent_by_name[name] for name in result_names],
         [
             *step.name_in()[:n_arguments],
-            *(f"{name}_slope" for name in (*_CARRIED, "a")),
-            *(f"factor_{k}_slope" for k in range(n_products)),
+            *(f"{name}_cotangent" for name in (*_STATE_NAMES, "a")),
+            *(f"factor_{k}_cotangent" for k in range(n_products)),
         ],
         result_names,
     )
@@ -617,7 +632,7 @@ def _vector_jacobian_function(
 
 
 class _RolloutStep(nn.Module):
-    """One step of a rollout."""
+    """One step of the source of the inputs and of the model of a rollout."""
 
     def __init__(self, rollout: Rollout) -> None:
         super().__init__()
@@ -635,14 +650,14 @@ class _RolloutStep(nn.Module):
 
 @final
 class CompiledRollout:
-    """A rollout as compiled C, with gradients by parameters, initial states and memory.
+    """A rollout as compiled C, with gradients of parameters, initial states and initial memory.
 
     It has no gradient if gradients were disabled in torch when it was compiled, or if no parameter
     requires one.
 
     Args:
-        rollout: its source must not depend on the number of the step. Parameters and buffers may
-            change between runs.
+        rollout: rollout whose source does not depend on the number of the step. Parameters and
+            buffers may change between runs.
         x: example of the initial states [B, nx], in the precision of the runs.
         w: example of the inputs [B, T, m].
         s: example of the memory [B, n].
@@ -700,10 +715,10 @@ class CompiledRollout:
             # a source with tensors for each row accepts this number of rows only
             q = reference.source.initial(x.double())
             applied = reference.source(x.double(), w[:, 0].double(), 0, q)[0]
-        rows += [("q", q[:1]), ("own", self._row_tensors(tensors, 1).double())]
+        rows += [("q", q[:1]), ("row_values", self._row_tensors(tensors, 1).double())]
         shared = [tensors[name].detach() for name in self.shared_names]
-        names = [f"{name}_after" for name in _CARRIED]
-        self.parts = split_step(step, rows, shared, [*names, "a"], _LABEL)
+        names = [f"{name}_after" for name in _STATE_NAMES]
+        self.parts = split_step(step, rows, shared, [*names, "a"], _MODEL_NAME)
         self.sizes = {name: example.shape[1] for name, example in rows}
         self.sizes["a"] = 0 if rollout.source.is_playback else applied.shape[1]
         self.trained_indices: list[int] | None = None
@@ -744,7 +759,7 @@ class CompiledRollout:
         return torch.cat([torch.zeros(n_rows, 0), *parts], dim=1)
 
     def prepare_tables(self, tensors: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return `theta` and the matrices of products, from parameters and buffers."""
+        """Compute `theta` and the matrices of products, concatenated, from named tensors."""
         prepared = self.parts.prepare(*(tensors[name].double() for name in self.shared_names))
         return _concatenate([prepared[k] for k in self.parts.theta_indices]).to(
             self.dtype
@@ -769,7 +784,7 @@ class CompiledRollout:
         return states, w if self.rollout.source.is_playback else applied_inputs, memory
 
     def simulate(self, *arguments: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return states, inputs and the final memory; arguments as of `_CompiledRun`."""
+        """Return states, inputs and the final memory; arguments as in `run_forward`."""
         if not torch.is_grad_enabled():
             return self.run_forward(*arguments, keep_history=False)[0]
         apply: Any = _CompiledRun.apply
@@ -798,12 +813,12 @@ class CompiledRollout:
             row_values: tensors that differ from row to row, flattened [B, n].
             w: inputs [B, T, m].
             q: initial memory of the source [B, k].
-            keep_history: whether to store what the gradient needs.
+            keep_history: whether to store the values that the gradient needs.
 
         Returns:
             States, inputs and final memory; and the arguments of the gradient: `theta`, tables,
-            row tensors, states, inputs and both memories with the rows last, padded to whole
-            blocks, and block by block what a step stores.
+            row tensors, states, inputs and both memories with the rows as last dimension, padded to
+            complete blocks, and the stored values of all steps, block by block.
         """
         n_rows, n_steps = w.shape[:2]
         n_blocks = -(-n_rows // self.n_lanes)
@@ -830,7 +845,7 @@ class CompiledRollout:
         rows = pad_rows(row_values).T.contiguous()
         tensors = [theta.detach(), tables.detach(), rows, states, inputs, *memories]
         self.call_library(
-            "fly", n_blocks, *tensors, applied, stored, int(keep_history), n_steps, n_padded
+            "run_forward", n_blocks, *tensors, applied, stored, int(keep_history), n_steps, n_padded
         )
         # without history two buffers alternate
         final_memory = memories[0][n_steps if keep_history else n_steps & 1]
@@ -894,8 +909,8 @@ class _CompiledRun(torch.autograd.Function):
             padded = torch.zeros(*grad.shape[1:], n_padded, dtype=compiled.dtype)
             padded[:, :, :n_rows] = grad.permute(1, 2, 0)
             cotangents.append(padded)
-        # each row has its own total; the sum over rows then does not depend on the number of
-        # threads
+        # the gradient is accumulated for each row, so that the sum over rows does not depend on the
+        # number of threads
         n_blocks = n_padded // compiled.n_lanes
         n_theta = len(compiled.trained_indices)
         backward_storage = compiled.allocate(n_blocks, n_steps, compiled.backward_storage)
@@ -907,13 +922,20 @@ class _CompiledRun(torch.autograd.Function):
         n_matrix_entries = (
             sum(product.matrix_size for _, product in products) if compiled.has_row_gradients else 0
         )
-        total = torch.zeros(
+        row_gradients = torch.zeros(
             n_blocks, n_theta + n_matrix_entries, compiled.n_lanes, dtype=compiled.dtype
         )
         compiled.call_library(
-            "back", n_blocks, *history, *cotangents, backward_storage, total, n_steps, n_padded
+            "run_backward",
+            n_blocks,
+            *history,
+            *cotangents,
+            backward_storage,
+            row_gradients,
+            n_steps,
+            n_padded,
         )
-        rows = total.transpose(1, 2).reshape(n_padded, -1)[:n_rows]
+        rows = row_gradients.transpose(1, 2).reshape(n_padded, -1)[:n_rows]
         if not math.isinf(compiled.max_gradient_ratio):
             cotangent_square = sum(grad.flatten(1).square().sum(1) for grad in grads)
             rows = _clip_row_gradients(
@@ -929,7 +951,7 @@ class _CompiledRun(torch.autograd.Function):
                 products, key=lambda p: compiled.forward_storage[f"factor_{p[0]}"].start
             )
             for _, group in groupby(
-                ordered_products, lambda p: layout[f"product_{p[0]}_slope"].start
+                ordered_products, lambda p: layout[f"product_{p[0]}_cotangent"].start
             ):
                 group_products = [*group]
                 (k, product) = group_products[0]
@@ -938,11 +960,11 @@ class _CompiledRun(torch.autograd.Function):
                     compiled.forward_storage[f"factor_{k}"].start, last_factor.stop
                 )
                 factor = history[-1][:, factor_range].unflatten(1, (product.n_repeats, -1))
-                slope = backward_storage[:, layout[f"product_{k}_slope"]].unflatten(
+                cotangent = backward_storage[:, layout[f"product_{k}_cotangent"]].unflatten(
                     1, (product.n_repeats, -1)
                 )
                 gradient = torch.zeros(factor.shape[2], product.n_outputs, dtype=compiled.dtype)
-                for a, b in zip(factor.unbind(1), slope.unbind(1), strict=True):
+                for a, b in zip(factor.unbind(1), cotangent.unbind(1), strict=True):
                     gradient.addbmm_(a, b.transpose(1, 2))
                 parts = gradient.split([member.n_inputs for _, member in group_products])
                 gradient_of_product |= {
@@ -968,16 +990,18 @@ def _clip_row_gradients(gradients: Tensor, cotangent_norm: Tensor, max_ratio: fl
         cotangent_norm: norm of each row's cotangent [B].
         max_ratio: largest ratio of gradient and cotangent as a multiple of the median ratio.
     """
-    size = gradients.norm(dim=1)
-    ratio = size / cotangent_norm.clamp(min=1e-30)
+    gradient_norm = gradients.norm(dim=1)
+    ratio = gradient_norm / cotangent_norm.clamp(min=1e-30)
     median_ratio = (
         ratio[cotangent_norm > 0].nanmedian()
         if bool((cotangent_norm > 0).any())
         else ratio.new_zeros(())
     )
-    factor = (max_ratio * median_ratio * cotangent_norm / size.clamp(min=1e-30)).clamp(max=1.0)
+    factor = (max_ratio * median_ratio * cotangent_norm / gradient_norm.clamp(min=1e-30)).clamp(
+        max=1.0
+    )
     # gradients that are not finite carry no information
-    return torch.where(torch.isfinite(size)[:, None], gradients * factor[:, None], 0.0)
+    return torch.where(torch.isfinite(gradient_norm)[:, None], gradients * factor[:, None], 0.0)
 
 
 def _named_tensors(rollout: Rollout) -> dict[str, Tensor]:

@@ -1,4 +1,5 @@
-/* Blocks of rows by the vector types that gcc and clang know. */
+/* Blocks of rows as the vector types of gcc and clang: V is a block of numbers, U the same without
+ * alignment, I a block of integers or truth values. */
 #include <math.h>
 #include <string.h>
 #if defined(__AVX512F__)

@@ -568,8 +568,8 @@ def record_graph(step: Callable[..., Any], examples: Sequence[Tensor], model_nam
         message_lines = str(error).strip().splitlines()
         reason = message_lines[0] if message_lines else type(error).__name__
         raise ExportError(
-            f"{model_name}: its step cannot be recorded as a fixed sequence of operations ({reason});"
-            " write it with operations on tensors alone, torch.where instead of `if`"
+            f"{model_name}: its step cannot be recorded as a fixed sequence of operations"
+            f" ({reason}); write it with operations on tensors alone, torch.where instead of `if`"
         ) from error
 
 
