@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def band_channels(states: np.ndarray, position_radius: np.ndarray) -> np.ndarray:
-    """Return the band channels [L, 2 + n] of states [L, 3 + n] and position radius [L]."""
+    """Return the channels of a band [L, 2 + n] from states [L, 3 + n] and a position radius [L]."""
     velocities = states[:, VELOCITIES]
     heading = states[:, HEADING]
     return np.column_stack((velocities, heading, position_radius, states[:, EXTRA_STATES]))
@@ -53,7 +53,7 @@ _MAX_STANDARD_SCORE = 2.5
 
 
 def running_mean_squares(states: np.ndarray, step: float) -> np.ndarray:
-    """Return running mean squares of the velocities and their derivatives [L, 2 n].
+    """Return mean squares of the velocities and their derivatives up to each step, [L, 2 n].
 
     They measure the intensity of the motion.
 
@@ -71,7 +71,7 @@ def running_mean_squares(states: np.ndarray, step: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MotionIntensity:
-    """Standardised logarithms of the mean squares of a predicted run.
+    """Standardises logarithms of the mean squares of a run, which measure its intensity.
 
     Attributes:
         floor: constant added to each mean square [2 n], squares of SI units.
@@ -363,7 +363,7 @@ def excess_disagreement(
 
     Args:
         spread: standard deviations between ensemble members; per axis for the position.
-        typical_spread: their root mean square over the calibration runs.
+        typical_spread: root mean square standard deviation over the calibration runs.
         level: nominal coverage of normal errors.
     """
     is_radial = np.array([name == "position" for name in channels])

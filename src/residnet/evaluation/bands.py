@@ -115,13 +115,13 @@ def compute_run_errors(
 
 @dataclass(frozen=True)
 class BandCoverage:
-    """How prediction intervals fared over some windows.
+    """Coverage and score of prediction intervals over some windows.
 
     Attributes:
-        share: share of the samples inside by channel, their `mean`, and `whole`: the share of
-            windows inside the interval of whole runs.
+        share: fraction of the samples inside the interval by channel, the `mean` of the channels,
+            and `whole`: the fraction of windows entirely inside the simultaneous interval.
         score: mean interval score in units of the constant-velocity error.
-        constant_width_score: the same of an interval of constant width.
+        constant_width_score: mean interval score of an interval of constant width.
     """
 
     share: dict[str, float]
@@ -131,7 +131,7 @@ class BandCoverage:
 
 @dataclass(frozen=True)
 class BandCounts:
-    """Sums over the scored samples of each of W windows, by channel [W, c].
+    """Counts and sums over the scored samples of each of W windows, by channel [W, c].
 
     Attributes:
         channels: names of the channels.
@@ -223,7 +223,7 @@ _SMOOTHING_SHARE = 0.11
 _SLOPE_RIDGE = 0.02
 """Ridge on the slopes, for measures of unit variance."""
 _ALTERNATIONS = 2
-"""Number of alternations between shape and slopes, each fitted given the other."""
+"""Number of alternating fits of the shape over horizons and of the intensity slopes."""
 _SCALE_FOLDS = 5
 """Number of folds of the cross-fitted error scales."""
 _HORIZON_STRIDE = 3

@@ -61,13 +61,14 @@ class DerivativeRow(Record):
     """A hydrodynamic derivative.
 
     Attributes:
-        name: such as Y_v or N_delta; of an acceleration with the suffix "/m".
+        name: symbol such as Y_v or N_delta; with the suffix "/m" for an acceleration.
         axis: X, Y or N.
         variables: variables of the monomial that the coefficient multiplies; `u` is the difference
             to the service speed, and a propeller's revolutions that to their equilibrium.
-        value: in SI units.
+        value: value in SI units.
         unit: SI unit.
-        standard_error: in SI units; None if the covariance of the parameters is unknown.
+        standard_error: standard error in SI units; None if the covariance of the parameters is
+            unknown.
         ci95: 95 % confidence interval in SI units; None without standard error.
         is_significant: whether the interval excludes zero; None without standard error.
         prime_i, prime_ii, bis: value in the non-dimensional systems; None where particulars that
@@ -96,14 +97,14 @@ class DerivativesFile(FileRecord):
         schema_name: format of the file.
         model: name of the model.
         quantity: `force`, or `acceleration` where the masses are unknown.
-        masses: where the masses come from: `identified` from forces in the logs, `estimated` from
+        masses: source of the masses: `identified` from forces in the logs, `estimated` from
             main particulars, or `unknown`.
         mass_matrix: M [3][3] in SI; None if unknown.
         particulars: main particulars in SI.
         froude_number: U / sqrt(g L).
         scale: length of the target vessel divided by that of the vessel in the logs.
         operating_point: values of the inputs at the expansion point.
-        surge_imbalance: surge acceleration there in m/s^2; zero at an equilibrium.
+        surge_imbalance: surge acceleration at the expansion point in m/s^2; zero at an equilibrium.
         rows: derivatives by order, axis and variables.
         correlation: correlation matrix of the first-order derivatives; None if unknown.
         published: Y_v, Y_r, N_v, N_r in the prime I system by Clarke et al. (1983); None if the

@@ -40,7 +40,7 @@ pairs.
 class RepeatedPair:
     """A window and the segment of another log that repeats it.
 
-    `mismatch` is the command difference as a share of the command range.
+    `mismatch` is the difference of the commands as a fraction of their range.
     """
 
     window: Window
@@ -113,10 +113,17 @@ def find_pairs(
     state_scales: np.ndarray,
     dt: float,
 ) -> Iterator[RepeatedPair]:
-    """Return pairs of repeated runs; `state_scales` [n] are the scales of the dynamic states.
+    """Yield pairs of repeated runs.
 
-    Each window of the protocol is paired with at most one segment per log, from its own log on.
-    Repetitions are undefined without commands; the result is then empty.
+    Each window of the protocol is paired with at most one segment of its own log and of each later
+    log. Without commands there are no pairs.
+
+    Args:
+        protocol: protocol of the windows.
+        logs: logs on one time grid.
+        n_commands: number of input columns that are commands.
+        state_scales: scales of the dynamic states [n].
+        dt: time step in s.
     """
     if n_commands == 0:
         return
@@ -200,10 +207,10 @@ def mismatch(reference_commands: np.ndarray, series: np.ndarray) -> np.ndarray:
 
 
 def _pair_differences(pair: RepeatedPair, logs: Sequence[PreparedLog]) -> list[float]:
-    """Return differences of two runs.
+    """Return the differences of two runs, [n + 2].
 
-    Root mean squares of u, v (samples usable in both) and the other velocities, then position and
-    heading at the end.
+    They are root mean square differences of the velocities, of u and v over the samples that are
+    usable in both, and the differences of position and heading at the end.
     """
     reference_log = logs[pair.window.log_index]
     repeat_log = logs[pair.repeat_log]
@@ -384,7 +391,7 @@ def block_bootstrap_interval(segments: Segments) -> BlockBootstrapInterval:
     tail_probability = bootstrap_tail_probability(max(math.floor(n_blocks), 2))
     n_drawn = math.ceil(n_blocks)
     if n_blocks > _NORMAL_APPROXIMATION_BLOCKS:
-        # of a ratio of sums, by its linear part
+        # delta method for a ratio of sums
         standard_error = float(
             np.std(sums - lengths * (sums.sum() / lengths.sum())) / lengths.mean()
         ) / math.sqrt(n_blocks)
@@ -413,7 +420,10 @@ def block_bootstrap_interval(segments: Segments) -> BlockBootstrapInterval:
 
 
 def _block_sums(segments: Segments, max_block_length: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sums and lengths of all blocks of `max_block_length` samples; a shorter piece is a block."""
+    """Return sums and lengths of all blocks of `max_block_length` samples.
+
+    A segment that is shorter than a block is a block.
+    """
     sums = []
     lengths = []
     for segment in segments:
@@ -487,7 +497,7 @@ class FitMeasures(NamedTuple):
     Attributes:
         rmse: root mean square residual.
         r2: coefficient of determination.
-        r2_adjusted: adjusted for the number of parameters.
+        r2_adjusted: coefficient of determination, adjusted for the number of parameters.
         cp: Mallows' C_p.
         aic: Akaike's criterion.
         bic: Bayesian criterion.
@@ -543,9 +553,10 @@ def goodness_of_fit_measures(
 
 
 def estimate_noise_variance(residuals: np.ndarray, n_parameters: float) -> float:
-    """Return sigma^2 = RSS / (m - d - 1) (9.17, correction E1).
+    """Return the noise variance sigma^2 = RSS / (m - d - 1) of m residuals and d parameters.
 
-    Infinite if m does not exceed d + 1.
+    Halvorsen 2019, eq. (9.17), prints the mean square for the sum of squares RSS. Infinite if m
+    does not exceed d + 1.
     """
     degrees_of_freedom = len(residuals) - n_parameters - 1
     return float(residuals @ residuals) / degrees_of_freedom if degrees_of_freedom > 0 else math.inf

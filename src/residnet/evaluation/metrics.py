@@ -679,7 +679,7 @@ def find_row(
     protocol: str | None = None,
     manoeuvre: str = "all",
 ) -> MetricsRow:
-    """Return the one row of a model and manoeuvre, of a split and a protocol if they are given.
+    """Return the row of a model and manoeuvre, and of a split and protocol if these are given.
 
     Raises:
         KeyError: if there is no such row, or several.
@@ -800,7 +800,7 @@ def iterate_rollout_columns(
 
     Args:
         inputs: names of the inputs, in column order.
-        bands: by model and protocol; None for none.
+        bands: prediction intervals by model and protocol; None if no model has any.
     """
     bands_by_model = bands or {}
     for log_index, log in enumerate(logs):

@@ -24,9 +24,9 @@ class Window:
     """A free run over samples start .. stop-1 of a log, the first of them the initial state.
 
     Attributes:
-        log_index: number of the log.
-        start: sample of the initial state.
-        stop: one past the last sample.
+        log_index: index of the log.
+        start: index of the sample of the initial state.
+        stop: index after that of the last sample.
         history_start: first sample of the measured past that may warm up a memory.
         initial_velocities: initial values of the dynamic states [n].
     """
@@ -154,7 +154,7 @@ class ManoeuvreProtocol(Config):
     def make_overlapping_windows(
         self, log: PreparedLog, log_index: int, dt: float, interval: float | None = None
     ) -> list[Window]:
-        """Return the windows themselves: a manoeuvre is one free run from its beginning."""
+        """Return the same windows as `make_windows`: a manoeuvre is one free run from its start."""
         return self.make_windows(log, log_index, dt)
 
 

@@ -30,7 +30,7 @@ class BlockCount(Record):
     """The blocks that a bootstrap resamples or a selection pairs.
 
     Attributes:
-        of: whether a block is all windows of a log (`logs`), or a part of a log.
+        of: kind of block: all windows of a log (`logs`), or a part of a log.
         count: number of blocks.
     """
 
@@ -71,22 +71,23 @@ class MetricsRow(Record):
         n: number of scored samples.
         diverged: number of diverged windows; they count with the constant-velocity error.
         rmse: mean over the windows of the root mean square error of each velocity.
-        mae: the same of the mean absolute error.
-        nrmse: `rmse` over the scales of the config, and its `mean` over the velocities.
+        mae: mean over the windows of the mean absolute error of each velocity.
+        nrmse: `rmse` divided by the scales of the config, and the `mean` over the velocities.
         rmse_ci95: bootstrap 95 % confidence intervals of `rmse`; None if there are too few windows.
         nrmse_mean_ci95: interval of the mean of `nrmse`.
         ci95_blocks: the blocks that were resampled.
         position_error_end: distance in m at the end of a window, mean over the windows.
-        position_error_end_ci95: 95 % confidence interval of it.
+        position_error_end_ci95: 95 % confidence interval of `position_error_end`.
         heading_error_end: heading error in rad at the end of a window, mean over the windows.
-        heading_error_end_ci95: 95 % confidence interval of it.
-        depth_error_end: depth error in m, of a vessel that dives.
-        depth_error_end_ci95: 95 % confidence interval of it.
-        attitude_error_end: attitude error in rad, of a vessel that dives.
-        attitude_error_end_ci95: 95 % confidence interval of it.
-        difference: paired difference to the reference model of this model.
-        band_coverage: share of the samples within the prediction interval by channel, their `mean`,
-            and `whole`: the share of windows inside the interval of whole runs.
+        heading_error_end_ci95: 95 % confidence interval of `heading_error_end`.
+        depth_error_end: depth error in m at the end of a window, for vessels that dive.
+        depth_error_end_ci95: 95 % confidence interval of `depth_error_end`.
+        attitude_error_end: attitude error in rad at the end of a window, for vessels that dive.
+        attitude_error_end_ci95: 95 % confidence interval of `attitude_error_end`.
+        difference: paired difference from the reference model of this model.
+        band_coverage: fraction of the samples within the prediction interval by channel, the `mean`
+            of the channels, and `whole`: the fraction of windows that are entirely within the
+            simultaneous interval.
         band_score: mean interval score in units of the constant-velocity error.
         band_score_constant: interval score of an interval of constant width.
         selected: whether validation data chose this single model; None where nothing was chosen.
@@ -272,7 +273,8 @@ class HorizonRow(Record):
         slowest: smallest mean speed of a window in m/s.
         fastest: largest mean speed of a window in m/s.
         sailed: mean distance travelled in m.
-        floor: errors of the integrated measured velocities (noise floor).
+        floor: errors of the integrated measured velocities, which even exact velocities of a model
+            would have.
         models: errors by model.
     """
 
@@ -291,7 +293,7 @@ class ClassErrors(Record):
 
     Attributes:
         nrmse_mean: mean error.
-        difference: paired difference to the reference model; None without one.
+        difference: paired difference from the reference model; None without one.
     """
 
     nrmse_mean: float
@@ -302,7 +304,7 @@ class ClassRow(Record):
     """Errors over the windows of one third of the range of speed or wind speed.
 
     Attributes:
-        by: speed of the vessel, or true wind speed.
+        by: quantity that defines the classes: speed of the vessel, or true wind speed.
         low: smallest mean of a window in m/s.
         high: largest mean of a window in m/s.
         windows: number of windows.
@@ -373,13 +375,13 @@ class KinematicErrors(Record):
     Attributes:
         windows: number of windows.
         position_mean: mean distance in m at the end of a window.
-        position_rms: root mean square of it.
+        position_rms: root mean square distance in m at the end of a window.
         heading_mean: mean heading error in rad at the end of a window.
-        heading_rms: root mean square of it.
+        heading_rms: root mean square heading error in rad at the end of a window.
         depth_mean: mean depth error in m at the end of a window.
-        depth_rms: root mean square of it.
+        depth_rms: root mean square depth error in m at the end of a window.
         attitude_mean: mean attitude error in rad at the end of a window.
-        attitude_rms: root mean square of it.
+        attitude_rms: root mean square attitude error in rad at the end of a window.
     """
 
     windows: int = 0
@@ -490,7 +492,7 @@ class Repeatability(RepeatDifferences):
     Attributes:
         tolerance: how much two runs may differ to count as repeated.
         logs: number of logs with a pair.
-        manoeuvres: the same by kind of manoeuvre.
+        manoeuvres: differences of repeated runs by kind of manoeuvre.
     """
 
     tolerance: RepeatTolerance
@@ -503,8 +505,8 @@ class LimitsFile(FileRecord):
 
     Attributes:
         run: name of the run.
-        splits: by split and protocol.
-        repeatability: by protocol, differences between repeated manoeuvres.
+        splits: limits of the models by split and protocol.
+        repeatability: differences between repeated manoeuvres by protocol.
     """
 
     schema_name: Literal["residnet.limits/1"] = Field(alias="schema")
@@ -527,7 +529,7 @@ class Activity(Record):
         measures: velocities and accelerations whose mean squares measure the motion.
         floor: smallest value of each measure.
         centre: mean logarithm of each measure.
-        spread: standard deviation of that logarithm.
+        spread: standard deviation of the logarithm of each measure.
         slope: slope of the log width against the standardised measures, by channel.
     """
 
@@ -619,7 +621,7 @@ class GoodnessRow(Record):
         parameters: number of fitted parameters of this axis.
         rmse: root mean square residual.
         r2: coefficient of determination; None if the target is constant.
-        r2_adjusted: adjusted for the number of parameters.
+        r2_adjusted: coefficient of determination, adjusted for the number of parameters.
         cp: Mallows' C_p.
         aic: Akaike's criterion; None without noise.
         bic: Bayesian criterion; None without noise.
@@ -629,11 +631,12 @@ class GoodnessRow(Record):
         block_seconds: length of a bootstrap block in s.
         mean: mean residual.
         mean_ci95: block-bootstrap 95 % interval of `mean`.
-        effective: number of independent samples with the same variance of the mean.
-        autocorrelation: at lags from one sample on.
+        effective: effective sample size: number of independent samples whose mean would have the
+            same variance.
+        autocorrelation: autocorrelation of the residuals at lags of 1, 2, ... samples.
         ljung_box: statistic of the test for white residuals.
-        white_p: its p-value.
-        difference: paired difference to the reference model.
+        white_p: p-value of `ljung_box` for white residuals.
+        difference: paired difference from the reference model.
     """
 
     model: str
@@ -792,16 +795,16 @@ class BookletIndex(Record):
     """A manoeuvring index.
 
     Attributes:
-        value: of the fitted parameters, in the scale of the logs.
-        ship: the same in the scale of the ship.
-        draws: number of parameter draws that gave it.
+        value: index for the fitted parameters, in the scale of the logs.
+        ship: index for the fitted parameters, in the scale of the ship.
+        draws: number of parameter draws for which the index exists.
         interval: prediction interval over the draws.
-        lengths: in lengths of the hull.
-        measured: of the measured manoeuvre.
-        difference: simulated minus measured.
+        lengths: index in lengths of the hull.
+        measured: index of the measured manoeuvre.
+        difference: simulated minus measured index.
         limit: limit of IMO in the scale of the ship.
         kept: whether the limit is met.
-        kept_share: share of the draws that meet it.
+        kept_share: fraction of the draws that meet the limit.
     """
 
     value: float
@@ -946,7 +949,8 @@ class LogQuality(Record):
         seconds: duration in s.
         samples: number of samples.
         usable: share of the samples at which velocities and position are scored.
-        learned_from: share of the samples with smoothed states and accelerations.
+        learned_from: fraction of the samples that have smoothed states and accelerations, from
+            which models learn.
         masked: share of the samples that each mask excludes.
         largest: largest magnitude of each state over the usable samples.
         integrated: pose channels that were integrated from the velocities.

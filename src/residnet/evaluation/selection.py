@@ -45,11 +45,11 @@ class SelectionCandidate:
     Attributes:
         name: name of the model.
         family: one of `MODEL_FAMILIES`.
-        n_parameters: number of its fitted parameters.
-        mean_nrmse: its mean NRMSE over the validation windows.
+        n_parameters: number of fitted parameters.
+        mean_nrmse: mean NRMSE over the validation windows.
         block_scores: contribution of each block of the validation data to the mean logarithm of
-            its error, [B]; see `block_log_errors`.
-        n_diverged: number of its validation windows that diverged, over all protocols.
+            the error, [B]; see `block_log_errors`.
+        n_diverged: number of validation windows in which the model diverged, over all protocols.
         faults: texts on failed checks and divergences; empty for a sound model.
     """
 
@@ -73,7 +73,7 @@ class SelectionCandidate:
 
     @property
     def complexity_rank(self) -> tuple[int, int]:
-        """The place in the order of models: family, then the number of parameters."""
+        """Sort key of the complexity: family, then the number of parameters."""
         return MODEL_FAMILIES.index(self.family), self.n_parameters
 
 
@@ -119,7 +119,7 @@ def log_error_ratio(
 ) -> tuple[float, float]:
     """Return the mean logarithm of the ratio of two models' errors, and its standard error.
 
-    Both are shares: 0.1 is about 10 %.
+    A logarithm of 0.1 is a difference of about 10 %.
     """
     mean_log_ratio = float((candidate.block_scores - reference.block_scores).sum())
     return mean_log_ratio, blocks.standard_error(candidate.block_scores, reference.block_scores)

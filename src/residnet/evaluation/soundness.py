@@ -79,7 +79,7 @@ class SteadyRun:
 
     Attributes:
         log: name of the log.
-        duration: its duration without the settling time, s.
+        duration: duration in s without the settling time.
         mean_state: mean state [3 + n] with the pose at zero.
         mean_inputs: mean inputs [m].
         decay: distance of the lateral velocities from their final mean at the start of the segment,
@@ -317,8 +317,7 @@ def settled_acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
 def check_damping(
     spec: ModelSpec, model: HybridDynamics, training_points: TrainingPoints
 ) -> SanityRow:
-    """Check that each velocity decays by itself: d u_dot/du < 0 and so on, by automatic
-    differentiation.
+    """Check that each velocity is damped: d u_dot/du < 0, d v_dot/dv < 0 and so on.
 
     No derivative may be positive at more than half of the recorded points, unless it is negligible
     against its values at the other points.

@@ -42,9 +42,9 @@ MONTH_NUMBERS: dict[str, int] = {
 }
 """First three letters of a month -> its number, from 1."""
 DATE_PART_NAMES = tuple(_VOCABULARY["date_parts"].split())
-"""Normalized names of columns with one part of a date or of a time of day."""
+"""Normalised names of columns with one part of a date or of a time of day."""
 VESSEL_COLUMN_NAMES = tuple(_VOCABULARY["vessel_columns"].split("|"))
-"""Normalized names of columns that identify the vessel of each row, in order of precedence."""
+"""Normalised names of columns that identify the vessel of each row, in order of precedence."""
 TIME_VECTOR_NAMES = tuple(_VOCABULARY["time_vectors"].split())
 """Names of time vectors in MATLAB and HDF5 files, in order of precedence."""
 ARRIVAL_COLUMN_NAMES = tuple(_VOCABULARY["arrival_columns"].split())
@@ -57,7 +57,7 @@ MANOEUVRE_PATTERNS: dict[str, re.Pattern[str]] = {
     kind: re.compile(re.sub(r"\|\s+", "|", text.strip()))
     for kind, text in _VOCABULARY["manoeuvre_names"].items()
 }
-"""Kind of manoeuvre -> pattern of the normalized names of its files."""
+"""Kind of manoeuvre -> pattern of the normalised names of its files."""
 REVOLUTION_PATTERN = re.compile("|".join(_VOCABULARY["revolution_patterns"].split()), re.IGNORECASE)
 """Words for revolutions."""
 
@@ -346,7 +346,7 @@ def _split_compound(token: str) -> tuple[str, ...]:
 
 
 def _mentions_concept(concept: str, text: str, tokens: list[str]) -> bool:
-    """Return whether a normalized name mentions a concept.
+    """Return whether a normalised name mentions a concept.
 
     Args:
         concept: key of `concepts` in the vocabulary.
@@ -371,7 +371,7 @@ class _ChannelRule:
         channel: name of the channel; None for quantities without a channel.
         required: required concepts, separated by blanks; alternatives are `rate|speed`.
         excluded: concepts that exclude the channel, separated by blanks.
-        pattern: regular expression that the normalized name must contain.
+        pattern: regular expression that the normalised name must contain.
     """
 
     def __init__(

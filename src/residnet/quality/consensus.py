@@ -98,7 +98,7 @@ SIZE_MARGIN = 0.02
 # Motion that no input explains. Of 92 idle stretches of KVLCC2's logs none reaches 3.2; of 311 of
 # the tanker's six do, among them all three in which she accelerates with all inputs at exactly 0.
 MIN_UNEXPLAINED_Z = 5.5
-"""Smallest RMS standardized residual of an unexplained idle stretch."""
+"""Smallest RMS standardised residual of an unexplained idle stretch."""
 MAX_UNEXPLAINED_SHARE = 0.2
 """Share of a log up to which such stretches are manual control instead of a wrong log."""
 

@@ -304,7 +304,7 @@ def count_reversals(heading: np.ndarray, min_swing: float) -> int:
 
 
 def estimate_resolution(values: np.ndarray) -> float:
-    """Return the quantization step of a channel; 0 if its values have no common step."""
+    """Return the quantisation step of a channel; 0 if its values have no common step."""
     nonzero_changes = np.abs(np.diff(values))
     nonzero_changes = nonzero_changes[np.isfinite(nonzero_changes) & (nonzero_changes > 0.0)]
     if nonzero_changes.size < MIN_SAMPLES:

@@ -51,7 +51,7 @@ from residnet.regression.sparse import (
 )
 
 Terms = tuple[Product, ...]
-"""Sorted products of an individual, which identify its fit."""
+"""Sorted products of an individual. Individuals with equal products share a fit."""
 _SINGULARITY_TOLERANCE = 1e-13
 """Squared pivot of the Cholesky factor below which a Gram matrix counts as singular.
 
@@ -61,9 +61,9 @@ _MIN_MEAN_SQUARE = 1e-300
 """Lower bound of the mean square of a target in a denominator."""
 _MIN_TERM_RMS = 1e-100
 """Root mean square below which a term counts as zero."""
-_MAX_CACHE_NUMBERS = 40_000_000
+_MAX_CACHE_ELEMENTS = 40_000_000
 """Maximum number of array elements in the cache of columns; it is cleared above."""
-_MAX_BATCH_NUMBERS = 3_000_000
+_MAX_BATCH_ELEMENTS = 3_000_000
 """Maximum number of array elements in one batch of columns."""
 
 
@@ -95,7 +95,7 @@ class FitnessEvaluator:
             algebra: algebra of the channels.
             data: channels [N] by name.
             target: target [N].
-            is_training: which samples [N] are used for training; the others validate.
+            is_training: mask of the training samples [N]; the others are for validation.
         """
         # training samples first: both subsets are slices of one array of columns
         order = np.argsort(~is_training, kind="stable")
@@ -137,7 +137,9 @@ class FitnessEvaluator:
                 else:
                     by_width.setdefault(len(terms), []).append(terms)
             for n_terms, same_size_sets in by_width.items():
-                batch_size = max(1, _MAX_BATCH_NUMBERS // (n_terms * self._cached_columns.shape[1]))
+                batch_size = max(
+                    1, _MAX_BATCH_ELEMENTS // (n_terms * self._cached_columns.shape[1])
+                )
                 for start in range(0, len(same_size_sets), batch_size):
                     self._fit_batch(same_size_sets[start : start + batch_size])
             self.n_fitted += len(new_term_sets)
@@ -156,7 +158,7 @@ class FitnessEvaluator:
         """Add the columns of products to the cache, scaled to unit mean square in training."""
         if (len(self._cache_rows) + len(products)) * self._cached_columns.shape[
             1
-        ] > _MAX_CACHE_NUMBERS:
+        ] > _MAX_CACHE_ELEMENTS:
             self._clear_cache()
         missing = sorted(products - self._cache_rows.keys())
         if not missing:
@@ -272,7 +274,7 @@ def evolve(
         algebra: algebra of the channels with the limits of `expression_limits`.
         data: channels [N] by name.
         target: target [N].
-        is_training: which samples [N] are used for training; the others validate.
+        is_training: mask of the training samples [N]; the others are for validation.
         config: settings of the evolution.
         seed: random seed.
 
@@ -624,7 +626,7 @@ def evolve_equation(
         algebra: algebra of the channels with the limits of the search.
         data: channels [N] by name.
         target: target [N].
-        is_training: which samples [N] are used for training; the others validate.
+        is_training: mask of the training samples [N]; the others are for validation.
         config: settings of the search.
         seed: random seed.
         extra_products: additional candidates of the final selection.
@@ -661,7 +663,7 @@ def evolve_equation(
 
 
 def validation_mask(group: np.ndarray, group_interval: int) -> np.ndarray:
-    """Return which samples [N] are used for validation: those of every n-th group.
+    """Return the mask of the validation samples [N]: those of every n-th group.
 
     Args:
         group: group number of each sample [N].

@@ -16,7 +16,9 @@ BINARY = {"+": "add", "-": "subtract", "*": "multiply", "/": "divide"}
 
 
 class EvolutionConfig(Config):
-    """Settings of the evolution; the defaults except the population are those of Table 6.1.
+    """Settings of the evolution.
+
+    The defaults except the population are those of Halvorsen 2019, Table 6.1.
 
     Attributes:
         population: number of individuals.

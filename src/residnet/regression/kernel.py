@@ -63,7 +63,7 @@ def fit_dual_path(
     """Solve kernel ridge regressions alpha = (K + lambda I)^-1 Y for every penalty lambda.
 
     The errors on a fold f need no refit: with the smoother H = K (K + lambda I)^-1 they are
-    (I - H_ff)^-1 (Y - H Y)_f (Moreno-Salinas et al. 2019, section 3.2, correction M4).
+    (I - H_ff)^-1 (Y - H Y)_f (Moreno-Salinas et al. 2019, section 3.2).
 
     Args:
         kernel: kernel matrix K of all samples [N, N].
@@ -234,8 +234,8 @@ class Kernel(ResizableModule, ABC):
 class RbfKernel(Kernel):
     """Sum of Gaussian radial basis functions, f_k(x) = sum_i c_ik exp(-gamma_k |x - x_i|^2).
 
-    gamma = 1 / (2 sigma), where sigma is a squared length (Moreno-Salinas et al. 2019, section 3.2,
-    correction M5).
+    gamma = 1 / (2 sigma), where sigma is a squared length (Moreno-Salinas et al. 2019,
+    section 3.2).
     """
 
     def __init__(self, config: RbfConfig, n_features: int, n_outputs: int = 3) -> None:
@@ -417,7 +417,7 @@ class SingleStateFreeRun:
     Args:
         z: inputs of the fit [N, nz].
         target: outputs of the fit [N, n].
-        segment: number of the uninterrupted segment of each sample [N], ascending.
+        segment: index of the uninterrupted segment of each sample [N], ascending.
         time_step: sampling interval, s.
         states: column of z of the state whose derivative each output is, [n].
 
@@ -455,7 +455,8 @@ class SingleStateFreeRun:
         """
         column = self.states[output]
         measured = self.z[..., column]
-        # the free run adds it, so that only errors of this output accumulate
+        # the part of the derivative that is not the output; the free run adds it as measured, so
+        # that only errors of this output accumulate
         remaining_derivative = (measured[:, 1:] - measured[:, :-1]) / self.time_step - self.target[
             :, :-1, output
         ]
@@ -492,8 +493,8 @@ class _SettingIndices(NamedTuple):
 class KernelRidge(Estimator):
     """Kernel ridge regression of every output, without intercept.
 
-    The state of a solution is that of the kernel module and `effective` [n], the effective number
-    of parameters of each output (the trace of the smoother).
+    The state of a solution is that of the kernel module and `effective_parameters` [n], the
+    effective number of parameters of each output (the trace of the smoother).
 
     Args:
         kernel: kernel module with its candidate settings.

@@ -50,9 +50,9 @@ Point = TypeVar("Point")
 class LeastSquares(Estimator):
     """Ordinary least squares without intercept, or with relative ridge penalties.
 
-    Columns are scaled to unit root mean square first, so that a penalty is relative to the energy
-    of each column. Standard errors are cluster-robust over groups (Liang and Zeger 1986), because
-    residuals at 10-20 Hz are strongly correlated and the formula for independent residuals
+    Columns are scaled to unit root mean square first, so that a penalty is relative to the sum of
+    squares of each column. Standard errors are cluster-robust over groups (Liang and Zeger 1986),
+    because residuals at 10-20 Hz are strongly correlated and the formula for independent residuals
     underestimates the errors several times. With fewer than two groups that formula is used.
 
     Args:
@@ -257,7 +257,7 @@ def _sum_over_chunks(x: Regressors, contribution: Callable[[slice, Tensor], Tens
 
 @dataclass(frozen=True)
 class DescentResult(Generic[Point]):
-    """The minimizer of a descent and its number of accepted steps."""
+    """The minimiser of a descent and its number of accepted steps."""
 
     minimizer: Point
     n_steps: int
@@ -271,11 +271,11 @@ def minimize_levenberg_marquardt(
     min_relative_decrease: float,
     damping: float = 1e-3,
 ) -> DescentResult[Point]:
-    """Minimize a cost by the Levenberg-Marquardt method.
+    """Minimise a cost by the Levenberg-Marquardt method.
 
     Args:
         initial_point: starting point, of any type that `linearize` accepts.
-        linearize: linearises the problem at a point. Returns the cost at the point, and a function
+        linearise: linearises the problem at a point. Returns the cost at the point, and a function
             from a damping to the cost and the point after the damped step.
         max_iterations: maximum number of accepted steps.
         min_relative_decrease: relative decrease of the cost below which the descent ends.

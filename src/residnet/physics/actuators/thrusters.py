@@ -158,7 +158,7 @@ class AzimuthThrusters(ForceActuators):
     def allocate(self, tau: Tensor) -> Tensor:
         """Return the commands [..., 2k] for forces tau [..., 3] by the pseudoinverse.
 
-        The pseudoinverse minimizes the sum of squared thrusts; thrusts above the maximum saturate.
+        The pseudoinverse minimises the sum of squared thrusts; thrusts above the maximum saturate.
         """
         thrust_x, thrust_y = (tau @ self.allocation_matrix.to(tau.dtype).T).chunk(2, dim=-1)
         thrust_magnitude = torch.hypot(thrust_x, thrust_y)
