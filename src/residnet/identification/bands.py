@@ -86,7 +86,7 @@ class LeaveFoldOutModels:
 
     Args:
         identified: fitted models.
-        fold_of_log: number of the fold of each training log [L].
+        fold_of_log: index of the fold of each training log [L].
     """
 
     def __init__(self, identified: IdentifiedModels, fold_of_log: np.ndarray) -> None:
@@ -100,7 +100,7 @@ class LeaveFoldOutModels:
 
     @cached_property
     def models_by_fold(self) -> list[dict[str, HybridDynamics]]:
-        """The models by name, fitted without each fold."""
+        """For each model by name, the models fitted without each fold."""
         models_by_fold: list[dict[str, HybridDynamics]] = [{} for _ in range(self.n_folds)]
         for name, fitted_model in self.identified.items():
             try:
@@ -241,7 +241,7 @@ class _ProtocolCalibration:
         identified: fitted models.
         protocol_name: name of the protocol.
         config: settings of the calibration.
-        failure_reasons: by model, why it could not be fitted without some of the logs.
+        failure_reasons: reason by model for which it was not fitted without some of the logs.
     """
 
     def __init__(

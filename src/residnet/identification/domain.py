@@ -35,9 +35,11 @@ _HELD_TOLERANCE: Final = 0.02
 """Tolerance of a held input, as a share of its magnitude, and of a proportional input, as a share
 of its range."""
 _MIN_LAW_R2: Final = 0.3
-"""R^2 of a control law by leave-one-log-out, below which the model cannot see the reference."""
+"""R^2 of a control law in leave-one-log-out cross-validation, below which the reference of the
+controller is no function of the channels of the model.
+"""
 _EXCESS: Final = 1.5
-"""Factor on the largest deviations from a relation in the logs."""
+"""Factor by which new data may exceed the largest deviations from a relation in the logs."""
 
 
 def detect_feedback_of_logs(
@@ -152,7 +154,7 @@ def _density_channels(
 
 
 def _factorize(moment: np.ndarray) -> np.ndarray:
-    """Return F [p, p] with F' F the inverse of a regularised moment matrix."""
+    """Return a factor F [p, p] such that F' F is the inverse of the regularised moment matrix."""
     ridge = _RIDGE * np.eye(len(moment))
     ridge[0, 0] = 0.0
     return np.asarray(np.linalg.inv(np.linalg.cholesky(moment + ridge)))

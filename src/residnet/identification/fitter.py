@@ -1,4 +1,4 @@
-"""Fitted models, their storage, and the single steps of a fit.
+"""Fitted models, their storage, and the steps of a fit.
 
 The steps are the constant-velocity model, baselines, heads on a baseline, and ensembles.
 """
@@ -243,7 +243,7 @@ def select_by_free_run(
     Args:
         model: model with the part.
         module: baseline or head that the solutions belong to.
-        solutions: at least one; a single one is used without evaluation.
+        solutions: at least one solution; a single solution is used without evaluation.
         score_model: free-run score on validation data; fewer divergences precede a smaller error.
 
     Returns:
@@ -307,7 +307,7 @@ def _find_best_with_neighbours(
 
 @dataclass(frozen=True)
 class HeadFit:
-    """A head in the course of its fit.
+    """A head while it is fitted.
 
     Attributes:
         spec: description of the model.
@@ -327,7 +327,7 @@ class HeadFit:
 
 
 class Fitter:
-    """The single steps of a fit on one set of logs.
+    """The steps of a fit on one set of logs.
 
     Args:
         logs: prepared logs by split; `train` and `validation` are used.

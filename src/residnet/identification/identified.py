@@ -208,7 +208,9 @@ def _make_plant_candidate(data: SimulatedTrials) -> Candidate | None:
 
 
 _DIVERGENCE_CHECKED_SPLITS = ("train", "validation")
-"""Splits in which a divergence excludes a model from the selection; test data must not count."""
+"""Splits in which a divergence excludes a model from the selection, which test data must not
+influence.
+"""
 
 
 def model_family(fitted_model: FittedModel) -> str:
@@ -242,7 +244,7 @@ class IdentifiedModels(Mapping[str, FittedModel]):
         models: fitted models by name.
         velocity_limits: magnitude of the velocities [n] above which a free run has diverged.
         training_logs: logs used in training.
-        validation_in_training: whether they include the validation logs.
+        validation_in_training: whether the training logs include the validation logs.
     """
 
     settings: FitSettings

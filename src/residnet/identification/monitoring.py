@@ -74,9 +74,9 @@ def compute_innovations(
     """Return innovations [B, k] and their derivatives by the size of each change [B, C, k].
 
     Args:
-        model: float64, in evaluation mode.
-        windows: B windows of equal length, with pasts of equal length.
-        changes: C changes.
+        model: model in float64 and evaluation mode.
+        windows: B windows of equal length, whose measured pasts also have equal length.
+        changes: C changes of the vessel, its environment or a sensor.
     """
     y = torch.from_numpy(np.stack([window.y for window in windows]))
     w = torch.from_numpy(np.stack([window.w for window in windows]))
@@ -163,7 +163,7 @@ def make_measured_windows(log: PreparedLog, n_steps: int, n_warmup: int) -> list
     """Return back-to-back windows of a log whose samples are all usable.
 
     Args:
-        log: prepared as those of the fit.
+        log: log, prepared as the logs of the fit.
         n_warmup: samples before a window for the warm-up of a memory; the first windows have none.
     """
     windows = []
@@ -277,8 +277,8 @@ def marginalise(
 
     Args:
         score: scores of Q changes, then of n environment parameters [..., Q + n].
-        information: their information [..., Q + n, Q + n].
-        n_target_changes: Q.
+        information: Fisher information of changes and environment [..., Q + n, Q + n].
+        n_target_changes: number Q of changes whose scores are returned.
         prior_precision: prior precision of the environment parameters [n, n].
     """
     target_information = information[..., :n_target_changes, :n_target_changes]
@@ -359,7 +359,7 @@ A difference of 1 is one standard error. The larger scatter is used because the 
 the clean logs, so that they scatter less than new logs.
 """
 _TINY_INFORMATION = 1e-12
-"""Avoids division by zero information."""
+"""Lower bound of an information in a denominator."""
 _HUBER_CONSTANT = 1.345
 """Tuning constant of the Huber weights in standard deviations; the usual value.
 
@@ -376,7 +376,7 @@ class GroupScores:
     Attributes:
         log_index: log of each group [G].
         score: score of each change [G, Q]; [G, F, Q] with F cross-fitted values.
-        information: their information [G, Q, Q].
+        information: Fisher information of the changes [G, Q, Q].
     """
 
     log_index: np.ndarray
@@ -390,7 +390,7 @@ class GroupScores:
 
     @property
     def diagonal_information(self) -> np.ndarray:
-        """Information about each cause alone [G, Q], never zero."""
+        """Information about the size of each change alone [G, Q], at least a tiny number."""
         return np.diagonal(self.information, axis1=1, axis2=2) + _TINY_INFORMATION
 
     def subtract_bias(self, bias: np.ndarray) -> GroupScores:
@@ -412,7 +412,7 @@ class ScoreDistribution:
     Attributes:
         noise_factor: variance of each score in units of its information [Q].
         size_variance: variance of the apparent sizes of groups [Q].
-        shared_size_variance: part of it that is common to the groups of one log [Q].
+        shared_size_variance: part of `size_variance` that is common to the groups of a log [Q].
         mean_size_variance: variance of the mean size over all clean logs [Q].
         correlation: correlation of the scores of different changes [Q, Q].
         n_groups: number of clean groups.
@@ -535,7 +535,7 @@ def _huber_mean(weighted_sizes: np.ndarray, weights: np.ndarray) -> tuple[np.nda
 
 
 def fit_score_distribution(groups: GroupScores) -> ScoreDistribution:
-    """Return how the scores of groups of clean windows scatter about zero."""
+    """Estimate the distribution of the scores of groups of clean windows about zero."""
     score = groups.score
     diagonal_information = groups.diagonal_information
     n_groups, n_causes = score.shape
@@ -580,8 +580,7 @@ def fit_score_distribution(groups: GroupScores) -> ScoreDistribution:
 def estimate_score_inflation(
     groups: GroupScores, fold_of_group: np.ndarray, groups_per_stretch: int
 ) -> float:
-    """Return the ratio of the scatter of clean segments to the scatter expected from other clean
-    logs.
+    """Return the observed scatter of clean segments, relative to that expected from other logs.
 
     Wind, waves and model errors differ between logs and persist for minutes. The expected scatter
     of a whole segment is therefore tested by cross-validation over logs.
@@ -623,7 +622,7 @@ def _fit_variance_components(
 
 
 _LOOKS_PER_STRETCH = 3.0
-"""Equivalent number of independent tests while a sliding stretch moves by its own length."""
+"""Equivalent number of independent tests while the sliding tested period moves by its length."""
 _N_FOLDS = 5
 """Number of folds of clean windows for cross-fitted scales."""
 _MIN_GROUPS = 5
@@ -899,7 +898,7 @@ class ChangeDetector:
         return [*self.hypotheses, *self.nuisance_changes]
 
     def group_windows(self, windows: Sequence[MeasuredWindow]) -> list[Sequence[MeasuredWindow]]:
-        """Return the windows of a log in groups whose wind and current are taken to be constant."""
+        """Divide the windows of a log into groups in which wind and current count as constant."""
         windows_per_group = max(round(self.config.group / self.config.window), 1)
         return [
             windows[first : first + windows_per_group]
@@ -964,7 +963,7 @@ class ChangeDetector:
         innovations_and_effects: Sequence[_InnovationsAndEffects],
         bias_by_look: Sequence[np.ndarray],
     ) -> ScoreSums:
-        """Return the sums of the same windows as a whole and in parts."""
+        """Return the score sums of windows, evaluated as a whole and in parts."""
         corrected_innovations = [
             (innovation - self.expected_innovations(effects, model_bias), effects)
             for (innovation, effects), model_bias in zip(

@@ -60,7 +60,7 @@ def sensitivity_information(
 
     Args:
         model: a baseline without a head.
-        runs: states [T + 1, 3 + n] and inputs held over each step [T, m] of R runs.
+        runs: states [T + 1, 3 + n] of R runs, and the inputs of each step [T, m].
         horizon: steps of the free runs of a refit.
         scales: scales of the velocities [n].
     """
@@ -87,7 +87,7 @@ def sensitivity_information(
 def update_covariance(covariance: Tensor, information: Tensor) -> Tensor:
     """Return the covariance [P, P] after data with Fisher information [P, P].
 
-    Parameters with zero covariance keep it.
+    The covariance of a parameter that is zero remains zero.
     """
     # P (I + J P)^-1 equals (P^-1 + J)^-1 and also holds for a singular P
     identity = torch.eye(len(covariance), dtype=covariance.dtype)

@@ -64,7 +64,7 @@ class TrainingDataSummary:
         median_segment_duration: half of the training samples are in gap-free segments of at least
             this duration, s.
         n_samples: number of training samples.
-        roll_time_per_radian: natural period of roll over 2 pi, s; infinite without roll.
+        roll_time_per_radian: natural period of roll divided by 2 pi, s; infinite without roll.
         asymmetric_pairs: pairs of inputs whose effects are not mirror images of each other; with
             any of them, models and training windows are not mirrored.
     """
@@ -228,7 +228,7 @@ def make_hull_terms(data_summary: TrainingDataSummary) -> list[str] | dict[str, 
 
 
 def make_full_hull_terms(data_summary: TrainingDataSummary) -> list[str]:
-    """Return the terms of a hull for long logs."""
+    """Return the terms of `make_hull_terms` for long logs: all terms in all axes."""
     _, rudders, propellers = _classify_inputs(data_summary)
     additional_terms = ["wind_mag r", "wind_u r"] if data_summary.has_wind else []
     additional_terms += [
@@ -261,7 +261,7 @@ def _classify_inputs(data_summary: TrainingDataSummary) -> tuple[list[str], list
 
 
 def _all_terms(data_summary: TrainingDataSummary) -> list[str]:
-    """Return the terms of all axes together.
+    """Return the terms of a hull, without distinguishing axes.
 
     An azimuth thruster has forces ahead and to the side; its thrust decreases with the inflow.
     """

@@ -27,7 +27,7 @@ class CoefficientRow(OpenRecord):
         axis: name of the acceleration.
         term: the regressor.
         value: the coefficient.
-        standard_error: its standard error; zero for an exact value.
+        standard_error: standard error of the coefficient; zero for an exact value.
     """
 
     axis: str
@@ -190,7 +190,8 @@ class FitNotes(FileRecord):
         undetermined_parameters: axis and term of the parameters that the data do not determine.
         steady_states: for each velocity and force, its mean in every manoeuvre with constant
             inputs, over the part in which the motion is steady.
-        steady_constraints: by the name of a velocity: its relation to the force that drives it.
+        steady_constraints: relation of each velocity to the force that drives it, by the name of
+            the velocity.
     """
 
     model_config = ConfigDict(extra="allow")

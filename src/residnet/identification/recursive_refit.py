@@ -39,7 +39,7 @@ from residnet.identification.monitoring import (
 from residnet.training.refit import require_parametric_baseline
 
 _MAX_CHANGES = 3
-"""Largest number of changes in one refit: the sizes of more cannot be told apart."""
+"""Largest number of changes in one refit: the sizes of more changes are not identifiable."""
 _DIRECTION_RIDGE = 1e-6
 """Ridge of the least squares for a direction, relative to the information of each parameter."""
 _MIN_EXPRESSED_SHARE = 0.7
@@ -206,8 +206,8 @@ def _parameter_direction(
 ) -> tuple[Tensor, float]:
     """Return the derivative of the free parameters [P] by the size of a change.
 
-    It is found by least squares on the accelerations of the change. The share of the accelerations
-    that the parameters explain is returned too.
+    It is the least-squares solution for the accelerations of the change. The second result is the
+    fraction of these accelerations that the parameters explain.
     """
     windows = [window for _, group in indexed_groups for window in group]
     states = torch.from_numpy(np.concatenate([window.y[:-1] for window in windows]))

@@ -1,4 +1,4 @@
-"""Settings of an identification: everything but where logs come from and where results go."""
+"""Settings of an identification, without the source of the logs and the run folder."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ModelPartsConfig(Config):
     """The models of a fit.
 
     Attributes:
-        baseline: the known part; required without a recipe.
+        baseline: physical part of the models; required without a recipe.
         baselines: further baselines by name, which heads may use.
         refit: baselines (by name, `baseline` for the first) whose coefficients are refitted through
             rollouts after least squares.

@@ -100,15 +100,17 @@ class LinearLaw(AnglePolicy):
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the initial memory: filters at the measured values, integral zero."""
-        measured = x[:, [self.psi, self.r]]
+        measured = x[:, [self.psi_column, self.r_column]]
         return torch.cat((torch.zeros_like(measured[:, :1]), measured), dim=1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         # exact step of the filter; a time constant of zero gives the factor 1, no filter
         filter_factor = 1.0 - torch.exp(-self.dt / self.lag.clamp(min=1e-6))
         # the difference is wrapped, so that the filter does not turn the long way round at +-pi
-        heading = s[:, 1:2] + filter_factor * wrap_angle(x[:, self.psi : self.psi + 1] - s[:, 1:2])
-        rate = s[:, 2:3] + filter_factor * (x[:, self.r : self.r + 1] - s[:, 2:3])
+        measured_heading = x[:, self.psi_column : self.psi_column + 1]
+        measured_rate = x[:, self.r_column : self.r_column + 1]
+        heading = s[:, 1:2] + filter_factor * wrap_angle(measured_heading - s[:, 1:2])
+        rate = s[:, 2:3] + filter_factor * (measured_rate - s[:, 2:3])
         error = wrap_angle(reference - heading)
         integral = s[:, 0:1]
         unlimited_command = self.kp * error - self.kd * rate + self.ki * integral
