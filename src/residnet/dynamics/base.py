@@ -138,7 +138,7 @@ class Dynamics(nn.Module, ABC):
         Args:
             rotation: change of the state since the start of the step [B, nx]; its attitude columns
                 are a rotation vector.
-            derivative: of the state after that change [B, nx].
+            derivative: derivative of the state after that change [B, nx].
         """
         vector = rotation.index_select(-1, self.attitude)
         angular_velocity = derivative.index_select(-1, self.attitude)
@@ -148,7 +148,7 @@ class Dynamics(nn.Module, ABC):
         return both_derivatives.index_select(-1, self.columns_with_attitude)
 
     def integrate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return the state one step later [B, nx]; arguments as of `state_derivative`."""
+        """Integrate over one step and return the state [B, nx]; arguments as `state_derivative`."""
         return self.integrate_from_derivative(self.state_derivative(x, p, rho), x, p, rho)
 
     def add_change(self, x: Tensor, change: Tensor) -> Tensor:

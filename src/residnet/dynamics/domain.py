@@ -1,8 +1,8 @@
 """Operating domain of a model: relations between inputs, and the density of states and inputs.
 
 A range for each channel is a box. Logs fill only a part of it: an input that was held, two
-propellers that ran alike, a rudder that a controller set from the heading. The operating domain
-adds to the ranges:
+propellers that ran at equal speeds, a rudder that a controller set from the heading. The operating
+domain adds to the ranges:
 
 - **relations**: an unexcited input has its value in the logs, or its relation to other inputs; an
   input of a controller has its relation to the heading and the velocities;
@@ -44,7 +44,7 @@ class DomainCheck(nn.Module):
         domain: the domain.
         state_names: names of the columns of states, the heading third.
         input_names: names of the columns of inputs.
-        dtype: of the numbers.
+        dtype: precision of the tables and of the inputs.
     """
 
     def __init__(

@@ -37,13 +37,13 @@ class InnovationFilter(nn.Module):
     a turn.
 
     Args:
-        time_constant: in s.
-        dt: step in s.
+        time_constant: time constant of the filter in s.
+        dt: time step in s.
         dof: the n dynamic states. An angle whose derivative is known has no innovation.
 
     Attributes:
-        size: entries of the memory: whether there is a prediction, the predicted dynamic states,
-            and the filtered innovation.
+        size: number of entries of the memory: whether there is a prediction, the predicted dynamic
+            states, and the filtered innovation.
     """
 
     def __init__(self, time_constant: float, dt: float, dof: DegreesOfFreedom) -> None:
@@ -284,7 +284,7 @@ class HybridDynamics(Dynamics):
 
         Args:
             x: states [B, 3 + n].
-            z: their channels [B, nz], which the first stage reuses.
+            z: channels at these states [B, nz], which the first stage reuses.
             p: result of `signals.prepare` for the inputs of the step.
             rho: residual of the step [B, n].
         """

@@ -40,10 +40,10 @@ class BandTable(Config):
     Attributes:
         level: nominal coverage of the intervals.
         steps: horizons as numbers of steps, from 1 on, ascending.
-        u: half widths in m/s.
-        v: half widths in m/s.
-        r: half widths in rad/s.
-        heading: half widths in rad.
+        u: half widths of the surge velocity in m/s.
+        v: half widths of the sway velocity in m/s.
+        r: half widths of the yaw rate in rad/s.
+        heading: half widths of the heading in rad.
         position: radii about the predicted position in m.
         p: half widths in rad/s; None without roll.
         phi: half widths in rad; None without roll.

@@ -48,9 +48,7 @@ Attempt = TypeVar("Attempt")
 
 
 class RoundingError(ExportError):
-    """The exported file differs from the model only by rounding, which is amplified along the
-    run.
-    """
+    """The exported file differs from the model by rounding errors, which grow along the run."""
 
 
 class LoadedExport(ABC):

@@ -41,7 +41,7 @@ _MAX_SCALAR_OPERATIONS: Final = 1100
 
 
 def expand_if_small(function: ca.Function) -> ca.Function:
-    """Return a function of single numbers where it is small; networks keep their matrices."""
+    """Expand a small function into scalar operations; networks keep their matrices."""
     n_operations = 0
     for k in range(function.n_instructions()):
         if function.instruction_id(k) == ca.OP_MTIMES:
@@ -70,12 +70,12 @@ _C_HEADERS: Final = frozenset(
 
 
 def file_prefix(file: Path) -> str:
-    """Return what all names of a C file begin with: the file's name as an identifier.
+    """Return the prefix of all names in a C file: the stem of the file as a C identifier.
 
     Two exports with different file names can then be linked into one program.
 
     Raises:
-        UsageError: where the header would hide one of the C library.
+        UsageError: if the header would hide a header of the C library.
     """
     if file.stem.lower() in _C_HEADERS:
         raise UsageError(
@@ -91,8 +91,8 @@ class CFunction:
 
     Attributes:
         name: name without the prefix of the file.
-        comment: its comment in the header.
-        function: what it does.
+        comment: comment of the function in the header.
+        function: CasADi function that the C function evaluates.
         flags: Boolean results; the first one is the return value of the C function.
     """
 
@@ -102,7 +102,7 @@ class CFunction:
     flags: Sequence[str] = ()
 
     def render_prototype(self, prefix: str) -> str:
-        """Return the prototype; arguments first, then where the results go."""
+        """Return the prototype: the arguments, then pointers to the results."""
         inputs = [f"const {prefix}_real *{name}" for name in self.function.name_in()]
         outputs = [
             f"{'int' if name in self.flags else f'{prefix}_real'} *{name}"
@@ -113,7 +113,7 @@ class CFunction:
         return f"{return_type} {prefix}_{self.name}({', '.join(inputs + outputs) or 'void'})"
 
     def render_definition(self, prefix: str, tables: Tables) -> str:
-        """Return the function in C."""
+        """Return the definition of the function in C."""
         statement_writer = FunctionWriter(
             expand_if_small(self.function), tables, f"{prefix}_{self.name}"
         )
@@ -220,7 +220,8 @@ def compile_shared_library(
         compiler_path: path of the compiler; empty for the default compiler.
 
     Raises:
-        ExportError: with the compiler's first complaint.
+        ExportError: if the compiler gives an error or a warning; the message contains the first
+            one.
     """
     # all code for Windows is independent of its position, and the flag a warning there
     position_flags = () if library_path.suffix == ".dll" else ("-fPIC",)
@@ -299,8 +300,10 @@ def measure_footprint(source: Path) -> dict[str, Any]:
     }
 
 
-_SPILLED: Final = 32
-"""Single numbers of a function that an estimate puts on the stack; registers hold the others."""
+_MAX_SPILLED_SCALARS: Final = 32
+"""Maximum number of scalar variables that the estimate places on the stack; the other scalars are
+assumed to be in registers.
+"""
 
 
 def function_bodies(text: str) -> dict[str, str]:
@@ -310,24 +313,24 @@ def function_bodies(text: str) -> dict[str, str]:
 
 
 def estimated_stack(body: str) -> int:
-    """Return an estimate of the bytes of stack that the body of a function takes."""
-    locals_ = re.findall(r"^\s*(?:const )?(?:REAL|int|size_t|\w+_real) ([^=;(]+)", body, re.M)
-    names = [name for declared in locals_ for name in declared.split(",")]
+    """Estimate the stack in bytes that the body of a function needs."""
+    declarations = re.findall(r"^\s*(?:const )?(?:REAL|int|size_t|\w+_real) ([^=;(]+)", body, re.M)
+    names = [name for declaration in declarations for name in declaration.split(",")]
     arrays = [re.findall(r"\[(\d+)\]", name) for name in names]
     sizes = [math.prod(map(int, size)) for size in arrays if size]
-    # a compiler holds few single numbers in memory at a time, however many there are in the source
-    single = min(len(names) - len(sizes), _SPILLED)
+    # a compiler keeps few scalars in memory at a time, however many the source has
+    n_scalars = min(len(names) - len(sizes), _MAX_SPILLED_SCALARS)
     # 64 bytes for the return address and saved registers
-    return 64 + 8 * (sum(sizes) + single)
+    return 64 + 8 * (sum(sizes) + n_scalars)
 
 
 def estimated_code(text: str) -> int:
-    """Return an estimate of the bytes of code and constants of a C file."""
+    """Estimate the size in bytes of the code and the constants of a C file."""
     return 4 * len(re.findall(r"[-+*/=<>(]|\b\d[\w.]*", text))
 
 
 def deepest_stack(stack: Mapping[str, int], bodies: Mapping[str, str]) -> int:
-    """Return the most bytes of stack of a call with all calls within the file that it makes."""
+    """Return the stack in bytes of the deepest call chain within the file."""
 
     def depth(name: str) -> int:
         called = set(re.findall(r"\b(\w+)\(", bodies.get(name, ""))) & (stack.keys() - {name})
@@ -466,7 +469,7 @@ def generate_c_source(
 
 
 def _render_vessel_functions(prefix: str, exported: ExportedVessel) -> list[tuple[str, str, str]]:
-    """Return comment, prototype and body of the memory's functions and of the band."""
+    """Return comment, prototype and body of the functions of the memory and of the band."""
     prefix_upper = prefix.upper()
     real_type = f"{prefix}_real"
     has_memory = exported.model.n_state > 0
@@ -579,7 +582,7 @@ class CExporter(Exporter):
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
         """Write source, header and card, checked in single and in double precision.
 
-        Where single precision does not determine the track, the file is in double precision alone.
+        If rounding in single precision changes the track, the file has double precision only.
         """
         exported.require_finite_numbers()
         # a header that is asked for names the pair
@@ -630,7 +633,7 @@ class CExporter(Exporter):
 
 
 class CasadiModel(LoadedExport):
-    """A written function, loaded back."""
+    """A CasADi function that was written to a file and loaded again."""
 
     def __init__(self, file: Path) -> None:
         self.function: Any = ca.Function.load(str(file))

@@ -44,7 +44,7 @@ _EDGE_SHARE = 0.05
 class BelievedForce(nn.Module):
     """The force [B, 3] of a motion according to the baseline: M (nu_dot - nu_dot_0), SI.
 
-    nu_dot_0 is its acceleration without forces.
+    nu_dot_0 is the acceleration of the baseline without actuator forces.
     """
 
     def __init__(self, baseline: nn.Module, mass: Tensor) -> None:

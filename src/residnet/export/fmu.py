@@ -39,8 +39,8 @@ _VALUE_REFERENCES = (
     ("states", "", 101, "output"),
     ("states", "_start", 201, "parameter"),
 )
-"""Entries of the card, what follows their names, first value reference, and causality;
-`instance.h` counts in the same way.
+"""Entry of the card, suffix of the variable names, first value reference, and causality. The value
+references are the same in `instance.h`.
 """
 LIBRARY_NAME = "model"
 
@@ -130,9 +130,9 @@ class FmuExporter(Exporter):
 
 
 _LIBRARY_SUFFIX = {"win32": ".dll", "darwin": ".dylib"}
-"""Of libraries, by the system; `.so` elsewhere."""
+"""Suffix of a shared library by operating system; `.so` for the others."""
 _CROSS_COMPILERS = (("x86_64-w64-mingw32-gcc", "win64", ".dll"),)
-"""Compilers for other machines as Linux distributions name them, the platform, and its suffix.
+"""Cross-compilers of Linux distributions: command, platform in FMI 2.0, suffix of a library.
 
 FMI 2.0 has no name for 64-bit ARM.
 """
@@ -147,7 +147,7 @@ def _read_packaged_file(name: str) -> str:
 
 
 def _platform_name() -> str:
-    """Return this machine as FMI 2.0 names it.
+    """Return the name of the platform of this machine in FMI 2.0.
 
     Raises:
         ExportError: if FMI 2.0 has no name for it.

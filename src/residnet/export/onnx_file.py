@@ -30,11 +30,13 @@ from residnet.export.base import (
 )
 
 _TOLERANCES = {torch.float32: SINGLE_TOLERANCE, torch.float64: 1e-7}
-"""Largest share of a range; onnxruntime computes sines of doubles to thirteen digits."""
+"""Largest difference relative to the range of a channel in each precision; onnxruntime computes
+sines of doubles to thirteen digits only.
+"""
 
 
 class _NonEmptyStep(nn.Module):
-    """A step without the arguments and results in which there is nothing, which ONNX refuses."""
+    """A step without its empty arguments and results, which ONNX does not support."""
 
     def __init__(self, exported: Exportable, dtype: torch.dtype) -> None:
         super().__init__()
@@ -54,7 +56,7 @@ class _NonEmptyStep(nn.Module):
 
 
 def _non_empty_results(exported: Exportable) -> list[str]:
-    """Return the names of the results in which there is something."""
+    """Return the names of the results that are not empty."""
     has_empty_argument = any(n_entries == 0 for _, n_entries in exported.arguments)
     return [name for name in exported.results if not (has_empty_argument and name == "s_after")]
 
@@ -100,7 +102,7 @@ class OnnxExporter(Exporter):
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
         """Write the graph, its card under the key `card` of the metadata.
 
-        It is in float64 where float32 does not determine the track.
+        It is in float64 if rounding in float32 changes the track.
         """
         for package in ("onnx", "onnxscript", "onnxruntime"):
             require_package(package, "format onnx", "export")
@@ -159,7 +161,7 @@ def _write_graph(exported: Exportable, file: Path, dtype: torch.dtype) -> None:
     """Write the graph.
 
     Raises:
-        ExportError: where torch cannot express the step in ONNX.
+        ExportError: if torch cannot express the step in ONNX.
     """
     inputs = [(name, n_entries) for name, n_entries in exported.arguments if n_entries]
     dynamic_rows = {0: torch.export.Dim("rows", min=1)}

@@ -45,8 +45,9 @@ class VesselCoefficients:
         mass: M [3, 3], rigid body and added mass together.
         linear: D [3, 3].
         quadratic: D_n [3, 3], coefficients of |nu| nu.
-        left_out: share of the force of the baseline that is not represented, by axis.
-        terms_left_out: terms of the baseline that are not in the form, by axis.
+        left_out: fraction of the force of the baseline that these matrices do not represent, by
+            axis.
+        terms_left_out: terms of the baseline that these matrices do not contain, by axis.
     """
 
     mass: Matrix
@@ -135,7 +136,7 @@ def _baseline_terms(spec: ModelSpec, model: HybridDynamics) -> tuple[Matrix, lis
 
 
 def _unplaced_terms(theta: Matrix, terms: list[str]) -> dict[str, list[str]]:
-    """Return the terms of each axis that are neither damping, Coriolis force nor a force."""
+    """Return the terms of each axis that are neither damping, Coriolis force nor actuator force."""
     damping_terms = {f"{name}" for name in VELOCITY_NAMES} | {
         f"{name}|{name}|" for name in VELOCITY_NAMES
     }

@@ -216,7 +216,7 @@ def _serialise(scripted: Any, card: Mapping[str, Any] | None = None) -> bytes:
 
 
 class AotiModel(LoadedExport):
-    """A compiled package, loaded back."""
+    """A compiled package that was written to a file and loaded again."""
 
     def __init__(self, file: Path, dtype: torch.dtype = torch.float32) -> None:
         self.package: Any = torch._inductor.aoti_load_package(str(file))

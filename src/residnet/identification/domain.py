@@ -25,12 +25,13 @@ from residnet.quality.feedback import InputFeedback, cross_validated_r2, detect_
 _LIMIT_LEVEL: Final = 0.993
 """Share of the samples of held-out logs within the limit of the density."""
 _RIDGE: Final = 1e-4
-"""Second moment added to each monomial: channels with less than 1 % of their scale in a direction
-count as if they had this much."""
+"""Second moment that is added to that of each monomial. Channels that vary by less than 1 % of
+their scale in a direction count as if they varied by 1 %.
+"""
 _MAX_SAMPLES_PER_LOG: Final = 20_000
 _MAX_FOLDS: Final = 10
 _MIN_LOGS: Final = 3
-"""Logs below which parts of logs are held out instead."""
+"""Number of logs below which parts of logs, not complete logs, are held out."""
 _HELD_TOLERANCE: Final = 0.02
 """Tolerance of a held input, as a share of its magnitude, and of a proportional input, as a share
 of its range."""

@@ -60,7 +60,7 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
 
 
 def _report_sources(logs: Sequence[PreparedLog]) -> None:
-    """Write to the log of the run which channels were not measured, and where spikes were removed."""
+    """Report which channels were not measured, and where spikes were removed."""
     for key, source_text in (
         ("smoothed", "are estimated by a smoother from the measured motion"),
         (

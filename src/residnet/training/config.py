@@ -17,8 +17,8 @@ def cosine_learning_rate(rate: float, final: float, epoch: int, epochs: int) -> 
 
     Args:
         rate: learning rate of the first epoch.
-        final: learning rate of the last epoch as a share of `rate`.
-        epoch: index of the epoch, from 0 on.
+        final: learning rate of the last epoch as a fraction of `rate`.
+        epoch: index of the epoch, starting at 0.
         epochs: number of epochs.
     """
     progress = 0.5 * (1 - math.cos(math.pi * epoch / max(epochs - 1, 1)))
@@ -31,7 +31,7 @@ class OneStage(Config):
     Attributes:
         epochs: maximum number of epochs.
         learning_rate: learning rate of Adam in the first epoch.
-        final: learning rate of the last epoch as a share of `learning_rate`.
+        final: learning rate of the last epoch as a fraction of `learning_rate`.
         gradient_clip: largest norm of the gradient.
         patience: number of successive validations without improvement after which training stops.
         validate_every: number of epochs between validations.
@@ -121,7 +121,7 @@ class OneStep(Config):
             from the loss.
         batch: number of windows per batch.
         learning_rate: initial learning rate of AdamW; it decreases along a cosine.
-        final: learning rate at the end of the stage as a share of `learning_rate`.
+        final: learning rate at the end of the stage as a fraction of `learning_rate`.
     """
 
     epochs: int = Field(default=10, ge=0, le=100_000)
@@ -148,7 +148,7 @@ class MultiStep(Config):
         epochs: number of epochs of `steps` batches each.
         batch: number of rollouts per batch.
         learning_rate: initial learning rate of AdamW; it decreases along a cosine.
-        final: learning rate at the end of the stage as a share of `learning_rate`.
+        final: learning rate at the end of the stage as a fraction of `learning_rate`.
     """
 
     horizon: Seconds = Field(gt=0)

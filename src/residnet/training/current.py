@@ -53,7 +53,7 @@ def estimate_currents(
         signals: signals of the logs.
         logs: L logs that are fitted.
         config: settings of the prior of currents.
-        others: K logs that the coefficients are not fitted on.
+        others: K logs whose currents are estimated with the coefficients of the other logs.
 
     Raises:
         FitError: if a log has no trainable sample, or the logs do not determine their currents.
@@ -64,10 +64,10 @@ def estimate_currents(
                 f"log {log.log.name}: no trainable sample to estimate its current from; remove it"
             )
     precision = config.spread**-2
-    # all samples give the currents
+    # the currents are estimated from all samples
     problem = _CurrentProblem(baseline, signals, logs, precision)
     current, error, theta = _estimate(problem, config)
-    # the two halves of each log give the Birge ratio, by which standard errors are too small
+    # the halves of each log give the Birge ratio, the factor by which standard errors are too small
     halves = []
     for log in logs:
         middle = np.flatnonzero(log.trainable)[log.trainable.sum() // 2]
@@ -78,7 +78,7 @@ def estimate_currents(
     variance_ratio = (first - second).square() / half_error.reshape(-1, 2, 2).square().sum(1)
     birge_ratio = max(float(variance_ratio.mean().sqrt()), 1.0)
     if others:
-        # logs that are not fitted: their currents at the coefficients of the fitted ones
+        # currents of the logs that are not fitted, with the coefficients of the fitted logs
         other_problem = replace(problem, logs=others, theta=theta)
         other_current, other_error, _ = _estimate(other_problem, config)
         current = torch.cat((current, other_current))
@@ -137,7 +137,7 @@ def through_water(log: PreparedLog, current: np.ndarray, signals: Signals) -> Pr
 
     Args:
         log: log over ground.
-        current: to the north and to the east [2], m/s.
+        current: components of the current to the north and to the east [2], m/s.
         signals: signals of the model.
     """
     psi = log.y[:, HEADING]
@@ -204,7 +204,7 @@ class _CurrentProblem:
     """The regression of accelerations on the motion through the water.
 
     Attributes:
-        baseline: its library gives the regressors.
+        baseline: baseline whose term library computes the regressors.
         signals: signals of the logs.
         logs: L logs over ground.
         precision: prior precision of each component of a current.

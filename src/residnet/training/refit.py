@@ -31,14 +31,24 @@ from residnet.regression.least_squares import DescentResult, minimize_levenberg_
 if TYPE_CHECKING:
     from residnet.training.refit_config import RefitConfig
 
-_ROWS_PER_BATCH = 1_024  # Jacobians held in memory at once
-_REGULARISATION = 1e-8  # of a parameter's own information: keeps the Hessian definite
-_MIN_NOISE = 1e-9  # SI, for channels that show none
-_MIN_GAIN = 2e-4  # relative decrease of the cost below which the search stops
-_SIGN_ROUNDS = 8  # times that terms of the wrong sign are fixed at zero
-_UNIDENTIFIABLE = 0.5  # share of a parameter's information that is the prior's
-_DIVERGED = 1e3  # error in scales beyond which a free run gives no search direction
-_RUNS_PER_FIT = 10  # about; decides whether compiling the rollout pays
+_ROWS_PER_BATCH = 1_024
+"""Maximum number of Jacobians in memory at a time."""
+_REGULARISATION = 1e-8
+"""Regularisation relative to the information of each parameter; it keeps the Hessian definite."""
+_MIN_NOISE = 1e-9
+"""Smallest noise of an initial velocity, SI, for channels without visible noise."""
+_MIN_GAIN = 2e-4
+"""Relative decrease of the cost below which the search stops."""
+_SIGN_ROUNDS = 8
+"""Maximum number of rounds in which terms of the wrong sign are fixed at zero."""
+_UNIDENTIFIABLE = 0.5
+"""Fraction of the information about a parameter that comes from the prior, above which the
+parameter counts as not identifiable.
+"""
+_DIVERGED = 1e3
+"""Error, in units of the scales, above which a free run gives no search direction."""
+_RUNS_PER_FIT = 10
+"""Typical number of simulations of a refit, which decides whether compiling the rollout pays."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +87,7 @@ class Problem:
         x0: initial states [B, 3 + n].
         inputs: inputs, constant over each step [B, T, m].
         measured: measured velocities after each step [B, T, n].
-        weight: 1/scale, or 0 for invalid samples [B, T, n].
+        weight: 1 / scale of each velocity; 0 for invalid samples [B, T, n].
         free: indices of the free parameters in theta [P].
         precision, prior_mean: precision [P, P] and mean [P] of the least-squares prior.
         regularisation: part of `precision` that does not depend on the data [P, P].
@@ -303,9 +313,17 @@ def normal_equations(
 
 
 class _Iterate(NamedTuple):
-    theta: Tensor  # free parameters [P]
+    """A point of the Gauss-Newton search.
+
+    Attributes:
+        theta: free parameters [P].
+        cost: cost at these parameters.
+        states: states of the free runs with these parameters [B, T + 1, 3 + n].
+    """
+
+    theta: Tensor
     cost: Tensor
-    states: Tensor  # of the free runs with them [B, T + 1, 3 + n]
+    states: Tensor
 
 
 def _gauss_newton(
