@@ -14,7 +14,7 @@ class MainFigure(Record):
 
     Attributes:
         value: the number; None if it is not finite.
-        unit: its unit; `-` for a dimensionless number.
+        unit: unit of the value; `-` for a dimensionless number.
     """
 
     value: float | None

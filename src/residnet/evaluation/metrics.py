@@ -592,7 +592,7 @@ class ProtocolEvaluation:
         ]
 
     def compare_with_references(self) -> dict[str, dict[str, PairedDifference | None]]:
-        """Return paired differences of each model to constant velocity and to the first
+        """Return paired differences of each model from constant velocity and to the first
         baseline.
         """
         all_windows = np.ones(len(self.log_indices), dtype=bool)

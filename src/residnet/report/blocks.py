@@ -20,15 +20,17 @@ CellMark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
 _PAGE_WIDTH = 700.0
 _LETTER_WIDTH = 5.8
 _CELL_PADDING = 6.0
-"""Pixels: text width of an A4 page, width of a bold letter in a table, padding of a cell."""
+"""Text width of an A4 page, width of a bold letter in a table, and padding of a cell, in pixels."""
 
 
 _MIN_WIDE_COLUMNS = 6
-"""Columns of a table that half of a page, 34 rem, no longer holds at 5 to 6 rem each."""
+"""Number of columns from which a table needs the full width of a page: half of a page is 34 rem,
+and a column 5 to 6 rem wide.
+"""
 
 
 class Block(Protocol):
-    """A part of a section, drawn by the template macro that bears its `kind`."""
+    """A part of a section, drawn by the template macro whose name is its `kind`."""
 
     kind: ClassVar[str]
 
@@ -39,7 +41,7 @@ class Text:
 
     Attributes:
         paragraphs: one string or several.
-        is_secondary: printed in grey, for explanations that most readers skip.
+        is_secondary: whether the text is grey, for explanations that most readers skip.
     """
 
     kind: ClassVar[str] = "text"
@@ -59,7 +61,8 @@ class Bullets:
 
     Attributes:
         items: one string for each entry.
-        is_warning: highlighted; for facts that a reader must know before using a result.
+        is_warning: whether the list is highlighted, for facts that a reader must know before using
+            a result.
     """
 
     kind: ClassVar[str] = "bullets"
@@ -73,8 +76,8 @@ class Facts:
 
     Attributes:
         pairs: (name, text); the text of a check may be marked as failed by `failed`.
-        failed: names that are set off by colour.
-        is_code: names and texts are printed as code (file names and checksums).
+        failed: names that are highlighted by colour.
+        is_code: whether names and texts are printed as code (file names and checksums).
     """
 
     kind: ClassVar[str] = "facts"
@@ -88,8 +91,8 @@ class Code:
     """Verbatim text in a fixed-width font.
 
     Attributes:
-        text: with its line breaks.
-        wraps_lines: long lines break at spaces instead of scrolling sideways.
+        text: the text with its line breaks.
+        wraps_lines: whether long lines break at spaces instead of scrolling sideways.
     """
 
     kind: ClassVar[str] = "code"
@@ -103,7 +106,7 @@ class Cell:
 
     Attributes:
         text: a formatted number or a few words.
-        note: small print below it.
+        note: small text below the cell.
         mark: `bad`, `best` or `weak` colour the cell; `text` aligns it to the left and lets it
             wrap.
         si: the number in SI units, shown as a tooltip if the cell uses another unit.
@@ -120,10 +123,10 @@ class Row:
     """One line of a table.
 
     Attributes:
-        label: its first cell.
-        cells: the others, in the order of the columns.
-        has_rule: a line is drawn above it, where a group of rows begins.
-        is_selected: it is set off as the one that was chosen.
+        label: text of the first cell.
+        cells: the other cells, in the order of the columns.
+        has_rule: whether a line is drawn above the row, at the start of a group of rows.
+        is_selected: whether the row is highlighted as the selected one.
     """
 
     label: str
@@ -140,12 +143,13 @@ class Table:
     def __init__(
         self, columns: Sequence[str], caption: str = "", groups: Sequence[tuple[str, int]] = ()
     ) -> None:
-        """Make a table without rows.
+        """Create a table without rows.
 
         Args:
             columns: titles with units, the first above the row labels.
             caption: a sentence above the table.
-            groups: titles that span several columns after the first, with how many they span.
+            groups: titles that span several columns after the first, and the number of columns of
+                each.
         """
         self.columns = list(columns)
         self.caption = caption
@@ -236,7 +240,7 @@ class Table:
         group_titles = [" " * widths[0]]
         start = 1
         for title, count in self.groups:
-            # a group is as wide as its columns and the gaps between them
+            # the width of a group is that of its columns and the gaps between them
             width = sum(widths[start : start + count]) + 2 * (count - 1)
             widths[start] += max(len(title) - width, 0)
             group_titles.append(f"{title:^{width}}")
@@ -329,7 +333,7 @@ def _get_nested(row: object, keys: str) -> object:
 
 
 def format_paired_interval(bounds: Sequence[float] | None, absent_text: str = DASH) -> Cell:
-    """Return the interval of a difference, set off where it excludes zero."""
+    """Return the cell of the interval of a difference, highlighted if it excludes zero."""
     if not bounds:
         return Cell(absent_text)
     text = " to ".join(map(format_signed, bounds))
@@ -337,7 +341,7 @@ def format_paired_interval(bounds: Sequence[float] | None, absent_text: str = DA
 
 
 def flag_cell(text: object, is_flagged: object) -> Cell:
-    """Return a cell that is set off where something is wrong."""
+    """Return a cell that is highlighted as bad if `is_flagged`."""
     return Cell(str(text), mark="bad" if is_flagged else "")
 
 
@@ -363,7 +367,7 @@ class Section:
 
     @property
     def present_blocks(self) -> list[Block]:
-        """Return the blocks that are there; a section may be handed None for an absent part."""
+        """Return the blocks that are not None; None stands for a part that a run does not have."""
         return [block for block in self.blocks if block is not None]
 
     @property

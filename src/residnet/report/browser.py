@@ -1,4 +1,7 @@
-"""Figures drawn with Bokeh: the parts of a page, and the data of their cases for its own script."""
+"""Interactive figures with Bokeh: panels of a page, and the data of their cases as JSON.
+
+The script of the page (`templates/explorer.js`) fills in the data of the selected case.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +24,20 @@ if TYPE_CHECKING:
 _FONT = "12px"
 _LETTER_WIDTH = 6.5
 _MIN_PANEL_WIDTH = 260.0
-"""Pixels of a letter of that font, and between the axes of a panel on a phone."""
+"""Font of texts, width of a letter in this font, and minimum width of the area between the axes of
+a panel (on a phone), in pixels.
+"""
 _DASHES: dict[str, Any] = {"long": [10, 4], "short": [4, 3], "dense": [8, 3, 2, 3, 2, 3]}
 _MARKERS = {"o": "circle", "s": "square", "x": "x", "^": "triangle"}
 
 
 @dataclass(frozen=True)
 class InteractiveFigures:
-    """What a page holds of its interactive figures.
+    """The interactive figures of a page.
 
     Attributes:
-        figures: each figure's panels and cases as JSON, curves in base 64, by its key.
-        library: BokehJS itself, so that the page loads nothing.
+        figures: panels and cases of each figure as JSON, with curves in base 64, by `html_id`.
+        library: code of BokehJS, so that the page loads no other files.
     """
 
     figures: dict[str, str]
@@ -63,7 +68,7 @@ def _build_canvases(figure: Figure) -> list[Canvas]:
     cursor = Span(dimension="height", line_dash="dotted", line_width=1)
     canvases = []
     for number, panel in enumerate(figure.panels):
-        # the page's own script fills in the first case: its values are there once
+        # the script of the page fills in the first case, so that its values are stored only once
         columns: dict[str, Any] = {
             name: [] for name in _panel_columns(figure, figure.cases[0], number)
         }
@@ -77,7 +82,7 @@ def _build_canvases(figure: Figure) -> list[Canvas]:
 
 
 def _axis_range(limits: Sequence[float]) -> Any:
-    """Return what an axis shows: given limits, else all that is switched on."""
+    """Return the range of an axis: the given limits, or those of all visible curves."""
     from bokeh.models import DataRange1d, Range1d
 
     return Range1d(start=limits[0], end=limits[1]) if limits else DataRange1d(only_visible=True)
@@ -112,7 +117,7 @@ def _build_canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataS
         _build_renderer(name, figure.styles[name], source) for name in figure.curve_names(number)
     ]
     canvas.renderers.extend(renderers)
-    # where places bear names, the name alone says what a mark is
+    # with named positions on an axis the name of a point identifies it
     shows_values = panel.kind == "curves" and not panel.y_names
     tooltips: Any = [("$name", "@$name{0.000 a}")] if shows_values else [("", "$name")]
     hover = models.HoverTool(
@@ -160,7 +165,7 @@ def _build_canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataS
 
 
 def _build_renderer(name: str, style: GlyphStyle, source: ColumnDataSource) -> Any:
-    """Return the renderer of what bears a name, added to nothing yet."""
+    """Return the Bokeh renderer of a named curve; the caller adds it to a panel."""
     from bokeh import models
     from bokeh.models.renderers import GlyphRenderer
 
@@ -197,7 +202,7 @@ def _build_renderer(name: str, style: GlyphStyle, source: ColumnDataSource) -> A
 
 
 def _panel_columns(figure: Figure, case: Case, panel: int) -> dict[str, np.ndarray]:
-    """Return the columns of a panel's source; shorter curves are filled with gaps."""
+    """Return the columns of the data source of a panel; shorter curves are padded with gaps."""
     traces = case.curves[panel]
     max_length = max((len(x) for x, _ in traces.values()), default=0)
     columns: dict[str, np.ndarray] = {}
@@ -211,7 +216,7 @@ def _panel_columns(figure: Figure, case: Case, panel: int) -> dict[str, np.ndarr
 
 
 def _figure_json(figure: Figure) -> str:
-    """Return a figure as the page's script takes it."""
+    """Return a figure as JSON for the script of the page."""
     from bokeh.document import Document
 
     # models are numbered in their order, so that the same run has the same page

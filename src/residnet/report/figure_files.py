@@ -31,7 +31,7 @@ from residnet.report.still import render_matplotlib, save_png
 
 
 def pack_columns(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return columns as 16-bit numbers with offset and step; equal columns are stored once."""
+    """Encode columns as 16-bit numbers with offset and step; equal columns are stored once."""
     packed_columns: dict[str, Any] = {}
     stored: dict[bytes, str] = {}
     for name, values in columns.items():
@@ -46,7 +46,7 @@ def pack_columns(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
             if finite_values.size
             else (0.0, 0.0)
         )
-        # finer than any screen; the largest number is a gap
+        # finer than any screen; the largest number marks a gap
         step = span / 65_000 if span > 0 else 1.0
         levels = np.full(len(values), 65_535, dtype="<u2")
         levels[finite] = np.round((finite_values - minimum) / step)
@@ -55,7 +55,7 @@ def pack_columns(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def unpack_column(columns: Mapping[str, Any], name: str) -> np.ndarray:
-    """Return one of the columns that `pack_columns` gave, as numbers [T]."""
+    """Decode one of the columns of `pack_columns`, as numbers [T]."""
     packed_column = columns[name]
     minimum, step, text = (
         columns[packed_column] if isinstance(packed_column, str) else packed_column
@@ -100,7 +100,7 @@ _FORMER_KINDS = {"across": "hline", "upright": "vline", "strip": "vspan"}
 
 
 def _pack_curves(panel_curves: Mapping[str, Curve]) -> dict[str, Any]:
-    """Return the curves of a panel with no more samples than a screen shows, packed."""
+    """Encode the curves of a panel, subsampled to the resolution of a screen."""
     columns: dict[str, np.ndarray] = {}
     for name, (x, y) in panel_curves.items():
         curve_parts = split_at_gaps(x, y)
@@ -126,7 +126,7 @@ def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Figure]:
             for file in (path, *previous_figure.static_images) if previous_figure else ():
                 manifest.remove_if_owned(file)
     begin_stage("drawing figures")
-    # the number keeps the order for whoever lists the folder
+    # the number keeps the order in a listing of the folder
     return [
         write_figure(folder, figure, f"{i:02d}_{figure.name}")
         for i, figure in enumerate(figures, start=1)
@@ -137,7 +137,7 @@ def read_figures(folder: Path, names: str = ".*") -> list[Figure]:
     """Read the figures of a folder in file order; unreadable files are skipped.
 
     Args:
-        folder: written by `write_figures`.
+        folder: folder that `write_figures` wrote.
         names: regular expression that the figure name must match.
     """
     read = (_read_figure(path) for path in sorted(folder.glob("*.json")))
@@ -176,7 +176,7 @@ def _read_figure(path: Path) -> Figure | None:
             static_images=[_still_path(path, name) for name in content["stills"]],
         )
     except (UsageError, OSError, ValueError, TypeError, KeyError, AttributeError):
-        # damaged: it is drawn again, or is not one of residnet
+        # a damaged figure is drawn again; other JSON files are no figures of residnet
         return None
 
 

@@ -33,7 +33,7 @@ from residnet.report.figure import Figure
 from residnet.report.run_reader import RunFiles
 
 _UNIT_SPACE = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
-"""The space between a number and its unit."""
+"""Matches the space between a number and its unit."""
 _MIN_BREAKABLE_LENGTH = 20
 """Minimum length of a name that may be broken."""
 
@@ -66,8 +66,8 @@ def write_page(
         title: title of the page; empty for the name of the run.
         description: subtitle; empty for the description of the run.
         verdict: sentences at the top of the page; the first one is bold.
-        sections: from top to bottom. A section without a title belongs to the first screen; its
-            first block is placed next to the others on wide screens.
+        sections: sections from top to bottom. A section without a title belongs to the first
+            screen; its first block is placed next to the others on wide screens.
         rendered: result of `render_figures` for the sections; None to render them now.
         level: level of the verdict, a key of `LEVEL_TEXTS`; empty if there is no verdict.
 
@@ -118,7 +118,7 @@ def write_page(
 
 
 def _collect_figures(blocks: Sequence[Block]) -> list[Figure]:
-    """Return the figures among blocks and the sections that they hold."""
+    """Return the figures among blocks, including those of nested sections."""
     figures: list[Figure] = []
     for block in blocks:
         if isinstance(block, Figure):

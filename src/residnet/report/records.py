@@ -9,17 +9,17 @@ from pydantic import Field
 from residnet.core.records import FileRecord, FileRows, Record
 
 TrialState = Literal["finished", "ended early", "failed", "unfinished"]
-"""How a trial of a sweep ended."""
+"""Final state of a trial of a sweep."""
 
 
 class SweepTrial(Record):
     """One trial of a sweep.
 
     Attributes:
-        number: number of the trial, from 0 on.
-        state: how it ended.
-        value: its objective; None if it has none.
-        seconds: duration of its run in s.
+        number: index of the trial, starting at 0.
+        state: final state.
+        value: value of the objective; None without a value.
+        seconds: duration of the run in s.
         fault: error message; empty without an error.
         values: value of each varied key.
     """
@@ -60,7 +60,7 @@ class SweepFile(FileRecord):
 
     @property
     def completed(self) -> list[tuple[SweepTrial, float]]:
-        """The trials that have an objective, with its value."""
+        """The trials with a value of the objective, and this value."""
         return [(trial, trial.value) for trial in self.trials if trial.value is not None]
 
 
@@ -160,7 +160,7 @@ class ParameterChangeRow(Record):
 
     Attributes:
         cause: name of the change.
-        size: its size.
+        size: estimated size of the change.
         standard_error: standard error of the size.
         unit: unit of the size.
         after_each_log: estimate after each log.
@@ -178,10 +178,10 @@ class RefitSummary(Record):
 
     Attributes:
         changes: identified changes.
-        ended: why the search for changes ended.
+        ended: reason for which the search for changes ended.
         run: folder of the new run; None if no change was identified.
         nrmse_old: mean free-run error of the old model on held-out logs; None without a run.
-        nrmse_new: the same of the new model.
+        nrmse_new: mean free-run error of the new model on held-out logs.
         worth_taking: whether the new model is significantly better.
     """
 
@@ -197,7 +197,7 @@ class RefitRow(Record):
     """The last entry of monitor.json after a refit.
 
     Attributes:
-        refit: its result.
+        refit: result of the refit.
     """
 
     refit: RefitSummary

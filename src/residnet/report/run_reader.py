@@ -54,10 +54,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 JsonObject = Mapping[str, Any]
-"""What a JSON object holds."""
+"""A JSON object."""
 RecordT = TypeVar("RecordT", bound=StoredFile)
 _SPLIT_PRIORITY = ("test", "external", "validation", "train")
-"""Splits by how much they say about data that no fit has seen."""
+"""Splits in the order in which a report prefers them: data that no fit has seen come first."""
 
 
 @dataclass(frozen=True)
@@ -95,10 +95,10 @@ class StoredWindow:
     dof: DegreesOfFreedom = SURGE_SWAY_YAW
 
     def free_run_errors(self, model: str) -> pd.DataFrame:
-        """Return what a model is off by [T] in SI and rad, `x` standing for the distance in place.
+        """Return the errors of a model at each sample [T] in SI units and rad, by channel.
 
-        u, v and the position are NaN where they are not scored; of angles, whole turns do not
-        count.
+        The column `x` is the distance from the measured position. u, v and the position are NaN
+        where they are not scored; errors of angles are at most half a turn.
         """
         import pandas as pd
 
@@ -111,21 +111,21 @@ class StoredWindow:
         return error
 
     def rmse_by_channel(self, model: str) -> np.ndarray:
-        """Return the root mean square errors [n] of what moves, over the samples that count."""
+        """Return the root mean square errors of the dynamic states [n], over the scored samples."""
         rmse = self.free_run_errors(model)[list(self.dof.dynamic_states)].pow(2).mean().pow(0.5)
         return rmse.to_numpy()
 
     def mean_nrmse(self, model: str, scales: Mapping[str, float]) -> float:
-        """Return the mean over the channels of `scales` of the error over the scale."""
+        """Return the mean of RMSE / scale over the channels of `scales`."""
         columns = [self.dof.dynamic_states.index(name) for name in scales]
         return float((self.rmse_by_channel(model)[columns] / [*scales.values()]).mean())
 
 
 class RunFiles:
-    """The contents of a run folder of any task, or of what `residnet evaluate` writes.
+    """The contents of a run folder of any task, or of a folder of `residnet evaluate`.
 
-    Parts that a folder does not have are empty. What belongs to a fit (`rows`, `kinds`, `find_row`
-    and so on) needs its metrics.json.
+    Parts that a folder does not have are empty. Attributes of a fit (`rows`, `find_row` and so on)
+    need its metrics.json.
     """
 
     def __init__(self, path: Path) -> None:
@@ -290,7 +290,7 @@ class RunFiles:
 
     @cached_property
     def provenance(self) -> ProvenanceFile | None:
-        """How the run was made (provenance.json); None if the file does not exist."""
+        """Versions, seed and input files (provenance.json); None if the file does not exist."""
         return self.read_record(ProvenanceFile, "provenance.json")
 
     @cached_property
@@ -300,7 +300,7 @@ class RunFiles:
 
     @cached_property
     def limits(self) -> LimitsFile | None:
-        """Where the models fail (limits.json); None if the file does not exist."""
+        """Errors by horizon, class and window (limits.json); None if the file does not exist."""
         return self.read_record(LimitsFile, "limits.json")
 
     def find_limits(self, protocol: str) -> ProtocolLimits | None:
@@ -360,7 +360,7 @@ class RunFiles:
 
     @cached_property
     def plant(self) -> str | None:
-        """The plant that made the data, where they are simulated."""
+        """The plant that generated the logs, if they are simulated."""
         return next((model for model, kind in self.model_kinds.items() if kind == PLANT), None)
 
     @cached_property
@@ -377,7 +377,7 @@ class RunFiles:
 
     @cached_property
     def main_model(self) -> str:
-        """The model that a report is on: the predictor, else the first head or the baseline."""
+        """The model that a report evaluates: the predictor, else the first head or the baseline."""
         names = [self.predictor, *self.heads, self.baseline, *self.model_kinds]
         return next(name for name in names if name is not None and name in self.model_kinds)
 
@@ -400,19 +400,19 @@ class RunFiles:
 
     @cached_property
     def protocols(self) -> list[str]:
-        """The protocols of the rows, the one by which the focus is judged first."""
+        """The protocols of the rows; that of the verdict comes first."""
         return order_protocols(self.rows, self.report_split, self.evaluation.selection)
 
     @property
     def selection_protocol(self) -> str:
-        """The protocol that chose between the models."""
+        """The protocol by whose errors models were selected."""
         return self.evaluation.selection or self.protocols[0]
 
     @cached_property
     def main_protocol(self) -> str:
-        """The protocol of the first screen: the first whose free runs have one length, if any has.
+        """The protocol at the top of the page: the first one with windows of equal length, if any.
 
-        That which selects comes first.
+        The protocol that selects models is the first candidate.
         """
         fixed_length = [name for name in self.protocols if self._window_length(name)]
         return (fixed_length or self.protocols)[0]
@@ -424,7 +424,7 @@ class RunFiles:
 
     @cached_property
     def horizon_text(self) -> str:
-        """When the errors of the main protocol are taken: after so many seconds, or at the end."""
+        """Text of the horizon of the errors of the main protocol: a time, or the end."""
         length = self._window_length(self.main_protocol)
         return f"after {length:g} s" if length else "at the end"
 
@@ -483,7 +483,7 @@ class RunFiles:
         return [name for name in dict.fromkeys(names) if name != "all"]
 
     def model_label(self, model: str) -> str:
-        """Return the name of a model in tables, with its role where it has a special one."""
+        """Return the name of a model in tables, with its role if that is special."""
         if self.model_kinds.get(model) == PLANT:
             return model if model == PLANT else f"{model} (plant)"
         if model == self.predictor != self.selected:
@@ -507,7 +507,7 @@ class RunFiles:
         return display_unit(self.si_unit(channel))
 
     def si_unit(self, channel: str) -> str:
-        """Return the SI unit of a channel, `-` where it is not known."""
+        """Return the SI unit of a channel; `-` if it is not known."""
         return self.metrics.channels.get(channel) or CHANNEL_UNITS.get(channel, "-")
 
     def model_settings(self, model: str) -> ModelSettings:

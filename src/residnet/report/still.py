@@ -1,4 +1,4 @@
-"""Figures drawn by matplotlib, for print and for whoever lists a run folder."""
+"""Static images of figures, drawn with matplotlib, for print and for the run folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FIGURE_WIDTH = 7.0
 pt.
 """
 _MAP_HEIGHT = 4.2
-"""Height of a line of maps in inches."""
+"""Height of a row of maps in inches."""
 _DASHES: dict[str, Any] = {
     "solid": "-",
     "dashed": "--",
@@ -220,7 +220,7 @@ def _draw_curve(axes: Any, style: GlyphStyle, x: np.ndarray, y: np.ndarray) -> A
 
 
 def _legend_above(canvas: Any, handles: dict[str, Any]) -> None:
-    """Place one legend above the panels with as many columns as fit."""
+    """Place a legend above the panels, with the largest number of columns that fit."""
     # in points: the sample and its spaces, then the text at 9 pt
     widths = [46.0 + 4.9 * len(text) for text in handles]
     columns = max(len(widths), 1)
@@ -236,7 +236,7 @@ def _legend_above(canvas: Any, handles: dict[str, Any]) -> None:
 
 
 def save_png(canvas: Any, path: Path, title: str, caption: str) -> None:
-    """Write a PNG that carries its title and caption as text.
+    """Write a PNG with title and caption as text metadata.
 
     Its palette of 128 colours takes a third of the bytes; chosen by coverage, it keeps the thin
     lines' own colours, which a palette chosen by frequency would mix.

@@ -50,14 +50,14 @@ _PRE_RESULT_FILES = {
 
 
 _LOCK_RETRIES = 20
-"""Tenths of a second to wait for the workers of a killed run to end."""
+"""Number of attempts, a tenth of a second apart, while the workers of a killed run end."""
 
 
 class RunFolder:
     """The folder of one run: paths of its files, and writers that replace files atomically.
 
     Attributes:
-        path: the folder itself.
+        path: path of the folder.
         manifest: record of the files that residnet wrote into it.
         resolved_config: the complete configuration, with every default and in SI units.
         provenance: versions, seed, revision and the SHA-256 of every input file.
@@ -70,10 +70,10 @@ class RunFolder:
         exported_models: models for controllers.
         data_quality: samples, masks and ranges of each log.
         residuals: residual targets and predictions.
-        limits: horizons and conditions at which models fail.
+        limits: errors of the models by horizon and condition.
         goodness: goodness of fit of the regressions.
         booklet: standard manoeuvres of the identified model.
-        selection: which model was selected, and why.
+        selection: the selected model and the reason.
         sanity: findings of the physical checks of each model.
         bands: prediction intervals of free runs.
         inspection: findings of the data checks.

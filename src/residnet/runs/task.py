@@ -126,7 +126,7 @@ class SummaryMetric(NamedTuple):
 
     Attributes:
         value: the number.
-        unit: its unit; `-` for a dimensionless number.
+        unit: unit of the value; `-` for a dimensionless number.
     """
 
     value: float
@@ -140,7 +140,7 @@ class SummaryMetric(NamedTuple):
 
 @dataclass(frozen=True)
 class TaskOutcome:
-    """The results of a run in brief.
+    """Summary of the results of a run.
 
     Attributes:
         verdict: complete sentences for a reader who reads nothing else.
@@ -148,7 +148,8 @@ class TaskOutcome:
         table: text for the terminal; empty for none.
         failure: message if a result failed a check; the run is complete and ends with a
             `DataError` of this message. Empty if all checks passed.
-        level: level of the verdict, one of `residnet.evaluation.verdict.LEVELS`; empty for none.
+        level: level of the verdict, one of `residnet.evaluation.verdict.LEVELS`; empty without a
+            verdict.
         exports: functions that write each model for controllers, by its name; they are called
             after the report is written. If one fails, the complete run ends with an `ExportError`;
             a withheld model is only reported.
@@ -168,8 +169,8 @@ class FinishedRun:
 
     Attributes:
         folder: the run folder.
-        outcome: its results in brief.
-        exports: files for controllers that it wrote.
+        outcome: summary of the results.
+        exports: exported files for controllers.
     """
 
     folder: RunFolder
@@ -222,7 +223,7 @@ class Task(Config):
         return sections
 
     def check(self) -> None:
-        """Check what the validation of the config cannot: files, models and packages.
+        """Check files, models and packages, which the validation of the config does not read.
 
         Raises:
             ResidnetError: if a file, a model or a package is missing or does not fit.
@@ -410,9 +411,9 @@ def torch_threads(threads: int) -> Iterator[None]:
 class PackageTask(Task):
     """A task of two modules: `config` holds its settings, `execute` the work.
 
-    A config is then read without importing what its work needs. `execute` lies beside the module
-    of the class and has the functions `execute(config, folder)`, optionally `check(config)`, and
-    one for each command of the task. A check that needs no PyTorch is a method of the config.
+    A config is then read without the imports of its work. The module `execute` is in the package of
+    the config class and has the functions `execute(config, folder)`, optionally `check(config)`,
+    and one for each command of the task. A check that needs no PyTorch is a method of the config.
     """
 
     @final

@@ -69,7 +69,7 @@ class HeadingTask(ReferenceTask):
     observation_size = 2
 
     def sample_goal(self, x: Tensor, generator: torch.Generator, cruise: float) -> Tensor:
-        """Return headings up to 60 degrees to either side."""
+        """Return headings up to 60 degrees to port or starboard of the initial one."""
         heading_change = (2.0 * _sample_uniform(len(x), generator, x) - 1.0) * math.pi / 3
         return heading(x).unsqueeze(-1) + heading_change
 

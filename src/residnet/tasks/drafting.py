@@ -60,9 +60,9 @@ from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.quality import inspect_log
 
 STOP = "stop: "
-"""Start of the last line of a draft that has to be completed before a run."""
+"""Prefix of the last line of a draft that must be completed before a run."""
 _MIN_TURN = np.radians(20.0)
-"""Range of the heading in rad from which a vessel counts as turning."""
+"""Range of the heading in rad above which a vessel counts as turning."""
 _UNMATCHED_COLUMN_NOTES = (UNMAPPED_COLUMNS, TEXT_COLUMNS, UNMAPPED_FIELDS)
 _MAX_INSPECTED_LOGS = 12
 """Maximum number of logs that are inspected."""
@@ -79,7 +79,7 @@ class ConfigDraft:
         guesses: pairs of a key and the reason of its guess.
         text: the YAML text with comments.
         warnings: unused channels and logs, and errors of the data that would mislead a fit.
-        missing: what the config needs before a run; empty if it is complete.
+        missing: text on the missing entries of the config; empty if it is complete.
     """
 
     config: dict[str, Any]
@@ -175,7 +175,7 @@ def _note_missing_inputs(
 def _note_unused_channels(
     draft_logs: _DraftLogs, draft_notes: DraftNotes, *, has_wind: bool
 ) -> None:
-    """Note channels of depth and wind that the model does not use, and what it would need."""
+    """Note channels of depth and wind that the model does not use, and the missing channels."""
     dof = draft_logs.dof
     measured_channels = {name for log in draft_logs.logs.values() for name in log.channels}
     depth_channels = [
@@ -417,9 +417,7 @@ class _DraftLogs:
             raise DataError(f"{reason} ({unmatched_notes})" if unmatched_notes else reason)
 
     def keep_inputs(self, inputs: Sequence[str], draft_notes: DraftNotes) -> tuple[str, ...]:
-        """Rename selected forces to tau_x, tau_y, tau_n, and drop unused channels; returns
-        inputs.
-        """
+        """Rename selected forces to tau_x, tau_y, tau_n and drop unused channels; return the inputs."""
         renamed_inputs = {
             name: next((f for f in ("tau_x", "tau_y", "tau_n") if name.startswith(f"{f}_")), name)
             for name in inputs
@@ -590,9 +588,7 @@ def _split_logs(
 def _move_short_logs_to_training(
     split_entries: dict[str, list[_SplitEntry]], memory_time: float, draft_notes: DraftNotes
 ) -> None:
-    """Move logs that are too short for evaluation to the training split, unless it is the last
-    one.
-    """
+    """Move logs that are too short for evaluation to the training split, except the last log."""
     from residnet.identification.recipe import choose_window_length, make_protocols
 
     for name in SPLITS[1:]:

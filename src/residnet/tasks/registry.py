@@ -2,7 +2,7 @@
 
 A task is imported when a config names it, so that this module does not wait for PyTorch. The entry
 of a task names the class of its settings. A task that is a package, such as `fit`, has its work in
-the module `execute` beside it (`residnet.runs.task.PackageTask`).
+the module `execute` of its package (`residnet.runs.task.PackageTask`).
 """
 
 from __future__ import annotations

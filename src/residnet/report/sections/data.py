@@ -33,11 +33,11 @@ from residnet.report.run_settings import ProtocolSettings
 from residnet.training.records import CurrentRow, CurrentsFile
 
 _SEVERE_LEVELS = ("fatal", "will mislead")
-"""Levels above a note, the worst first."""
+"""Severity levels above a note, in descending order."""
 
 
 def fit_data_section(run: RunFiles) -> Section | None:
-    """Return the section on the data, None where the folder says nothing about them."""
+    """Return the section on the data; None if the folder has no information on them."""
     baseline_notes = run.fit_notes(run.baseline or "baseline")
     samples = None if baseline_notes is None else baseline_notes.samples
     logs: dict[str, list[LogQuality]] = {}
@@ -100,7 +100,7 @@ def fit_data_section(run: RunFiles) -> Section | None:
 
 
 def _currents_table(run: RunFiles, currents: Sequence[CurrentRow]) -> Table:
-    """Return the estimated current of each log, in the unit of speeds."""
+    """Return the table of the estimated current of each log, in the display unit of speeds."""
     unit, factor = run.display_unit("u")
 
     def component(value: float, standard_error: float) -> Cell:
@@ -122,7 +122,7 @@ def _currents_table(run: RunFiles, currents: Sequence[CurrentRow]) -> Table:
 
 
 def compatibility_tables(rows: Sequence[CompatibilityRow]) -> list[Block]:
-    """Return the instrument errors over all logs, and the meaning of the velocities of each log.
+    """Return tables of instrument errors over all logs, and of the kind of velocities of each log.
 
     Args:
         rows: rows of compatibility.json.
@@ -244,7 +244,7 @@ def _protocol_text(protocol: ProtocolSettings) -> str:
 
 
 def quality_tables(run: RunFiles) -> tuple[Table, Table]:
-    """Return the contents of the logs by split and kind of manoeuvre, and for each log."""
+    """Return tables of the contents of the logs by split and manoeuvre, and for each log."""
     groups: dict[tuple[str, str], list[LogQuality]] = {}
     for entry in run.quality:
         groups.setdefault((entry.split, entry.manoeuvre), []).append(entry)
@@ -286,7 +286,7 @@ def quality_tables(run: RunFiles) -> tuple[Table, Table]:
 
 
 def _mean_percentage(logs: Sequence[LogQuality], share: Callable[[LogQuality], float]) -> float:
-    """Return the mean of a share over the samples of logs, in percent."""
+    """Return the mean percentage over logs, weighted by their numbers of samples."""
     samples = sum(log.samples for log in logs)
     return 100 * sum(share(log) * log.samples for log in logs) / samples
 
@@ -308,7 +308,7 @@ def _masked_text(logs: Sequence[LogQuality]) -> str:
 class _FindingKind(NamedTuple):
     """All findings of one level and code, with the names of their logs.
 
-    The rank is the place of the level in `_SEVERE_LEVELS`, the worst first.
+    The rank is the position of the level in `_SEVERE_LEVELS`.
     """
 
     code: str
@@ -322,7 +322,7 @@ class _FindingKind(NamedTuple):
 
 
 def quality_section(run: RunFiles) -> Section | None:
-    """Return the findings by kind and the notes by log, None where the run has no doctor.json."""
+    """Return the findings by kind and the notes by log; None if the run has no doctor.json."""
     if run.inspection is None or not run.inspection.logs:
         return None
     logs = run.inspection.logs

@@ -42,9 +42,9 @@ from residnet.report.run_reader import RunFiles
 
 
 def distinct_manoeuvres(run: RunFiles, split: str, protocol: str) -> list[str]:
-    """Return kinds and groups of manoeuvres without those that hold the same runs as one before.
+    """Return kinds and groups of manoeuvres, without duplicates.
 
-    A group of a single kind holds the same runs as that kind.
+    A group of a single kind has the same free runs as that kind.
     """
     seen_errors: list[list[tuple[int, dict[str, float]]]] = []
     manoeuvre_kinds: list[str] = []
@@ -94,7 +94,7 @@ def errors_section(run: RunFiles) -> Section:
 
 
 def _quantity_titles(run: RunFiles, nrmse_title: str = "NRMSE [-]") -> dict[str, str]:
-    """Return the titles of what tables of errors show."""
+    """Return the column titles of tables of errors."""
     return {
         **{
             channel: f"{channel_title(channel)} [{run.display_unit(channel)[0]}]"
@@ -110,7 +110,7 @@ def _quantity_titles(run: RunFiles, nrmse_title: str = "NRMSE [-]") -> dict[str,
 
 
 def _split_comparison_table(run: RunFiles, protocol: str, splits: Sequence[str]) -> Table:
-    """Return the errors of all models, the splits side by side for each quantity."""
+    """Return the table of errors of all models, with the splits side by side."""
 
     def cell(model: str, key: str, split: str) -> Cell:
         return _quantity_cell(run, key, run.find_row(model, split, protocol))
@@ -142,7 +142,7 @@ def errors_table(run: RunFiles, split: str) -> Table:
 
     def cell(row: MetricsRow, key: str) -> Cell:
         quantity_cell = _quantity_cell(run, key, row)
-        # a terminal has no room for notes, except for the number of divergences
+        # a terminal has no space for notes, except for the number of divergences
         note = describe_divergence(row) if key == "nrmse" else ""
         return Cell(quantity_cell.text, note, "" if key in run.channels else quantity_cell.mark)
 
@@ -196,7 +196,7 @@ def errors_by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | Non
 
 
 def _quantity_cell(run: RunFiles, key: str, row: MetricsRow | None) -> Cell:
-    """Return what a row says of a quantity, and its change against the baseline's on its data."""
+    """Return the cell of a quantity of a row, with its change relative to the baseline."""
     if row is None:
         return Cell(DASH)
     if key == "diverged":
@@ -236,9 +236,9 @@ def _quantity_cell(run: RunFiles, key: str, row: MetricsRow | None) -> Cell:
 
 
 def limits_section(run: RunFiles) -> Section | None:
-    """Return for each protocol errors by manoeuvre and band, worst windows and what limits them.
+    """Return errors by class, worst windows and noise floor of each protocol.
 
-    None where the selected model has no row.
+    None if the selected model has no row.
     """
     main_model = run.main_model
     protocol_sections: list[Block] = []
@@ -278,7 +278,7 @@ class _BreakdownRow(NamedTuple):
         label: the kind, or the range of speeds.
         windows: number of windows.
         nrmse: mean error.
-        difference: paired difference to the reference model; None without one.
+        difference: paired difference from the reference model; None without a reference.
     """
 
     group: str
@@ -347,7 +347,7 @@ def _error_breakdown_table(
 
 
 def worst_runs_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
-    """Return the worst free runs of the main protocol, and a figure to look into them with."""
+    """Return the section with the worst free runs of the main protocol and their figure."""
     protocol_limits = run.find_limits(run.main_protocol)
     blocks = [
         block
@@ -360,7 +360,7 @@ def worst_runs_section(run: RunFiles, figures: Sequence[Figure]) -> Section | No
 def _worst_windows_table(
     run: RunFiles, main_model: str, protocol_limits: ProtocolLimits | None
 ) -> Table | None:
-    """Return the windows with the largest errors of a model, None where none are recorded."""
+    """Return the table of the windows with the largest errors of a model; None without windows."""
     windows = () if protocol_limits is None else protocol_limits.worst.get(main_model, ())
     if not windows:
         return None

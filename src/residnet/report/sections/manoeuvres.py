@@ -64,7 +64,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _MAX_SEPARATE_FLIGHTS = 12
-"""Most flights that have a table and a picture each; of more, the first of each kind has."""
+"""Maximum number of manoeuvres with a table and an image each. With more manoeuvres, only the first
+of each kind has them.
+"""
 _MAX_CASES = 30
 _MAX_PANELS = 12
 _MAX_ZIGZAGS = 6
@@ -78,7 +80,7 @@ _INDEX_TITLES = {
     "steady_speed_ratio": "steady speed over approach speed",
     "pull_out_yaw_rate": "yaw rate after pull-out",
 }
-"""Names of indices that are not their key with spaces."""
+"""Titles of indices that differ from the key with spaces."""
 _COMPARED_INDICES = (
     "first_overshoot",
     "second_overshoot",
@@ -106,7 +108,7 @@ _PLOTTED_CHANNELS = ("u", "v", "r", "p", "psi", "phi", "w", "q", "z", "theta")
 
 
 def index_title(name: str) -> str:
-    """Return a manoeuvring index in words."""
+    """Return the title of a manoeuvring index."""
     return _INDEX_TITLES.get(name, name.replace("_", " "))
 
 
@@ -126,7 +128,7 @@ def sections(run: RunFiles) -> list[Section]:
 
 
 def _trials_table(content: IndicesFile) -> Table:
-    """Return a row for each flight: what went wrong, else the most telling of its indices."""
+    """Return the table of simulated manoeuvres: the fault, or the main indices, of each."""
 
     def main_index(row: FlightIndices) -> str:
         return next((name for name in _MAIN_INDICES if name in row.indices), "")
@@ -286,7 +288,7 @@ def _table_by_index(
 
 
 def _table_by_trial(content: IndicesFile, rows: Sequence[FlightIndices]) -> Table:
-    """Return a row for each flight of one kind of manoeuvre."""
+    """Return the table of one kind of manoeuvre, with a row for each simulation."""
     has_several = len({row.craft for row in rows}) > 1
 
     def cell(row: FlightIndices, name: str) -> Cell:
@@ -389,7 +391,7 @@ def _trial_curves(
     track: dict[str, Curve] = {}
     panels: list[dict[str, Curve]] = [track, *({} for _ in factors)]
     for name, log in logs.items():
-        # a recording, as far as it was flown
+        # a replayed recording, up to the end of the simulation
         was_simulated = (
             log.t - log.t[0] <= first_motion.t[-1] if name == "recorded" else slice(None)
         )
@@ -437,7 +439,7 @@ def _spiral_figure(
 def booklet_section(run: RunFiles) -> Section | None:
     """Return a table for each standard manoeuvre and one that compares measured zigzags.
 
-    None where the run has no booklet.json.
+    None if the run has no booklet.json.
     """
     content = run.read_record(BookletFile, "booklet.json")
     if content is None:

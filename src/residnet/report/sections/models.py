@@ -29,15 +29,17 @@ from residnet.report.run_settings import HeadSettings, ModelSettings
 from residnet.report.sections.runs import AXES, model_styles, short_label
 
 _EXTRA_UNITS = {"wind_u": "m/s", "wind_v": "m/s", "wind_mag": "m/s"}
-"""Units of factors of terms that are no channels of a log."""
+"""Units of the factors of terms that are not channels of a log."""
 _MAX_LISTED = 8
-"""Most names given of a list."""
+"""Maximum number of listed names."""
 _MAX_PLOTTED_TERMS = 6
-"""Most terms drawn for themselves in a panel, the largest ones; of the others the sum is drawn."""
+"""Maximum number of terms with a curve of their own in a panel, the largest ones; the others are
+added to one curve.
+"""
 _SPLITS = ("train", "validation")
 _RING_STYLE = GlyphStyle("", kind="points", size=7, is_hollow=True, z_order=5)
 _MIN_WHITE_NOISE_P = 0.05
-"""Least p-value at which residuals pass for white noise."""
+"""Smallest p-value at which residuals count as white noise."""
 
 
 def models_section(run: RunFiles) -> Section | None:
@@ -101,7 +103,7 @@ def _coefficient_table(notes: FitNotes) -> Table:
     def value(row: CoefficientRow) -> str:
         error = row.standard_error
         decimals = max(1 - math.floor(math.log10(error)), 0) if error > 0 else 7
-        # an exact one has no error to tell its digits by
+        # an exact coefficient has no standard error that determines its digits
         return format_fixed(row.value, decimals) if decimals <= 6 else format_number(row.value, 4)
 
     def ratio(row: CoefficientRow) -> Cell:
@@ -228,7 +230,7 @@ def _head_section(run: RunFiles) -> Section | None:
 
 
 def _inputs_text(settings: ModelSettings, notes: FitNotes) -> str:
-    """Return the inputs of a head and the baseline below it, or the members of an ensemble."""
+    """Return the inputs and the baseline of a head, or the members of an ensemble."""
     if notes.members:
         return "mean of " + ", ".join(notes.members)
     if settings.head is None:
@@ -397,7 +399,10 @@ def term_figures(run: RunFiles) -> Iterator[Figure]:
 
 
 def evolution_figures(run: RunFiles) -> Iterator[Figure]:
-    """Draw the best error of each generation of every model that was bred (Figures 6.2, 6.3)."""
+    """Draw the smallest error of each generation of genetic programming.
+
+    Source: Halvorsen 2019, Figures 6.2 and 6.3.
+    """
     for model in run.heads:
         notes = run.fit_notes(model)
         equations = {} if notes is None else notes.equations
@@ -566,7 +571,7 @@ def goodness_section(run: RunFiles) -> Section | None:
 
 
 def _goodness_tables(rows: Sequence[GoodnessRow], factor: float) -> list[Table]:
-    """Return how close each model fits on one axis, and how sure its residuals are."""
+    """Return tables of the goodness of fit on one axis, and of statistics of the residuals."""
 
     def whiteness_cell(row: GoodnessRow) -> Cell:
         p = row.white_p

@@ -1,4 +1,4 @@
-"""Figures of free runs: runs one by one, errors against the horizon and by model, residuals."""
+"""Figures of free runs: single runs, errors against the horizon and by model, residuals."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from residnet.report.figure import (
 from residnet.report.run_reader import RunFiles, StoredWindow
 
 DisplayUnits: TypeAlias = Mapping[str, tuple[str, str, float]]
-"""By channel its SI unit, the unit in which it is shown, and the factor to that."""
+"""SI unit, display unit and factor from SI to the display unit, by channel."""
 _MAX_CASES = 12
 _MAX_STATIC_IMAGES = 6
 _MAX_TIME_BINS = 60
@@ -76,7 +76,8 @@ AXES = {
     "q_dot": ("pitch", "deg/s²", DEGREES_PER_RADIAN),
 }
 """Name of each acceleration's axis, its unit on a page, and the factor to that."""
-# colour, line, order; the plant lies on the head that comes near it and shows it through its gaps
+# colour, line style, drawing order; the plant is drawn above a head that may coincide with it, and
+# its gaps show the head
 _ROLE_STYLES = {
     CONSTANT_VELOCITY: (GREY, "dotted", 3),
     BASELINE: (ORANGE, "dashed", 3),
@@ -88,10 +89,10 @@ _RANK_NAMES = ("median error", "largest error", "least error")
 
 
 def model_styles(run: RunFiles) -> dict[str, GlyphStyle]:
-    """Return how each model looks.
+    """Return the style of each model.
 
-    Constant velocity, baseline and plant have their own looks; the selected head is always the
-    solid blue one. Leading head, baseline and plant alone are switched on at first.
+    Constant velocity, baseline and plant have fixed styles; the selected head is always solid blue.
+    Initially only the main model, the baseline and the plant are visible.
     """
     visible_models = {run.main_model, run.baseline, run.plant, *run.heads[:1]}
     styles = {}
@@ -110,7 +111,7 @@ def model_styles(run: RunFiles) -> dict[str, GlyphStyle]:
 
 
 def short_label(run: RunFiles, model: str) -> str:
-    """Return the name of a model in figures, where a long one would run over its neighbours."""
+    """Return the name of a model for figures, shortened so that labels do not overlap."""
     label = run.model_label(model)
     return label if len(model) <= 20 else label.replace(model, model[:19] + "…")
 
@@ -229,7 +230,7 @@ def track_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | Non
 
 
 def plot_window(window: StoredWindow, title: str) -> Figure:
-    """Return the figure of one free run that is held in memory: track, then velocities.
+    """Return the figure of a free run that is not stored in a file: track, then velocities.
 
     A vessel that does not move or turn has no track.
     """
@@ -258,7 +259,7 @@ def _build_panel(text: str, unit: tuple[str, str, float], height: int = 165) -> 
 
 
 def _moving_channels(dof: DegreesOfFreedom) -> set[str]:
-    """Return the columns of a free run that the live velocities move, `x` for the position."""
+    """Return the columns of a free run that the active velocities change; `x` is the position."""
     return {*dof.active_states, *["x"] * dof.has_position, *["psi"] * dof.has_heading}
 
 
@@ -278,7 +279,7 @@ def _motion_panels(title: str, units: DisplayUnits, dof: DegreesOfFreedom) -> li
 def _select_windows(
     run: RunFiles, windows: Sequence[StoredWindow]
 ) -> list[tuple[StoredWindow, str]]:
-    """Return the runs to choose from with the rank of each among its kind."""
+    """Return the selectable free runs, each with its rank among those of its manoeuvre kind."""
     groups: dict[tuple[int, str], list[StoredWindow]] = {}
     for window in windows:
         if run.main_model in window.predicted:
@@ -292,14 +293,14 @@ def _select_windows(
         for rank, index in enumerate(((len(members) - 1) // 2, len(members) - 1, 0)):
             if all(members[index] is not entry[2] for entry in ranked_windows):
                 ranked_windows.append((rank, group_index, members[index]))
-    # if there is not room for all, medians come before worst and best runs
+    # if there is no space for all, medians come before the worst and the best runs
     selected = sorted(ranked_windows, key=lambda entry: entry[:2])[:_MAX_CASES]
     selected.sort(key=lambda entry: (entry[1], entry[0]))
     return [(window, _RANK_NAMES[rank]) for rank, _, window in selected]
 
 
 def _rank_by_error(run: RunFiles, windows: Sequence[StoredWindow]) -> list[StoredWindow]:
-    """Return the runs of the leading model, the one of least error first."""
+    """Return the free runs in ascending order of the error of the main model."""
     scales = {name: run.metrics.scales.get(name, 1.0) for name in run.dof.dynamic_states}
     return sorted(
         (window for window in windows if run.main_model in window.predicted),
@@ -310,7 +311,7 @@ def _rank_by_error(run: RunFiles, windows: Sequence[StoredWindow]) -> list[Store
 def _window_curves(
     window: StoredWindow, main_model: str, units: DisplayUnits
 ) -> list[dict[str, Curve]]:
-    """Return track and motion of a run, measured and predicted, and the band of one model."""
+    """Return measured and predicted curves of a run, with the prediction band of one model."""
     time = window.t - window.t[0]
     usable = window.usable
     # headings begin within half a turn of north, tracks at their start
@@ -354,7 +355,7 @@ def _window_curves(
 
 
 def error_growth(windows: Sequence[StoredWindow], model: str) -> pd.DataFrame:
-    """Return the root mean square errors over windows against the time since the start.
+    """Return root mean square errors over windows as functions of the time since the start.
 
     Args:
         windows: free runs of one protocol.
@@ -417,7 +418,7 @@ def horizon_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | N
 def _build_error_panels(
     run: RunFiles, prefix: str, height: int
 ) -> tuple[list[Panel], dict[str, float]]:
-    """Return a panel for the errors of each channel that moves, and its factor from SI by name."""
+    """Return a panel for the errors of each channel, and the factor from SI by channel."""
     units = display_units(run)
     moving_channels = _moving_channels(run.dof)
     error_channels = [name for name in _ERROR_NAMES if name in moving_channels]

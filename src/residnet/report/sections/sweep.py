@@ -1,4 +1,4 @@
-"""The report of a sweep: the best trials, what their keys matter, and all trials."""
+"""The report of a sweep: the best trials, the importance of the keys, and all trials."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from residnet.report.run_reader import RunFiles
 from residnet.report.sections.variants import VARIANTS_FILE, variant_sections
 
 _MAX_SHOWN_TRIALS = 15
-"""Trials in the first table, the best ones, which fit on a screen; the last section has all."""
+"""Number of the best trials in the first table, which fits on a screen."""
 _MAX_LINE_LENGTH = 20
-"""Most letters of a line beneath an axis."""
+"""Maximum number of letters in a line of a label below an axis."""
 _RANK_GROUPS = (
     ("worse half", 0.5, 1.0, GlyphStyle("worse half", "#B8B8B8", width=0.8)),
     ("better half", 0.1, 0.5, replace(SOLID_STYLE, label="better half", alpha=0.45, width=1.0)),
     ("best tenth", 0.0, 0.1, replace(SOLID_STYLE, label="best tenth", width=1.2)),
     ("best", 0.0, 1e-9, GlyphStyle("best", VERMILLION, width=2.4, z_order=4)),
 )
-"""Groups of trials by their rank: from which share of them, to which, and how they are drawn."""
+"""Groups of trials by rank: name, lower and upper limit as fractions of all trials, and style."""
 
 
 def parallel_coordinates(content: SweepFile) -> Figure:
-    """Draw each finished trial of sweep.json as a line over its keys to its value."""
+    """Draw the finished trials in parallel coordinates: one axis per key, and one for the value."""
     rows = [trial for trial, _ in content.completed]
     values = np.array([value for _, value in content.completed])
     rank = np.argsort(np.argsort(values if content.minimized else -values))
@@ -149,7 +149,7 @@ def _importance_figure(content: SweepFile) -> Figure:
 def _axis_positions(
     rows: Sequence[SweepTrial], key: str, log: bool
 ) -> tuple[np.ndarray, list[tuple[float, str]]]:
-    """Return the heights of the trials on the axis of a key [trials], and marks on that axis."""
+    """Return the positions of the trials on the axis of a key [trials], and its tick labels."""
     key_values = [row.values[key] for row in rows]
     numbers = [
         value
@@ -170,7 +170,7 @@ def _axis_positions(
 
 
 def _wrap_key(key: str) -> str:
-    """Return a long key in lines that end with its parts."""
+    """Return a long key with line breaks between its parts."""
     lines = [""]
     for part in re.findall(r"[^. ]+[. ]?", key):
         if lines[-1] and len(lines[-1]) + len(part) > _MAX_LINE_LENGTH:

@@ -1,4 +1,4 @@
-"""The report of the variants of a fit: errors of each, and paired differences to the reference."""
+"""The report of the variants of a fit: errors, and paired differences from the reference."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def variant_sections(files: RunFiles) -> list[Section]:
 
 
 def plot_differences(rows: Sequence[VariantRow], reference: str) -> Figure:
-    """Plot the differences to the reference with intervals, one panel for each protocol.
+    """Plot the differences from the reference with intervals, one panel for each protocol.
 
     Args:
         reference: name of the reference variant.

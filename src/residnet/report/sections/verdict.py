@@ -1,4 +1,4 @@
-"""The verdict on a fit, and what a reader must know before using its selected model."""
+"""The verdict on a fit, and the limitations of its selected model."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from residnet.report.sections.free_runs import distinct_manoeuvres
 
 
 def verdict_sentences(run: RunFiles) -> list[str]:
-    """Return how good the selected model is, sentence by sentence.
+    """Return the sentences of the verdict on the selected model.
 
     Raises:
-        UsageError: where the folder holds no metrics.json.
+        UsageError: if the folder has no metrics.json.
     """
     main_model = run.main_model
     if run.find_row(main_model, run.report_split, run.protocols[0]) is None:
@@ -41,7 +41,7 @@ def verdict_sentences(run: RunFiles) -> list[str]:
 
 
 _MEASUREMENT_ROW = "measurements"
-"""Row of the position error that remains when the measured velocities are integrated."""
+"""Name of the row with the position error of the integrated measured velocities."""
 _NO_POSE_TEXT = (
     "The logs hold no {}: judge the model by its velocities, for errors of position and heading are"
     " those of integrated velocities."
@@ -96,7 +96,7 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
 
 
 def verdict_level(run: RunFiles) -> str:
-    """Return the level of the verdict on the selected model, empty where it has no free runs."""
+    """Return the level of the verdict on the selected model; empty if it has no free runs."""
     return judged_level(collect_evidence(run, run.main_model))
 
 

@@ -197,9 +197,7 @@ def _initial_state_of_log(craft: SimulatedVessel, log: Log) -> torch.Tensor:
 
 
 def sample_parameters(fitted_model: FittedModel, draws: int, seed: int) -> torch.Tensor:
-    """Return fitted parameters and `draws` samples of their normal distribution, [1 + draws,
-    ...].
-    """
+    """Return the fitted parameters and `draws` samples of their distribution, [1 + draws, ...]."""
     baseline = fitted_model.model.baseline
     assert isinstance(baseline, ParametricBaseline), "the configuration was validated"
     assert fitted_model.covariance is not None, "the configuration was validated"
@@ -215,9 +213,7 @@ def sample_parameters(fitted_model: FittedModel, draws: int, seed: int) -> torch
 
 
 def _input_shares_from_logs(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]:
-    """Return the input shares with full drive and steer scaled to the largest inputs of the
-    logs.
-    """
+    """Return the input shares, with full drive and steer equal to the largest inputs in the logs."""
     rudder = config.steering_input()
     max_rudder = max(identify_zigzag(log, rudder).angle for log in logs)
     return {

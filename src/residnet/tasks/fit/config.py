@@ -26,7 +26,7 @@ class ExportConfig(Config):
     """Models that are exported as TorchScript when the run ends.
 
     Attributes:
-        models: their names; `predictor` is the model that the report shows first, `selected` the
+        models: names of the models; `predictor` is the model that the report shows first, `selected` the
             single model chosen on validation data.
     """
 

@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
     """Fit all models, evaluate them in free runs, and write the results.
 
-    Logs that ran in currents are taken through the water.
+    If the config asks for currents, logs are converted to the motion through the water.
 
     Raises:
         ResidnetError: if the logs cannot be used, or do not determine a model.

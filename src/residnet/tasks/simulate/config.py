@@ -84,11 +84,12 @@ class Programme(Config):
         step: time step of the logs; null for the step of the model, or 0.05 s without a model.
         substeps: number of simulation steps of the vessel within one step of the logs.
         initial: initial states by name; others have the default of the vessel.
-        length: of the hull for indices in lengths; that of the vessel if absent.
-        reader: of logs that are replayed.
-        noise: of the sensors; indices are taken from the motion itself.
-        disturbance: a learned model feels only the wind, if it was fitted with it.
-        seed: of everything random.
+        length: length in m of the hull, for indices in lengths; null for that of the vessel.
+        reader: reader of the logs that are replayed.
+        noise: noise of the sensors in the logs; indices are computed from the motion without noise.
+        disturbance: wind, current and waves; a learned model responds only to the wind, if it was
+            fitted with it.
+        seed: seed of all random numbers.
     """
 
     vessel: str | None = None

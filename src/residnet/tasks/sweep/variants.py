@@ -179,7 +179,7 @@ def compare_variants(errors: pd.DataFrame, reference: str) -> list[VariantRow]:
 
     A row has the number of windows that diverged, the mean error over windows and seeds, its
     standard deviation over seeds (None for one seed), the smallest and largest of the seeds, and
-    the difference to the reference variant over the same windows, seeds averaged first, with its
+    the difference from the reference variant over the same windows, seeds averaged first, with its
     95 % interval by blocks of windows.
 
     Args:
