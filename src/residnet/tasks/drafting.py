@@ -417,7 +417,7 @@ class _DraftLogs:
             raise DataError(f"{reason} ({unmatched_notes})" if unmatched_notes else reason)
 
     def keep_inputs(self, inputs: Sequence[str], draft_notes: DraftNotes) -> tuple[str, ...]:
-        """Rename selected forces to tau_x, tau_y, tau_n and drop unused channels; return the inputs."""
+        """Rename forces to tau_x, tau_y, tau_n, drop unused channels, and return the inputs."""
         renamed_inputs = {
             name: next((f for f in ("tau_x", "tau_y", "tau_n") if name.startswith(f"{f}_")), name)
             for name in inputs

@@ -213,7 +213,7 @@ def sample_parameters(fitted_model: FittedModel, draws: int, seed: int) -> torch
 
 
 def _input_shares_from_logs(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]:
-    """Return the input shares, with full drive and steer equal to the largest inputs in the logs."""
+    """Return the input shares; full drive and steer are the largest inputs in the logs."""
     rudder = config.steering_input()
     max_rudder = max(identify_zigzag(log, rudder).angle for log in logs)
     return {

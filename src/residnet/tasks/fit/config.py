@@ -26,8 +26,8 @@ class ExportConfig(Config):
     """Models that are exported as TorchScript when the run ends.
 
     Attributes:
-        models: names of the models; `predictor` is the model that the report shows first, `selected` the
-            single model chosen on validation data.
+        models: names of the models; `predictor` is the model that the report shows first,
+            `selected` the single model chosen on validation data.
     """
 
     models: tuple[str, ...] = ("predictor",)
