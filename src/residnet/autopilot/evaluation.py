@@ -292,7 +292,8 @@ def build_time_series(
 
 
 _SWING_TOLERANCE = 1.25
-"""Factor on the limits of the training, which are 20 % below the accepted limits."""
+"""Factor from the limits of oscillation in training to the accepted limits, which are 25 % larger.
+"""
 N_QUIET_RUNS = 100
 """Number of simulations without noise, waves and disturbance."""
 
@@ -426,7 +427,7 @@ def compute_tracking_metrics(
     position_error = (desired_motion[:, POSITION] - pose[:, POSITION]).norm(dim=-1)
     heading_error = wrap_angle(desired_motion[:, HEADING] - pose[:, HEADING]).abs()
     power = command * motion[:, RANGE_VELOCITIES]
-    # the power of keeping the position and of keeping the heading are told apart (Table 4.13)
+    # the power for the position and the power for the heading are separate (Table 4.13)
     energy = [float(power[:, :2].sum(-1).abs().sum() * dt), float(power[:, 2].abs().sum() * dt)]
     integrated_errors = [float(position_error.sum() * dt), float(heading_error.sum() * dt)]
     duration = dt * len(pose)
@@ -460,11 +461,11 @@ class CourseRun:
     """Simulation of one vessel on one course.
 
     Attributes:
-        track: north, east [N, 2] in m.
-        heading: [N] in rad.
-        rudder: command [N] in rad.
-        speed: [N] in m/s.
-        cross_track: [N] in m, positive to starboard of the plan.
+        track: north and east [N, 2] in m.
+        heading: heading [N] in rad.
+        rudder: rudder command [N] in rad.
+        speed: speed [N] in m/s.
+        cross_track: cross-track error [N] in m, positive to starboard of the plan.
         dt: time step in s.
         finished: whether the end of the course was reached within the duration.
     """
@@ -489,10 +490,10 @@ def build_course_row(
 ) -> dict[str, Any]:
     """Return a row of metrics.json.
 
-    `ratios` is course time over the reference's length at the service speed; `ratio_turning` takes
-    the speed that the vessel keeps in its smallest turn, for vessels that slow down. `margins` is
-    how far inside the circle that was entered least, or outside the one that was passed most
-    closely.
+    `ratio` is the course time divided by the time for the length of the reference course at the
+    service speed; `ratio_turning` uses the speed in the tightest turn instead, for vessels that
+    slow down. `margin` is the smallest depth inside a circle that was entered, or the smallest
+    distance outside a circle that was passed.
     """
     must_enter = planned.protocol == "enter"
     buoys = [

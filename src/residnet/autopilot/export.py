@@ -164,7 +164,7 @@ class GuardedPolicy(_GuardedController):
     def step_unchecked(
         self, y: Tensor, reference: Tensor, s: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what `step` returns, of tensors of the right shape and type."""
+        """Evaluate `step` for tensors of the required shape and precision."""
         is_valid = self.is_in_range(y) & (reference.abs() <= self.high[0])
         y = torch.where(is_valid, y, torch.zeros_like(y))
         reference = torch.where(is_valid, reference, torch.zeros_like(reference))
@@ -244,7 +244,7 @@ class GuardedCoursePolicy(_GuardedController):
         return self.step_unchecked(y.to(torch.float64), s.to(torch.float64))
 
     def step_unchecked(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return what `step` returns, of tensors of the right shape and type."""
+        """Evaluate `step` for tensors of the required shape and precision."""
         is_valid = self.is_in_range(y)
         y = torch.where(is_valid, y, torch.zeros_like(y))
         last_command = self.last_command(s)

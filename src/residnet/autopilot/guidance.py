@@ -36,7 +36,7 @@ _ANGLES = 181
 _SAMPLES = 100
 """Number of points of the track of a turn."""
 _DISTANCES = 400
-"""Number of candidate distances for each turn."""
+"""Number of candidate wheel-over distances for each turn."""
 
 
 @final
@@ -70,8 +70,8 @@ class WheelOver(nn.Module):
         angles, corner_distances, tracks = _switching_turns(nomoto, limit)
         max_miss = share * acceptance
         radius = nomoto.speed / (nomoto.gain * limit)
-        # upper bound: an arc without lag that passes the corner at `max_miss`, plus the way of the
-        # lag
+        # upper bound: an arc without lag that passes the corner at `max_miss`, plus the distance
+        # travelled during the lag
         max_distance = math.sqrt(max_miss * (2.0 * radius + max_miss)) + nomoto.speed * nomoto.time
         distance = np.linspace(0.0, max_distance, _DISTANCES)
         miss_distance = np.stack(

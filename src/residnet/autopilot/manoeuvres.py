@@ -111,7 +111,7 @@ class Waypoints(Manoeuvre):
 
 _RIGHT_ANGLE = math.pi / 2
 _HALF_RIGHT_ANGLE = math.pi / 4
-# Table 4.1 prints the twelve poses twice (correction J12 in docs/documents/corrections.md);
+# Table 4.1 prints the twelve poses twice (J12 in docs/documents/corrections.md);
 # headings are not wrapped, so that the vessel turns in the direction written in the table (J13)
 SEGMENTS: tuple[Waypoint, ...] = (
     (0.0, -15.0, -_RIGHT_ANGLE),

@@ -121,7 +121,8 @@ def to_body_derivatives(
 ) -> tuple[Tensor, Tensor]:
     """Return nu and nu_dot [..., 3] in body axes from the derivatives [..., 3] of a pose in NED.
 
-    A vector that is constant in NED rotates at -r in body axes (correction J7).
+    A vector that is constant in NED rotates at -r in body axes (see J7 in
+    docs/documents/corrections.md).
     """
     u, v = to_body(pose_rate[..., 0], pose_rate[..., 1], psi)
     surge_acceleration, sway_acceleration = to_body(

@@ -35,7 +35,7 @@ def enlarge_to_turning_radius(buoys: Sequence[BuoyConfig], min_radius: float) ->
 
 
 def overlapping_pairs(buoys: Sequence[BuoyConfig]) -> list[tuple[int, int]]:
-    """Return the numbers of consecutive buoys that no course can pass between.
+    """Return the numbers (from 1) of consecutive buoys between which no course can pass.
 
     Their circles overlap, and they are to be left to different sides.
     """
@@ -130,7 +130,7 @@ def smallest_turn(
 def buoy_feasibility(
     buoys: Sequence[BuoyConfig], min_radius: float
 ) -> list[dict[str, float | bool]]:
-    """Compare the radius of each buoy with the smallest turning radius in m.
+    """Describe how the radii of the buoys compare with the smallest turning radius in m.
 
     Both courses of Gouletas 2020 have radii below it (correction G18 in
     docs/documents/corrections.md).
@@ -178,7 +178,7 @@ def plan_course(
     rudder_share = config.share * (1.0 - current)
     max_offset = config.current * (nomoto.time + config.lookahead / nomoto.speed)
     clearance_margin = config.reach if protocol == "enter" else config.margin
-    # what a turn takes is seen from the yaw rate that it reaches, which K overstates in hard turns
+    # the gain of the steady turn replaces K, which overestimates the yaw rate of hard turns
     achieved_nomoto = replace(nomoto, gain=steady.yaw_rate / limit)
     turn_maker = TurnMaker(vessel, achieved_nomoto, steady.step)
 

@@ -42,7 +42,7 @@ The motion after each turn depends on z, and z is fitted to it: both converge as
 decreases.
 """
 _STEP_MULTIPLES = (1.0, 5.0)
-"""Multiples of that trust radius that are tried until the constraints are met."""
+"""Multiples of the trust radius of a round, tried until the constraints are met."""
 _MISS_TOLERANCE = 1e-3
 """Accepted violation of a constraint in turning radii."""
 _CONVERGENCE_TOLERANCE = 1e-3

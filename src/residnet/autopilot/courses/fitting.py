@@ -43,7 +43,7 @@ _PASSING_MARGIN = 0.03
 its distance from its own turn.
 """
 _ABEAM_SINE = 0.3
-"""Sine of the angle from ahead or astern below which a buoy is not yet on a side."""
+"""Sine of the bearing from ahead or astern below which a buoy counts as on neither side."""
 _OTHER_PART_RANGE = 2.0
 _OWN_PART_RANGE = 0.7
 """Distances from a circle in turning radii within which other parts of the course, and the buoy's
@@ -64,7 +64,7 @@ class LinearizedProblem(NamedTuple):
         constraints: constraint values [m]; feasible if not negative.
         constraint_jacobian: derivatives [m, nz] of the constraints.
         penalties: penalty per unit of violation [m].
-        buoy_numbers: number of the buoy of each constraint [m].
+        buoy_numbers: index of the buoy of each constraint [m].
         n_hard: number of hard constraints, which come first; a valid course meets all of them.
     """
 
@@ -120,9 +120,9 @@ class _TrialStep(NamedTuple):
 
     Attributes:
         z: route after the step.
-        linearised: problem linearised there.
+        linearised: problem linearised at `z`.
         gain: decrease of the merit function.
-        predicted_gain: its decrease in the linear program.
+        predicted_gain: decrease of the merit function in the linear program.
     """
 
     z: Array
@@ -197,7 +197,7 @@ class RouteProblem:
         return problem
 
     def _passing_margin(self, circle: Circle) -> float:
-        """Return the extra distance in m of other parts of the course that the start permits."""
+        """Return the additional distance in m of other parts of the course from a circle."""
         start_distance = abs(circle.centre - self.route.start) - circle.radius
         margin = _PASSING_MARGIN * self.length_unit + self.max_offset
         return margin if start_distance < 0 else min(margin, 0.5 * start_distance)
@@ -252,7 +252,7 @@ class RouteProblem:
             ]
 
     def _first_counted_point(self, points: np.ndarray, circle: Circle) -> int:
-        """Return the first point that counts for a circle, see `first_checked_sample`."""
+        """Return the first point that is checked for a circle, see `first_checked_sample`."""
         if circle.turn_sign == 0 or abs(circle.centre - points[0]) >= circle.radius:
             return 0
         return min(

@@ -22,7 +22,7 @@ _ANGLES = 36
 RINGS = (0.0, 0.25)
 """Distances outside its circle at which a buoy may be passed, in turning radii."""
 _MAX_CANDIDATE_PATHS = 24
-"""Number of shortest paths to a pose that are checked first."""
+"""Number of the shortest paths to a pose that are checked for collisions first."""
 _CUT_TOLERANCE = 0.05
 """Distance in turning radii by which an outline may cut a circle; the fit corrects it."""
 _N_ENTRY_COURSES = 18
@@ -208,9 +208,9 @@ class Circle:
 
     Attributes:
         centre: complex position in m.
-        radius: in m.
+        radius: radius in m.
         turn_sign: +1 if the buoy is left to starboard, -1 to port, 0 if the circle is entered.
-        table: number of the turn table for the turn round it.
+        table: index of the turn table for the turn round the buoy.
     """
 
     centre: complex

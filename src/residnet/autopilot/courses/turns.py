@@ -199,7 +199,7 @@ class TurnMaker:
         """Return the times [B] in s at which the yaw rate reaches zero, else the end time.
 
         Args:
-            countered: states under counter-rudder by the time.
+            countered: states under counter-rudder as a function of the time.
             turn_signs: +1 [B] for turns to starboard, -1 to port.
         """
         column = self.vessel.state_column("r")
@@ -270,8 +270,8 @@ class SteadyTurn:
 
     Attributes:
         radius: radius of the track in m.
-        speed: in m/s.
-        yaw_rate: in rad/s.
+        speed: speed in m/s.
+        yaw_rate: yaw rate in rad/s.
         step: time step of the simulation in s.
     """
 
@@ -320,7 +320,9 @@ _MAX_TURN_ANGLE = math.radians(500.0)
 _N_HOLD_TIMES = 56
 """Number of turns in a table; their angles differ by about nine degrees."""
 _RESIDUAL_MOTION_TOLERANCE = 2e-3
-"""Residual motion after a turn that is neglected, relative to speed and radius, and in rad."""
+"""Residual motion after a turn that is neglected: relative to speed and radius, and angles in
+rad.
+"""
 _SETTLING_TIME = 4.0
 """Number of time constants after which the motion behind a turn has decayed."""
 

@@ -746,7 +746,7 @@ class SteadinessLimits(Config):
 
     Attributes:
         heading_swing: largest peak-to-peak range of the heading in rad in the steady state without
-            noise: from 10/7 of the conditions' duration on (20 s for 14 s).
+            noise, evaluated from 10/7 of the duration of the conditions on (20 s for 14 s).
         rudder_swing: largest peak-to-peak range of the rudder command in rad in that interval.
         overshoot: largest overshoot in rad of the nominal vessel without delay and bias, over
             changes of heading of all sizes.
@@ -792,7 +792,8 @@ class LimitCycleTest:
         sampled_steps = self.conditions.sample_steps(
             limits.flights + _N_NOMINAL, conditions.dt, generator
         )
-        # a loop swings first where delay, K and T are at their bounds, which few draws come near
+        # limit cycles appear first where delay, K and T are at their bounds, which random samples
+        # rarely approach
         sampled_steps = self.conditions.with_corner_rows(
             sampled_steps, limits.flights // 2, generator
         )
@@ -812,7 +813,7 @@ class LimitCycleTest:
         n_varied = self.limits.flights
         max_swing, max_overshoot, _ = limits.limits_for(trajectories.axis)
         overshoots = trajectories.step_metrics(self.conditions)["overshoot"]
-        # what is no number is not within its limit
+        # NaN is not within a limit
         is_steady = (axis_swing <= max_swing) & (rudder_swing <= limits.rudder_swing)
         is_steady[n_varied:] &= overshoots[n_varied:] <= max_overshoot
         return int((~is_steady).sum())
@@ -823,7 +824,7 @@ def count_excess_overshoots(overshoot: Tensor, limit: float) -> int:
 
     Args:
         overshoot: overshoot of N simulations in rad, [N]; NaN counts as above the limit.
-        limit: in rad.
+        limit: limit in rad.
     """
     n_beyond = int((~(overshoot <= limit)).sum())
     return max(n_beyond - len(overshoot) // 20, 0)
@@ -1031,7 +1032,7 @@ class CandidateEvaluation:
         if n_candidates not in self.cached_arguments:
             repeated_steps = self.steps.repeat(n_candidates)
             x, w, s = simulation.rollout_arguments(repeated_steps)
-            # rows next to each other in memory, as the compiled flights take them
+            # contiguous rows, as the compiled simulation requires
             self.cached_arguments[n_candidates] = (
                 repeated_steps,
                 (x, w.permute(1, 2, 0).contiguous().permute(2, 0, 1), s),
@@ -1047,7 +1048,7 @@ class CandidateEvaluation:
                     rollout, *arguments, row_tensors=per_row_names
                 )
         except ExportError:
-            # what cannot be compiled is flown as it is
+            # a loop that cannot be compiled is simulated in torch
             self.compiler = None
             return simulation.simulate(steps)
         return simulation.to_trajectories(

@@ -98,7 +98,8 @@ class NetworkPredictor(Predictor):
     Inputs are velocities, heel and, with a rate limit, the rudder angle. In calm water position and
     heading do not affect the motion, so that the network predicts the change of the heading only.
     With linear layers, as in the listing of the source, the map is affine: exact for Nomoto's
-    model, but only a tangent for the 4-DOF vessel (correction G21).
+    model, but only a tangent for the 4-DOF vessel (G21 in
+    docs/documents/corrections.md).
 
     Args:
         state: names of the state of the vessel.
@@ -239,7 +240,7 @@ class NominalSteering(Dynamics):
 
 
 class _PredictiveLawConfig(Config):
-    """The settings of the law (6.4)."""
+    """Settings of the control law of Gouletas 2020, eq. (6.4)."""
 
     horizon: Seconds = Field(gt=0)
     candidates: int = Field(default=41, ge=3, le=10_001)
@@ -338,7 +339,7 @@ class PredictiveConfig(_PredictiveLawConfig):
         horizon: horizon of the prediction, in s; the heading does not settle with the
             document's 0.01 s (see docs/documents/corrections.md).
         candidates: number of rudder angles that are compared, evenly spaced between the limits.
-        weight: weight in (6.4) of the angle with the smallest heading error, from 0 to 1.
+        weight: weight in eq. (6.4) of the angle with the smallest heading error, from 0 to 1.
         hidden: widths of the hidden layers; the document has 20 units for Nomoto's model and 30 for
             the 4-DOF vessel.
         linear: whether activations are omitted, as in the document's listing (correction G21).

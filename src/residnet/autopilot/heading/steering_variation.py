@@ -43,7 +43,7 @@ class Axis(NamedTuple):
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """The states that noise is added to: value, angle and rate."""
+        """The states to which measurement noise is added: value, angle and rate."""
         return tuple(dict.fromkeys((self.value, self.angle, self.rate)))
 
 
@@ -88,7 +88,7 @@ class VariedPlant(Dynamics):
     depth. The other inputs of the plant follow in their order.
 
     Raises:
-        ConfigError: where the vessel lacks the command of the axis.
+        ConfigError: if the vessel lacks the command of the axis.
     """
 
     def __init__(
@@ -189,7 +189,7 @@ class VariedModel(Dynamics):
         axis: the controlled axis.
 
     Raises:
-        ConfigError: where the model has a memory and another step.
+        ConfigError: if the model has a memory and another time step.
     """
 
     def __init__(

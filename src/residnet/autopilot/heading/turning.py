@@ -72,7 +72,7 @@ class ManoeuvreRecord:
     usable: NDArray[np.bool_]
 
     def subsample(self) -> ManoeuvreRecord:
-        """Return every n-th sample so that at most `_MAX_COARSE_SAMPLES` are left."""
+        """Return every n-th sample, at most `_MAX_COARSE_SAMPLES` in all."""
         stride = slice(None, None, -(-len(self.rudder) // _MAX_COARSE_SAMPLES))
         dt = self.dt * (stride.step or 1)
         return ManoeuvreRecord(dt, self.rudder[stride], self.yaw_rate[stride], self.usable[stride])
@@ -278,7 +278,7 @@ class NomotoModel:
     restoring: float = 0.0
 
     def to_json(self) -> dict[str, float]:
-        """Return the numbers under the keys of stored policies and of controllers.json."""
+        """Return the parameters with the keys of stored policies and of controllers.json."""
         return {
             "gain": self.gain,
             "time": self.time,
@@ -288,5 +288,5 @@ class NomotoModel:
 
     @classmethod
     def from_json(cls, content: Mapping[str, float]) -> NomotoModel:
-        """Read the numbers that `to_json` wrote."""
+        """Read the parameters that `to_json` wrote."""
         return cls(content["gain"], content["time"], content["speed"], content["righting"])

@@ -356,7 +356,7 @@ def _identify_rudder_gear(plant: Plant, axis: Axis) -> tuple[float | None, float
     rate_at_half_small = rudder_rate_at(0.01)
     if abs(rate_at_large - rudder_rate_at(0.5)) <= 1e-6 * abs(rate_at_large):
         return rate_at_large, None
-    # what is at its command within a step has no lag
+    # a gear that reaches its command within a step has no lag
     has_lag = (
         abs(rate_at_small - 2.0 * rate_at_half_small) <= 1e-6 * abs(rate_at_small)
         and rate_at_small * dt < 0.5 * 0.02
@@ -431,6 +431,6 @@ class SteeredModel(SteeredVessel):
     def straight_course(self, speed: Tensor) -> tuple[Tensor, Tensor]:
         x, w = self.vessel.straight_course(speed)
         vessel_states = dict(zip(self.vessel.state, x.unbind(1), strict=True))
-        # what the vessel does not have, such as roll, is at rest
+        # states that the vessel does not have, such as roll, are zero
         zero_state = torch.zeros_like(speed)
         return torch.stack([vessel_states.get(name, zero_state) for name in self.state], dim=1), w

@@ -26,16 +26,16 @@ from residnet.report.figure_files import figures_section, read_figures, write_fi
 from residnet.report.run_reader import JsonObject, RunFiles
 
 TRACKS_FILE = "tracks.parquet"
-"""Flights of the nominal vessel."""
+"""File of the simulations of the nominal vessel."""
 COURSES_FILE = "courses.parquet"
-"""The plans."""
+"""File of the planned courses."""
 SPREAD_FILE = "spread.parquet"
-"""One line for each flight of the spread, where there is one."""
+"""File with a row for each simulation of a random vessel; only if the config asks for them."""
 PROTOCOL_RULES = {
     "enter": "Every buoy's circle of acceptance is to be entered.",
     "sides": "Every buoy is to be passed on its side, outside its circle.",
 }
-"""What each protocol demands."""
+"""Description of the rule of each protocol."""
 _DASHES = {"course": "solid", "lookahead": "long", "enclosure": "short", "integral": "dense"}
 _GUIDANCE_SUFFIXES = {
     "course": "",
@@ -92,7 +92,7 @@ def _iterate_course_figures(run: RunFiles) -> Iterator[Figure]:
 
 
 def _run_styles(runs: Any, column: str) -> dict[str, GlyphStyle]:
-    """Return how the flights of each controller and guidance look."""
+    """Return the style of the curves of each controller and guidance."""
     controllers = runs[column].drop_duplicates().tolist()
     model_pairs = runs[[column, "guidance"]].drop_duplicates()
     return {
@@ -139,7 +139,7 @@ def _protocol_case(
     }
     panels: list[dict[str, Curve]] = [track, *({} for _ in _PANELS)]
     panels[2]["limits"] = (np.zeros(2), limit)
-    # what leaves the picture has lost the course
+    # a vessel that leaves the picture has lost the course
     plan_coordinates = [
         np.concatenate((plan[name], buoy_coordinates))
         for name, buoy_coordinates in (("east", east), ("north", north))
@@ -235,7 +235,7 @@ def sections(run: RunFiles) -> list[Section]:
     """Return the sections: times and margins by protocol, explanations, and figures.
 
     Raises:
-        UsageError: where the folder holds no metrics.json.
+        UsageError: if the folder has no metrics.json.
     """
     write_figures(run.path / "figures", _iterate_course_figures(run))
     sections_written: list[Section] = []
@@ -259,7 +259,7 @@ def sections(run: RunFiles) -> list[Section]:
 def _rows_by_protocol(
     rows: Sequence[JsonObject],
 ) -> dict[str, tuple[list[JsonObject], list[JsonObject]]]:
-    """Return the rows of the nominal flights and of the spread by protocol."""
+    """Return the rows of the nominal vessel and of the random vessels by protocol."""
     rows_by_protocol: dict[str, tuple[list[JsonObject], list[JsonObject]]] = {}
     for row in rows:
         nominal_rows, spread_rows = rows_by_protocol.setdefault(row["protocol"], ([], []))
@@ -273,7 +273,7 @@ def _rule_text(rows: Sequence[JsonObject]) -> str:
 
 
 def tables_text(rows: Sequence[JsonObject]) -> str:
-    """Return the tables of a course run, of the rows of metrics.json, for the terminal."""
+    """Return the tables of a course run for the terminal, from the rows of metrics.json."""
     texts = []
     for nominal_rows, spread_rows in _rows_by_protocol(rows).values():
         texts += [_rule_text(nominal_rows), nominal_table(nominal_rows).to_text()]
@@ -282,7 +282,7 @@ def tables_text(rows: Sequence[JsonObject]) -> str:
 
 
 def nominal_table(rows: Sequence[JsonObject]) -> Table:
-    """Return time, margin and cross-track error of the nominal flights of one protocol."""
+    """Return the table of time, margin and cross-track error of the nominal vessel."""
 
     def count_column(key: str) -> Any:
         return lambda row: flag_cell(f"{row[key]} of {row['n']}", row[key] != row["n"])
@@ -314,7 +314,7 @@ def nominal_table(rows: Sequence[JsonObject]) -> Table:
 
 
 def spread_table(rows: Sequence[JsonObject]) -> Table:
-    """Return shares and medians over the flights of the spread of one protocol."""
+    """Return the table of fractions and medians over the random vessels of one protocol."""
     return build_table(
         rows,
         [

@@ -30,11 +30,11 @@ from residnet.report.figure_files import figures_section, read_figures, write_fi
 from residnet.report.run_reader import JsonObject, RunFiles
 
 RESPONSES_FILE = "flights.parquet"
-"""Responses at the corners of the spread."""
+"""File of the responses at the corners of the parameter ranges."""
 VESSELS_FILE = "plants.parquet"
-"""What each random vessel gave."""
+"""File of the metrics of each random vessel."""
 CONDITIONS_FILE = "conditions.parquet"
-"""What each flight under the stated conditions cost, by controller."""
+"""File of the metrics of each simulation under the stated conditions, by controller."""
 
 
 class AxisWords(NamedTuple):
@@ -53,12 +53,12 @@ _DEPTH_WORDS = AxisWords("depth", "m", 1.0, "pitch rate", "stern planes", ("z", 
 
 
 def _config_as_run(run: RunFiles) -> Mapping[str, Any]:
-    """Return the config with the simulated times, scaled by its pace."""
+    """Return the config with all times scaled by its pace, as simulated."""
     return {**run.resolved_config, **run.task_metrics.get("flown", {})}
 
 
 def axis_words(test: Mapping[str, Any]) -> AxisWords:
-    """Return the words of a run by its `test`."""
+    """Return the words for the controlled axis of a run, by its `test`."""
     return _DEPTH_WORDS if test.get("depth") else _HEADING_WORDS
 
 
@@ -114,7 +114,7 @@ def _iterate_autopilot_figures(run: RunFiles) -> Iterator[Figure]:
 
 
 def _controller_styles(kinds: Mapping[str, str]) -> dict[str, GlyphStyle]:
-    """Return how each controller looks; policies have the widest lines and lie on top."""
+    """Return the style of each controller; policies have the widest lines and are drawn last."""
     return {
         name: replace(style, width=1.8, z_order=4) if kinds[name] == "policy" else style
         for name, style in style_family(kinds, width=1.2).items()
@@ -124,7 +124,7 @@ def _controller_styles(kinds: Mapping[str, str]) -> dict[str, GlyphStyle]:
 def _response_figure(
     series: pd.DataFrame, kinds: Mapping[str, str], test: JsonObject, name: str
 ) -> Figure:
-    """Draw a step of the nominal vessel; of policies, the corners of the spread as shades."""
+    """Draw a step of the nominal vessel; for policies also the corners of the ranges, shaded."""
     axis_labels = axis_words(test)
     (change, settling_band) = _step_and_band(test)
     value, rate = axis_labels.columns
@@ -288,7 +288,7 @@ def _cost_figure(
 
 
 def _learning_figure(notes_by_policy: Mapping[str, JsonObject], name: str) -> Figure:
-    """Draw the cost over the flights that epochs are chosen on, from the start of training on."""
+    """Draw the cost over the validation simulations, from the start of the training on."""
     panel: dict[str, Curve] = {}
     for policy, fit in notes_by_policy.items():
         curve = [point for point in fit["curve"] if "validation" in point]
@@ -316,7 +316,7 @@ def sections(run: RunFiles) -> list[Section]:
     """Return costs, comparison, effort, figures and controllers of an autopilot run.
 
     Raises:
-        UsageError: where the folder holds no metrics.json.
+        UsageError: if the folder has no metrics.json.
     """
     write_figures(run.path / "figures", _iterate_autopilot_figures(run))
     test = _config_as_run(run)["test"]
@@ -363,7 +363,7 @@ def sections(run: RunFiles) -> list[Section]:
 
 
 def _rows_by_model(rows: Sequence[JsonObject], protocol: str) -> dict[str, dict[str, JsonObject]]:
-    """Return the rows of the controllers that have one of that protocol, by model and protocol."""
+    """Return the rows of the controllers with a row of a protocol, by model and protocol."""
     rows_by_model: dict[str, dict[str, JsonObject]] = {}
     for row in rows:
         rows_by_model.setdefault(row["model"], {})[row["protocol"]] = row
@@ -377,7 +377,7 @@ def _rows_by_model(rows: Sequence[JsonObject], protocol: str) -> dict[str, dict[
 def settling_table(
     rows: Sequence[JsonObject], reference_controller: str | None, axis_labels: AxisWords
 ) -> Table:
-    """Return settling time, overshoot and steady errors, a row for each controller.
+    """Return the table of settling time, overshoot and steady errors by controller.
 
     Args:
         reference_controller: the controller whose nominal settling time the others are divided by.
@@ -424,7 +424,7 @@ def settling_table(
 
 
 def effort_table(rows: Sequence[JsonObject], axis_labels: AxisWords) -> Table:
-    """Return what a change costs over random vessels, and what a course costs at sea."""
+    """Return the table of control effort: of a change over random vessels, and in waves."""
     groups = [
         (f"absolute error [{axis_labels.unit} s]", 2),
         (f"{axis_labels.rudder} travel [deg]", 2),
@@ -502,7 +502,7 @@ def _effort_text(test: JsonObject) -> list[str]:
 
 
 def best_classical_row(rows: Sequence[JsonObject]) -> JsonObject:
-    """Return the row of the classical controller with the least mean cost."""
+    """Return the row of the classical controller with the smallest mean cost."""
     of_conditions = [row for row in rows if row["protocol"] == "conditions"]
     classical = [row for row in of_conditions if row["kind"] == "classical"]
     return min(classical or of_conditions, key=_mean_cost)
@@ -513,7 +513,7 @@ def _mean_cost(row: JsonObject) -> float:
 
 
 def cost_sentences(rows: Sequence[JsonObject]) -> list[str]:
-    """Return a sentence for each learned policy, the cheapest first: its cost and the best law's.
+    """Return a sentence for each learned policy on its cost and that of the best classical law.
 
     It is empty without operating conditions.
     """
@@ -580,7 +580,7 @@ def cost_table(rows: Sequence[JsonObject], axis_labels: AxisWords) -> Table:
 
 
 def extrapolation_table(rows: Sequence[JsonObject]) -> Table | None:
-    """Return mean and worst costs outside the conditions of training; None without such flights."""
+    """Return the table of costs outside the conditions of training; None without simulations."""
     tests = list(
         dict.fromkeys(row["protocol"] for row in rows if row["protocol"].startswith("beyond_"))
     )

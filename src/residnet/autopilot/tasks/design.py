@@ -111,7 +111,7 @@ def _require_excitation(logs: Sequence[Log], records: Sequence[ManoeuvreRecord])
     """Refuse a rudder that a controller set from the heading, without steps or manoeuvres.
 
     Raises:
-        DataError: where feedback explains the rudder beyond its effect on the yaw rate.
+        DataError: if feedback explains the rudder beyond its effect on the yaw rate.
     """
     signals = []
     for log, record in zip(logs, records, strict=True):

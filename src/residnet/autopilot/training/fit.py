@@ -33,7 +33,9 @@ from residnet.training.trainer import EpochTraining, run_epochs
 _LATE_FRACTION = 1.0 / 3.0
 """Final fraction of a simulation in which the rudder of a stable loop should be constant."""
 _ALL_REJECTED = 1_000_000
-"""Number of rejected simulations of an epoch that costs more than the start; more than exist."""
+"""Number of rejected simulations that stands for an epoch with a higher cost than the initial
+policy; larger than any actual number.
+"""
 _SMALL_STEP_FRACTION = 0.6
 """Fraction of the range of reference changes used for simulations without noise."""
 _DIVERGED_COST_RATIO = 1.15
@@ -203,7 +205,7 @@ class PolicyFit(EpochTraining):
 
         Args:
             trajectories: simulations of a batch.
-            overshoot: their overshoot [B] in rad or m.
+            overshoot: overshoot [B] of the simulations in rad or m.
             n_quiet: number of simulations without noise, which come first.
         """
         settings = self.settings

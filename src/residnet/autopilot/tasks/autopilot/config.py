@@ -60,7 +60,7 @@ class PolicyConfig(Config):
             with such an inner law). The network is added to this law; its tuned constants are the
             initial values of the training. Null for a network alone, without law,
             observer or predictor.
-        units: of the recurrent network; 0 trains the constants of a law alone.
+        units: number of units of the recurrent network; 0 to train the constants of a law only.
         learned: learned model to train on instead of the vessel; the policy is
             compared on the vessel.
         training: settings of the training.
@@ -380,7 +380,7 @@ class AutopilotConfig(PackageTask, ComputingTask):
             model.estimate_nomoto(self.rudder, self.turning_time, dt)
 
     def training_vessel(self, name: str) -> SteeredPlant | SteeredModel:
-        """Return what a policy is trained on: the vessel under the conditions, or a learned model.
+        """Return the vessel of a training: the vessel under the conditions, or a learned model.
 
         Raises:
             UsageError: if the run or the model is missing.
@@ -470,7 +470,7 @@ class AutopilotConfig(PackageTask, ComputingTask):
 
 
 _PUSH_STD_FACTOR = 2.0
-"""Standard deviations of the slow push that the rudder must be able to hold."""
+"""Number of standard deviations of the slow disturbance that the rudder must compensate."""
 _REFERENCE_STEP = math.radians(30.0)
 REFERENCE_STEERING = NomotoModel(3.47, 3.94, 3.2), math.radians(5.0)
 """K, T and rudder of the vessel of Gouletas 2020; times in configs refer to it at a pace of one."""
@@ -479,7 +479,7 @@ REFERENCE_STEERING = NomotoModel(3.47, 3.94, 3.2), math.radians(5.0)
 def minimum_turn_time(
     nomoto: NomotoModel, rudder_limit: float, rate: float | None, change: float = _REFERENCE_STEP
 ) -> float:
-    """Return the least time in s of a change of heading [rad] by T r_dot + r = K delta.
+    """Return the smallest time in s of a change of heading [rad] by T r_dot + r = K delta.
 
     Time-optimal control: full rudder, then full counter-rudder until the yaw rate is zero at the
     new heading. The finite rate of the rudder adds the time of two movements from amidships.

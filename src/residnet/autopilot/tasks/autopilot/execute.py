@@ -84,7 +84,7 @@ Controllers = dict[str, tuple[str, Policy]]
 
 
 def execute(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
-    """Tune, train and compare."""
+    """Tune classical laws, train policies, and compare them."""
     config = config.with_scaled_times()
     vessel = config.steered_vessel
     nomoto = vessel.estimate_nomoto(config.rudder, config.turning_time)
@@ -112,7 +112,7 @@ def execute(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
             name, base_law, steering, config, folder
         )
         controllers = {name: (policy_config.role, policy), **controllers}
-        # what it is compared with: itself untrained, and without its network
+        # references of the comparison: the untrained policy, and the policy without its network
         if policy_config.units > 0:
             ablations[f"{name} untrained"] = ("untrained", untrained_policy)
             if isinstance(policy, ObserverPolicy | DepthPolicy):
@@ -132,7 +132,7 @@ def execute(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
         ("heading_swing", "rudder_swing", "error_end", "heading_rms", "rudder_rms", "heel_rms"),
         "rad",
     )
-    # what is of the heading error in rad is of the depth's in m
+    # metrics of the heading error in rad are metrics of the depth error in m
     depth_units = {"rad": "m", "rad s": "m s"} if config.test.depth else {}
     for name in ("overshoot", "iae", "heading_swing", "error_end"):
         channels[name] = depth_units.get(channels[name], channels[name])
@@ -268,7 +268,7 @@ def _train_policy_or_resume(
         notes |= {"seconds": round(seconds, 1), "cpu_seconds": round(cpu, 1)}
         notes |= {"constants": policy.constant_values()}
         store.save_module(name, spec, policy, notes)
-        # as a resumed run reads it
+        # reloaded, so that a resumed run has the same policy
         policy = rebuild_module(spec, policy)
     untrained_policy = spec.build().eval().requires_grad_(False).double()
     policy.set_step(steering.dt)
@@ -288,7 +288,7 @@ def load_trained_policy(
     """Return a trained policy of a finished run, at a step of dt seconds.
 
     Raises:
-        UsageError: where the run lacks it, or it is not as it was written.
+        UsageError: if the run lacks the policy, or its files were changed.
     """
     policy = load_recurrent(models / name, config.policy_spec_class(name))
     policy.set_step(dt)
@@ -462,8 +462,9 @@ def export_model(config: AutopilotConfig, request: ExportRequest) -> Path:
 
     Raises:
         UsageError: if the run has no policy of this name.
-        WithheldError: where a classical controller costs less, but for `asked.anyway`.
-        ExportError: where the file does not reproduce the policy.
+        WithheldError: if a classical controller has a lower cost and `request.allows_objections` is
+            false.
+        ExportError: if the file does not reproduce the policy.
     """
     name = request.resolve_model_name(config.policies)
     rows = read_json(request.run.metrics)["rows"]
