@@ -20,8 +20,8 @@ from residnet.core.errors import ConfigError
 KeyPath = tuple[str | int, ...]
 """Path to a value of a config: keys of mappings and indices of lists."""
 
-# limits on values, nesting levels and digits: no config is near them, and a file far beyond them
-# would occupy the parser for minutes
+# limits on values, nesting levels and digits of a number: no config is near them, and a file far
+# beyond them would occupy the parser for minutes
 _MAX_VALUES = 200_000
 _MAX_DEPTH = 60
 _MAX_DIGITS = 400

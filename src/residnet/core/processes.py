@@ -22,7 +22,9 @@ from residnet.core.trust import is_trusted, set_trusted
 _TRIM_THRESHOLD = -1
 _MMAP_THRESHOLD = -3
 _MAX_KEPT_BYTES = 128 << 20
+"""Freed memory in bytes that the process retains at most."""
 _MAX_REUSED_BYTES = 64 << 20
+"""Size in bytes of a block above which it is returned to the system at once."""
 
 
 def retain_freed_memory() -> None:

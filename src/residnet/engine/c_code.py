@@ -556,7 +556,7 @@ def _cache_path(compiler_path: str, source: str, flags: Sequence[str]) -> Path:
 
 
 def _cache_folder() -> Path:
-    """Return the folder of the cache."""
+    """Return the folder of compiled libraries, which later processes reuse."""
     if folder := os.environ.get("RESIDNET_CACHE"):
         return Path(folder) / "residnet-cache"
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"

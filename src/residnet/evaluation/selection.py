@@ -91,7 +91,7 @@ class SelectionBlocks:
 
     @property
     def n_blocks(self) -> int:
-        """Number of blocks."""
+        """Number of blocks of validation data."""
         return len(self.weights)
 
     @property

@@ -520,7 +520,7 @@ class CompiledModel(LoadedExport):
         self.output_sizes = self._result_sizes()
 
     def _result_sizes(self) -> dict[str, int]:
-        """Return the sizes of the results."""
+        """Return the number of entries of each result of a step, by name."""
         zero_arguments = [
             torch.zeros(1, n_entries, dtype=torch.float64)
             for _, n_entries in self.exported.arguments

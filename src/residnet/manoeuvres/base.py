@@ -101,7 +101,7 @@ class Helm:
         )
 
     def state_column(self, name: str) -> int:
-        """Return the column of a state.
+        """Return the index of the column of a state in x.
 
         Raises:
             UsageError: if the vessel has no such state.
@@ -135,7 +135,7 @@ def require_state(name: str, state_names: Sequence[str]) -> None:
     """Check that a vessel has a state that a manoeuvre observes.
 
     Raises:
-        UsageError: if it has not.
+        UsageError: if it does not have the state.
     """
     if name not in state_names:
         raise UsageError(

@@ -209,8 +209,8 @@ class Excitation(ScheduledManoeuvre, ABC):
         sway_amplitude: largest sway force to either side as a share of its limit, for vessels whose
             commands are forces.
         dive_amplitude: largest dive to either side, for vessels that dive.
-        own_amplitude: amplitude of an independent wave of each command, as a share of full steer,
-            which makes the effects of several thrusters distinguishable.
+        own_amplitude: amplitude of an additional independent wave of each command, as a share of
+            full steer, which makes the effects of several thrusters distinguishable.
         band: frequencies that are excited.
         seed: seed of the random waves.
         start: time at which the waves begin, after an approach with the mean drive.
@@ -389,7 +389,7 @@ class ExcitationFamily(ManoeuvreFamily):
     start: Seconds = 5.0
 
     def _sample_common(self, generator: np.random.Generator) -> dict[str, Any]:
-        """Draw the settings that all excitations have."""
+        """Draw the settings that all kinds of excitation have in common."""
         settings: dict[str, Any] = {
             name: sample_uniform(generator, getattr(self, name))
             for name in ("drive", "drive_amplitude", "steer_amplitude")

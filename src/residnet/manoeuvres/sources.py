@@ -1,4 +1,4 @@
-"""Sources of inputs that fly manoeuvres side by side in one batch."""
+"""Sources of inputs that simulate several manoeuvres in one batch."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Simulated sea trials: manoeuvres that a plant or a learned model flies, and their logs.
+"""Simulated sea trials: manoeuvres of a plant or a learned model, and their logs.
 
-Forces, current, wind and waves surround a vessel, and sensors measure it.
+Forces, current, wind and waves act on a vessel, and sensors with errors measure its motion.
 """
 
 from __future__ import annotations
@@ -272,5 +272,5 @@ def build_trial_vessel(config: SimulatedTrials) -> SimulatedVessel:
 
 
 def simulate_trial_logs(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Log]:
-    """Return the logs of `simulate_trials`."""
+    """Simulate trials and return their logs only; see `simulate_trials`."""
     return [run.measured_log for run in simulate_trials(manoeuvres, config)]

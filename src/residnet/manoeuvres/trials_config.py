@@ -149,7 +149,7 @@ class DisturbanceConfig(Config):
         """Check that a plant has the inputs of this disturbance.
 
         Raises:
-            ConfigError: with the first missing input.
+            ConfigError: if an input is missing; names the first one.
         """
         for name, key in self.required_plant_inputs().items():
             if name not in plant.input_names:
@@ -268,9 +268,9 @@ class SensorsConfig(Config):
     """White noise of the measured velocities, and errors of the sensors of other channels.
 
     Attributes:
-        u: standard deviation in m/s.
-        v: standard deviation in m/s.
-        r: standard deviation in rad/s.
+        u: standard deviation of the noise of u in m/s.
+        v: standard deviation of the noise of v in m/s.
+        r: standard deviation of the noise of r in rad/s.
         sensors: sensors by channel; other channels are exact.
     """
 

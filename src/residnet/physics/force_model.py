@@ -62,7 +62,7 @@ class ForceCorrection(nn.Module):
 
 @final
 class ForceCorrectionSum(nn.Module):
-    """Sum of force corrections [..., 3]."""
+    """The force [..., 3] of several corrections of a hull model together."""
 
     def __init__(self, corrections: Sequence[nn.Module] | nn.ModuleList) -> None:
         super().__init__()

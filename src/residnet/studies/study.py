@@ -24,8 +24,8 @@ StudyResults = Mapping[str, Any]
 class StudyTask(PackageTask):
     """A computational experiment of a document, with its results in one JSON file.
 
-    The module `execute` beside the config has the functions `compute_results(config, folder)`,
-    which returns the results for JSON and the figures, `summarize(config, results)`,
+    The module `execute` in the package of the config has the functions `compute_results(config,
+    folder)`, which returns the results for JSON and the figures, `summarize(config, results)`,
     `main_figures(config, results)` and `build_sections(config, results, run)`, and optionally
     `exports(config, folder)`.
     """
@@ -40,7 +40,7 @@ class StudyTask(PackageTask):
         folder.write_json(folder.path / self.results_file, results)
         for figure in figures:
             write_figure(folder.figures, figure)
-        # as a reader of the file sees them
+        # reloaded from the file, as the report reads them
         stored_results: StudyResults = read_json(folder.path / self.results_file)
         sentences: list[str] = self.call_executor("summarize", stored_results)
         metrics: dict[str, SummaryMetric] = self.call_executor("main_figures", stored_results)
@@ -143,7 +143,7 @@ def plot_time_series(
 
     Args:
         name: name of the figure.
-        title_and_caption: its title and caption.
+        title_and_caption: title and caption of the figure.
         styles: styles of the paths and shared traces by name.
         t: time [T].
         paths: columns [T, n] by name.

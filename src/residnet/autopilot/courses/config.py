@@ -132,8 +132,7 @@ def buoy_feasibility(
 ) -> list[dict[str, float | bool]]:
     """Describe how the radii of the buoys compare with the smallest turning radius in m.
 
-    Both courses of Gouletas 2020 have radii below it (correction G18 in
-    docs/documents/corrections.md).
+    Both courses of Gouletas 2020 have radii below it (see G18 in docs/documents/corrections.md).
     """
     return [
         {

@@ -342,7 +342,8 @@ class PredictiveConfig(_PredictiveLawConfig):
         weight: weight in eq. (6.4) of the angle with the smallest heading error, from 0 to 1.
         hidden: widths of the hidden layers; the document has 20 units for Nomoto's model and 30 for
             the 4-DOF vessel.
-        linear: whether activations are omitted, as in the document's listing (correction G21).
+        linear: whether activations are omitted, as in the document's listing (see G21 in
+            docs/documents/corrections.md).
         training: settings of the training.
     """
 

@@ -87,7 +87,7 @@ class SteeredVessel(ABC):
 
     @final
     def state_column(self, name: str) -> int:
-        """Return the column of a state."""
+        """Return the index of the column of a state in x."""
         return self.state.index(name)
 
     @final

@@ -18,6 +18,7 @@ from residnet.preprocessing.compatibility.sensors import Sensor
 MIN_MARGIN = 20.0
 """Difference of the BIC below which two hypotheses are not distinguished."""
 _MIN_EFFECTIVE_SHARE = 0.02
+"""Smallest fraction of the samples that counts as independent when residuals are autocorrelated."""
 
 
 @dataclass(frozen=True)

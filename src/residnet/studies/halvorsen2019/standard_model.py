@@ -116,8 +116,8 @@ def standard_accelerations(
 ) -> np.ndarray:
     """Return nu_dot = M^-1 (tau - C nu - D nu), [N, 3].
 
-    M_A(3,2) = -N_vdot and M_A(3,3) = -N_rdot (correction H18), C is skew-symmetric (corrections H4,
-    H19), and D = -diag(...) (correction H1).
+    M_A(3,2) = -N_vdot, M_A(3,3) = -N_rdot, C is skew-symmetric and D = -diag(...), which the
+    document misprints (H1, H4, H18, H19 in docs/documents/corrections.md).
 
     Args:
         p: parameters [14] in SI units, in the order of `STANDARD_PARAMETER_NAMES`.
@@ -169,7 +169,7 @@ def fit_standard_model(
         starting point, in ascending order.
 
     Raises:
-        FitError: with fewer samples than parameters, or if no start leads to finite errors.
+        FitError: if there are fewer samples than parameters, or no start gives finite errors.
     """
     from scipy.optimize import least_squares
 

@@ -98,7 +98,9 @@ class LoopConfig(Config):
 
 
 class MotionNoise(Config):
-    """White measurement noise, drawn at every step (Table 4.14, correction J25).
+    """White measurement noise, drawn at every step.
+
+    Source: Jervan 2020, Table 4.14; see J25 in docs/documents/corrections.md.
 
     Attributes:
         position: standard deviation of x and y in m.

@@ -2,7 +2,7 @@
 
 The residual is the force that the hull model does not explain: tau - F(nu_dot, nu) (3.19), (3.20).
 It is regressed on basis functions of the motion (chapters 3 and 4); a model runs forward in time by
-(3.22) (Jervan 2020).
+eq. (3.22) of Jervan 2020.
 """
 
 from __future__ import annotations
@@ -343,9 +343,9 @@ class ForceRecord:
         return float(self.t[1] - self.t[0])
 
     def motion_ranges(self, *, mirror: bool) -> list[tuple[float, float]]:
-        """Return the least and most of nu_dot and nu of the training samples, six.
+        """Return the ranges of nu_dot and nu over the training samples, six pairs.
 
-        With `mirror` the mirror images of the samples count too.
+        With `mirror` the mirror images of the samples are included.
         """
         motion = torch.cat((self.nu_dot, self.nu), dim=-1)[self.is_training]
         if mirror:
@@ -376,7 +376,7 @@ class ResidualForceModel(NamedTuple):
     fit: RegressionFit
 
     def residual_along(self, record: ForceRecord) -> Tensor:
-        """Return the residual [N, 3] that the model leaves along a record, in N, N, N m.
+        """Return the remaining residual [N, 3] of the model along a record, in N, N, N m.
 
         The model is compared with the command, or through its lag with the force that follows it.
         """
@@ -388,9 +388,9 @@ class ResidualForceModel(NamedTuple):
         return self.force.force_residual(force, record.nu_dot, record.nu, record.pose[:, HEADING])
 
     def test_mse(self, record: ForceRecord) -> list[float]:
-        """Return the mean square of what remains of the measurements as logged, by axis.
+        """Return the mean square of the remaining residual of the unsmoothed measurements, by axis.
 
-        It is over the test samples, in N^2, N^2, (N m)^2.
+        The mean is over the test samples, in N^2, N^2, (N m)^2.
         """
         return mean_squares_by_axis(self.residual_along(record)[~record.is_training])
 
@@ -405,10 +405,10 @@ def fit_model(
 
     Args:
         base: the known model, F_base(nu_dot, nu).
-        lag: where the config asks for one and it is known; None to find it.
+        lag: known lag of the thrusters, if the config asks for a lag; None to identify it.
 
     Raises:
-        FitError: where the data do not determine the model.
+        FitError: if the data do not determine the model.
     """
     if config.searches_settings:
         return _search_settings(config, record, base)
@@ -476,10 +476,10 @@ def fit_model(
 def _search_settings(
     config: ResidualModelConfig, record: ForceRecord, base: ForceModel
 ) -> ResidualForceModel:
-    """Return the model of least error over left-out folds.
+    """Return the model with the smallest cross-validated error.
 
-    Tried are lag and mirror, each with and without, and no residual. Errors are in units of what
-    the base leaves, so that no residual has an error of one.
+    Candidates are models with and without lag and mirror symmetry, and a zero residual. Errors are
+    relative to the residual of the base, so that a zero residual has an error of one.
     """
     no_residual_model = ResidualForceModel(
         base, None, RegressionFit(torch.zeros(0), torch.zeros(0), torch.zeros(0))
@@ -522,10 +522,10 @@ def _search_settings(
 def refit_with_settings(
     config: ResidualModelConfig, model: ResidualForceModel, record: ForceRecord, base: ForceModel
 ) -> ResidualForceModel:
-    """Return a searched model fitted to other samples, with the settings and the lag that it has.
+    """Fit a model to other samples with its selected settings and its lag.
 
     Raises:
-        FitError: where the samples do not determine it.
+        FitError: if the samples do not determine the model.
     """
     notes = model.fit.notes
     settings = {
@@ -537,7 +537,7 @@ def refit_with_settings(
 
 
 def mirror_signs(terms: Sequence[str]) -> Tensor | None:
-    """Return the sign [J] that each basis function changes by in the mirror; None if unknown."""
+    """Return the sign [J] of the mirror image of each basis function; None if unknown."""
     signs = [
         parity
         for term in terms

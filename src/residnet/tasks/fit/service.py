@@ -112,7 +112,7 @@ class MonitoredLog:
 
     @property
     def n_windows(self) -> int:
-        """Number of windows."""
+        """Number of monitored windows of the log."""
         return len(self.scores)
 
     def to_record(self) -> MonitoredLogRow:

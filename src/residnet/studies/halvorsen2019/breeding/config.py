@@ -20,8 +20,7 @@ MASS = 10.0
 DAMPING = 13.0
 STIFFNESS = 5.0
 """The system m x_ddot + d x_dot + k x = tau (4.1) in kg, kg/s and N/m (section 5.3, (5.13)); the
-system of (4.3) has other values: 20 kg, 10 kg/s, 12 N/m (correction H24 in
-docs/documents/corrections.md).
+system of (4.3) has other values: 20 kg, 10 kg/s, 12 N/m (see H24 in docs/documents/corrections.md).
 """
 TRUE_COEFFICIENTS = {"tau_x": 1.0 / MASS, "u": -DAMPING / MASS, "x": -STIFFNESS / MASS}
 """True coefficients of u_dot (4.2) by term."""

@@ -96,7 +96,7 @@ class PreparationConfig(Config):
         interval: shortest and longest time between two samples of the log, in s.
         step: time step of the uniform grid in s.
         cutoff: cut-off frequency of the Butterworth filter as a share of the Nyquist frequency
-            (correction H27 in docs/documents/corrections.md).
+            (see H27 in docs/documents/corrections.md).
         order: order of the filter, which is run forward and backward.
         filter_inputs: whether commands and forces are filtered like the velocities. The document
             filters only the velocities; equations then also learn the filter and have smaller

@@ -198,9 +198,9 @@ class TrialSamples:
 
     Attributes:
         samples: channels `CHANNELS` and measured accelerations; `group` numbers the stretches.
-        log: number of the log that a sample belongs to [N].
-        is_validation: samples that no model is fitted to [N] bool.
-        phase: number of the phase in `physics.froude.PHASES` [N].
+        log: index of the log of each sample [N].
+        is_validation: mask of the samples that no model is fitted to [N].
+        phase: index of the phase of each sample in `physics.froude.PHASES` [N].
         step: time step in s.
     """
 
@@ -211,10 +211,10 @@ class TrialSamples:
     step: float
 
     def contiguous_indices(self, mask: np.ndarray) -> list[np.ndarray]:
-        """Return the indices of the kept samples, piece by piece without gaps.
+        """Return the indices of the selected samples, one array for each part without gaps.
 
         Args:
-            mask: samples to keep [N] bool.
+            mask: selected samples [N] bool.
         """
         starts, stops = find_runs(np.where(mask, self.samples.group.numpy(), -1))
         return [
@@ -263,8 +263,8 @@ def prepare_logs(
 
     Args:
         logs: logs with the channels u, v, r, cmd_n and cmd_nozzle.
-        vessel: vessel that sailed them, whose jets turn commands into forces.
-        config: how the logs are prepared.
+        vessel: vessel of the logs, whose water jets convert commands to forces.
+        config: settings of the preparation.
         seed: seed of the times of the samples.
     """
     from scipy.signal import butter, filtfilt
@@ -537,7 +537,7 @@ def _cutoff_figure(name: str, trials: Mapping[float, TrialSamples]) -> Figure:
 
 
 def _most_turning_samples(trial: TrialSamples, mask: np.ndarray) -> np.ndarray:
-    """Return the indices of the minute that turns most: straight runs show little."""
+    """Return the indices of the minute with the most turning, which shows most of the dynamics."""
     nozzle = trial.samples.z.numpy()[:, CHANNELS.index("cmd_nozzle")]
     segments = trial.contiguous_indices(np.broadcast_to(mask, nozzle.shape))
     segment = max(segments, key=lambda indices: float(np.abs(nozzle[indices]).sum()))

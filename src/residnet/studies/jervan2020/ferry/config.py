@@ -52,7 +52,7 @@ class PublishedFigures(Config):
         crossing_heading_mae: mean heading error in the crossing in deg (Table 4.12).
         alone: mean square error of u, v, r and of their derivatives against the desired motion
             without feedback, in (m/s)^2, (m/s)^2, (rad/s)^2 and the same per second squared
-            (Table 4.8, correction J21 in docs/documents/corrections.md).
+            (Table 4.8; see J21 in docs/documents/corrections.md).
         crossing_power: mean power in W for position and heading control in the crossing (Table
             4.13).
         coefficients: coefficients of the basis functions in surge, sway and yaw in SI units
@@ -177,6 +177,6 @@ class FerryStudyConfig(StudyTask, ComputingTask):
         )
 
     def export_model(self, request: ExportRequest) -> Path:
-        """Write the feed-forward of a model; `selected` leaves the least of the residual force."""
+        """Write the feed-forward of a model; `selected` has the smallest residual force."""
         file: Path = self.call_executor("export_model", request)
         return file

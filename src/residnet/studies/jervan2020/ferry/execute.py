@@ -284,14 +284,14 @@ class FerryStudy:
 
     Attributes:
         believed_run: the course with the believed model, from which the models are identified.
-        record: its log; one half identifies the models and the other tests them.
+        record: log of this course; one half identifies the models, the other half tests them.
         unmodelled_mse: mean square residual of the believed model on the test half, by axis in N^2,
             N^2, (N m)^2.
         models: fitted models by name, each from one half of the course.
         whole_course_models: models with a hyperparameter search, fitted to the whole course for
             export.
-        runs: by model, `believed` first, of the `course`, the `crossing`, and the course without
-            feedback (`feed_forward_alone`); empty if not simulated.
+        runs: simulations by model, `believed` first, of the `course`, the `crossing`, and the
+            course without feedback (`feed_forward_alone`); empty if not simulated.
         updates: for each feed-forward model on the changed vessel: whether it is still valid, and
             the tracking errors before and after a new identification.
     """

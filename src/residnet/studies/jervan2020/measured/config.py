@@ -37,7 +37,8 @@ class MeasuredModelConfig(ResidualModelConfig):
     """One regression of the residual of measured forces.
 
     Attributes:
-        lag: as in the base class, but not searched, since an actual force has no lag.
+        lag: whether the lag of the thrusters is identified; null for no lag, since an actual force
+            has none.
         force: force that the model explains: the actual or the commanded one.
         published: published mean square residuals on the test half of the document, without and
             with this model, in N^2, N^2, (N m)^2; from other trials.

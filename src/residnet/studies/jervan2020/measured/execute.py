@@ -246,7 +246,7 @@ def run_force_study(config: ForceResidualConfig) -> tuple[dict[str, Any], list[F
             _ACCELERATION_UNITS,
         ),
     ]
-    # of the models of the actual force, the one with the least cross-validated error
+    # the model of the actual force with the smallest cross-validated error
     actual_force_errors = {
         row["model"]: row["minus_believed"]["mean"][3]
         for row in rows
