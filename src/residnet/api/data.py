@@ -1,4 +1,4 @@
-"""Logs into Python: read, looked at by the data doctor, and prepared for a fit; configs drafted."""
+"""Logs in Python: reading, data checks, preparation for a fit, and drafts of configs."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from residnet.preprocessing.data_module import WindowsDataModule
 
 LogsLike = PathLikeArg | Log | Sequence[PathLikeArg] | Sequence[Log]
-"""Logs that were read, or where to read them."""
+"""Logs, or the paths to read them from."""
 """Recipes by name."""
 
 

@@ -419,7 +419,7 @@ def fit(
         config = make_fit_settings(data, baseline, heads, settings)
         extensions = None
         if callbacks or logger is not None:
-            # imports Lightning, which a fit without networks must not wait for
+            # imports Lightning, which takes seconds and which a fit without networks does not need
             from residnet.training.trainer import make_extensions
 
             extensions = make_extensions(callbacks, logger)

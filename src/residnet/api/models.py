@@ -446,7 +446,7 @@ def require_instance(
 
     Args:
         value: the argument.
-        expected_type: its expected type or types.
+        expected_type: expected type or types of the value.
         expected: begin of the error message.
 
     Raises:

@@ -46,7 +46,7 @@ REPLACED_VALUES: dict[str, str] = {
 
 
 def format_renaming_hint(path: tuple[str | int, ...], value: str | None = None) -> str:
-    """Return what replaces a renamed key, or a renamed or removed value; else an empty text."""
+    """Return a hint on the replacement of a renamed key or value; empty for other keys."""
     key_text = ".".join(map(str, path)) + ("" if value is None else f"={value}")
     for old_key, new_key in RENAMED_KEYS.items():
         if fnmatchcase(f".{key_text}", f"*.{old_key}"):
@@ -159,13 +159,13 @@ def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
 
     Args:
         path: YAML file; relative paths in the config are relative to its folder.
-        overrides: applied in order. `dotted.key=value` sets a YAML value, an index addresses an
-            item of a list, and `~dotted.key` removes a key.
+        overrides: overrides, applied in order. `dotted.key=value` sets a YAML value, an index
+            addresses an item of a list, and `~dotted.key` removes a key.
         model: config class, or a union of them (`Annotated[A | B, Field(discriminator="kind")]`).
 
     Raises:
-        ConfigError: with the file (and line) or override, the key path, the fault, the value and
-            the nearest valid name.
+        ConfigError: if the config is not valid. The message has the file (and line) or override,
+            the key path, the fault, the value and the nearest valid name.
     """
     path = Path(path)
     data, root = _read_mapping(path)
@@ -195,7 +195,7 @@ def validate_config(data: Any, model: Any, where: str, folder: Path | None = Non
         folder: folder in which relative paths are searched first.
 
     Raises:
-        ConfigError: as `load_config`.
+        ConfigError: if the data are not valid, see `load_config`.
     """
     return _validate_data(data, model, _ConfigOrigin(where), folder)
 
@@ -224,7 +224,7 @@ def _require_plausible_numbers(
     """Reject numbers that are so large or small that later arithmetic would overflow.
 
     Raises:
-        ConfigError: with the key of the number.
+        ConfigError: if a number is too large or too small; the message names its key.
     """
     if isinstance(data, dict | list):
         items = data.items() if isinstance(data, dict) else enumerate(data)
@@ -541,7 +541,7 @@ _FAULT_CODES = {
     "assertion_error": "config.invalid",
     **dict.fromkeys(_EXPECTED_TYPES, "config.wrong_type"),
 }
-"""Kind of pydantic's error -> code of the fault; any other kind is a violated bound."""
+"""Code of the fault by the kind of pydantic's error; any other kind is a violated bound."""
 
 
 def describe_error(
@@ -550,7 +550,7 @@ def describe_error(
     """Return the most specific fault of a validation error as one line.
 
     Args:
-        error: of pydantic.
+        error: validation error of pydantic.
         model: config class, or a union of them, that was validated.
         locate: returns the file (with line) or override that set the value at a key path.
     """

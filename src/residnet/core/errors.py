@@ -98,7 +98,7 @@ def require_package(package: str, feature: str, extra: str) -> None:
 
     Args:
         package: name of the package to import.
-        feature: what needs the package, as the subject of the message.
+        feature: feature that needs the package, as the subject of the message.
         extra: extra of residnet that installs the package.
 
     Raises:

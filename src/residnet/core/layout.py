@@ -100,9 +100,9 @@ def _is_motion(angle: np.ndarray) -> bool:
 
 
 _MIN_ANGLE_SAMPLES = 50
-"""Number of samples up to which the test is not possible."""
+"""Number of samples up to which an angle is not tested for motion."""
 _N_DEPTH_SPANS = 50
-"""Number of spans of a log over which depth changes are compared with the motion."""
+"""Number of parts of a log whose changes of depth are compared with those of the motion."""
 
 
 def _depth_follows_motion(channels: Mapping[str, np.ndarray]) -> bool:
@@ -384,7 +384,7 @@ class DegreesOfFreedom:
         """Check that the model has no depth and pitch.
 
         Args:
-            subject: what supports no depth and pitch, as the subject of the message.
+            subject: part that does not support depth and pitch, as the subject of the message.
 
         Raises:
             UsageError: if the model has six degrees of freedom.
@@ -399,7 +399,7 @@ class DegreesOfFreedom:
         """Check that the model has no roll, depth and pitch.
 
         Args:
-            subject: what supports no roll, as the subject of the message.
+            subject: part that does not support roll, as the subject of the message.
 
         Raises:
             UsageError: if the model has roll.

@@ -7,8 +7,8 @@ line that names it.
 
 A run folder has the manifest `checksums.json`, which lists every file below it. Files elsewhere
 (`export --out`, `new --out`, `inspect --out`, the logs of `demo`, the cache) are listed in
-`.residnet.json` in their folder: one record for all formats, which also covers files that have no
-room for a mark of their own. If that record is lost, the files count as the user's.
+`.residnet.json` in their folder: one record for all formats, which also covers files that
+cannot contain a mark. If that record is lost, the files count as the user's.
 
 While a command runs, the manifest grows by a journal (`checksums.jsonl`, `.residnet.jsonl`): one
 line of JSON is appended *before* the file is moved to its place, so that after a kill every file
@@ -335,13 +335,13 @@ class Manifest:
             raise UsageError(f"{self.path}: cannot be written ({error.strerror})") from error
 
     def verify(self, skipped: Collection[str] = ()) -> None:
-        """Check that each recorded file is there, is a regular file and has its SHA-256.
+        """Check that each recorded file exists, is a regular file and has the recorded SHA-256.
 
         Args:
             skipped: first parts of the names of files that are not checked.
 
         Raises:
-            UsageError: if a file is missing, a link or a device, cut off, edited or from elsewhere.
+            UsageError: if a file is missing, a link or a device, truncated, edited or replaced.
         """
         for name, versions in self.read().items():
             if PurePosixPath(name).parts[0] in skipped or None in versions:
@@ -467,7 +467,7 @@ def find_manifest(path: Path) -> Manifest:
 
 
 def require_replaceable(path: Path) -> None:
-    """Check that a file may be written: it does not exist, or residnet wrote it and it is the same.
+    """Check that a file may be written: it does not exist, or is an unchanged file of residnet.
 
     Call it before a long computation, so that its result can be written.
 

@@ -81,7 +81,7 @@ def process_pool(
 
     Args:
         workers: largest number of processes; each is started when it is first needed.
-        initialiser: called once in each process before its first task.
+        initializer: called once in each process before its first task.
         initializer_arguments: arguments of `initializer`.
 
     Raises:

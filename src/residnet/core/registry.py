@@ -231,7 +231,7 @@ class PluginUnion:
         return core_schema.with_info_wrap_validator_function(
             self._validate_python_kind,
             listed_kinds,
-            # by the class of the value, which the listed kinds may lack
+            # by the class of the value, which may not be among the listed kinds
             serialization=core_schema.plain_serializer_function_ser_schema(
                 _return_unchanged, return_schema=core_schema.any_schema()
             ),

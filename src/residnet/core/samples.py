@@ -42,7 +42,7 @@ class Samples:
         return SampleOrigins(self.group.numpy(), self.t.numpy(), self.kinds)
 
     def select_manoeuvres(self, kinds: Collection[str]) -> Samples:
-        """Return the samples of manoeuvres of given kinds; all if `kinds` is empty."""
+        """Return the samples of manoeuvres of some kinds; all samples if `kinds` is empty."""
         if not kinds:
             return self
         is_selected = torch.tensor(

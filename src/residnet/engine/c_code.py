@@ -495,7 +495,7 @@ def find_compiler() -> str:
     )
 
 
-# -O1 compiles in half the time of -O2. With -fexpensive-optimisations, which fuses products and
+# -O1 compiles in half the time of -O2. With -fexpensive-optimizations, which fuses products and
 # sums at no cost here, its code is as fast. Of -ffast-math only the flags that preserve infinities
 # and NaN: the complete option also makes the processor flush subnormal numbers in the entire
 # process from then on

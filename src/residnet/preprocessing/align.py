@@ -53,8 +53,8 @@ def align_to_grid(
     `hard:gap`. The masks of the log cover every grid point to which a masked sample contributes.
 
     Args:
-        log: with an increasing clock.
-        config: the grid.
+        log: log with an increasing clock.
+        config: settings of the grid.
         required_channels: channels whose NaN is masked; None for all channels. A channel that
             nobody uses must not exclude samples.
 
@@ -103,8 +103,8 @@ def resample_at(log: Log, config: GridConfig, times: np.ndarray) -> Log:
     """Return the log at given times by the rules of `align_to_grid`.
 
     Args:
-        log: with an increasing clock.
-        config: its step is the averaging length.
+        log: log with an increasing clock.
+        config: grid whose step is the averaging length.
         times: increasing times [G] in s on the clock of the log; before the first and after the
             last sample the result is NaN.
     """

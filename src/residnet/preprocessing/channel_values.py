@@ -28,11 +28,13 @@ _MIN_SPIKE_CHANGES = 12.0
 The usual change is the 99 % quantile of the change between samples.
 """
 _MIN_SPIKE_DISTANCES = 30.0
-"""The same minimum, relative to the 99 % quantile of the distance from the median."""
+"""Minimum distance of a spike from the median of its neighbours, relative to the 99 % quantile of this
+distance.
+"""
 _MAX_SPIKE_SAMPLES = 2
 """Maximum length of a spike in samples."""
 _MIN_CHANGES_FOR_SCAN = 3.0
-"""Lower bound of both minima, in 99 % quantiles of the change between samples."""
+"""Lower bound of both minimum distances, in 99 % quantiles of the change between samples."""
 _MIN_RANGE_EXCESS = 0.9
 """Alternative minimum: distance outside the range of the channel, in ranges."""
 _MIN_SAMPLES = 20
@@ -42,7 +44,7 @@ CACHED_SAMPLES = 8_192
 _MAX_SUBSAMPLE = 40_000
 """Number of samples for quantiles of a long channel."""
 _N_SUBSAMPLE_SEGMENTS = 40
-"""Number of stretches that form these samples."""
+"""Number of segments of the channel that form this subsample."""
 
 
 def estimate_noise_std(values: np.ndarray) -> float:

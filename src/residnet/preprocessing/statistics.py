@@ -105,8 +105,8 @@ def estimate_agreement(
     """Estimate correlation, gain and lag of a channel by cross-correlation at lags up to 3 s.
 
     Args:
-        reference: [T].
-        measured: [T].
+        reference: reference channel [T].
+        measured: channel [T] that is compared with it.
         step: sampling interval in s.
 
     Returns:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from residnet.preprocessing.prepare import PreparedLog
 
 _SEGMENTS_PER_LOG = 1_000_000
-"""Number above that of the segments of a log, so that labels of logs differ."""
+"""Offset of segment labels between logs, larger than the number of segments of any log."""
 WINDOW_COLUMNS = ("y", "smoothed", "nu_dot", "w", "rate_inputs", "usable", "trainable")
 """Attributes of `WindowStore` that windows contain by default."""
 

@@ -275,7 +275,7 @@ def minimize_levenberg_marquardt(
 
     Args:
         initial_point: starting point, of any type that `linearize` accepts.
-        linearise: linearises the problem at a point. Returns the cost at the point, and a function
+        linearize: linearises the problem at a point. Returns the cost at the point, and a function
             from a damping to the cost and the point after the damped step.
         max_iterations: maximum number of accepted steps.
         min_relative_decrease: relative decrease of the cost below which the descent ends.

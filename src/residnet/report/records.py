@@ -38,7 +38,7 @@ class SweepFile(FileRecord):
     Attributes:
         run: name of the sweep.
         objective: name and unit of the objective.
-        minimised: whether the smallest objective is sought.
+        minimized: whether the smallest objective is sought.
         search: kind of search.
         keys: the varied keys.
         log: keys that vary on a logarithmic scale.

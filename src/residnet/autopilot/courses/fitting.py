@@ -1,7 +1,7 @@
 """Fit the leg lengths and hold times of a route for the shortest time past its buoys.
 
 The constraints have exact derivatives. The solver is sequential linear programming with a trust
-region and an exact penalty function (R. Fletcher, Practical Methods of Optimisation, 1987,
+region and an exact penalty function (R. Fletcher, Practical Methods of Optimization, 1987,
 chapter 12).
 """
 
@@ -120,7 +120,7 @@ class _TrialStep(NamedTuple):
 
     Attributes:
         z: route after the step.
-        linearised: problem linearised at `z`.
+        linearized: problem linearised at `z`.
         gain: decrease of the merit function.
         predicted_gain: decrease of the merit function in the linear program.
     """
@@ -493,7 +493,7 @@ class RouteProblem:
 
         Args:
             z: present route.
-            linearised: problem linearised at z.
+            linearized: problem linearised at z.
             trust_radius: largest change of an entry of z.
         """
         lower, upper = self.bounds()

@@ -973,7 +973,7 @@ def detect_encoding(path: Path) -> str:
 
     A byte order mark decides first, then whether the complete file is UTF-8. Otherwise the
     encodings of Western and Central Europe, Russia, Japan, Korea and China are compared:
-    charset-normaliser excludes those that give implausible characters. A header has too few words
+    charset-normalizer excludes those that give implausible characters. A header has too few words
     for its language statistics, so the encoding wins in which most cells are known column names.
     """
     from charset_normalizer import from_bytes

@@ -68,10 +68,10 @@ def estimate_clock_from_rate(
     """Estimate the time to add to the clock of a gyro so that it follows a heading.
 
     Args:
-        heading_times: [T] in s, increasing.
-        heading: [T] in rad, unwrapped; NaN for missing values.
-        rate_times: [K] in s, increasing.
-        yaw_rate: [K], of any scale and sign; NaN for missing values.
+        heading_times: times of the heading [T] in s, increasing.
+        heading: heading [T] in rad, unwrapped; NaN for missing values.
+        rate_times: times of the yaw rate [K] in s on the clock of the gyro, increasing.
+        yaw_rate: yaw rate [K], of any scale and sign; NaN for missing values.
 
     Returns:
         The estimate; None if there are too few values or no turns.
@@ -122,14 +122,14 @@ def _correlate_rates(
     reference_energy = correlate(reference**2, in_signal) - reference_sum**2 / counts
     signal_energy = correlate(in_reference, signal**2) - signal_sum**2 / counts
     product = correlate(reference, signal) - reference_sum * signal_sum / counts
-    # a stretch of the overlap without turns has no energy and decides nothing
+    # an overlap without turns has no signal and no information on the offset
     floor = 1e-6 * float(reference @ reference) * float(signal @ signal)
     if floor <= 0.0:
         return None
     correlation = product / np.sqrt(np.maximum(reference_energy * signal_energy, floor))
     correlation = np.clip(correlation, -0.9999, 0.9999)
     has_overlap = counts >= _MIN_OVERLAP * min(reference.size, signal.size)
-    # log-likelihood ratio of a regression with this correlation: longer overlaps are surer
+    # log-likelihood ratio of a regression with this correlation, which grows with the overlap
     independent_share = min(step / 2.0, 1.0)
     scores = -0.5 * independent_share * counts * np.log(1.0 - correlation**2) * has_overlap
     best = int(np.argmax(scores))
@@ -152,10 +152,10 @@ def _refine_offset(
 
     Args:
         coarse: result of the cross-correlation.
-        heading_times: [T] in s.
-        heading: [T] in rad.
-        rate_times: [K] in s.
-        yaw_rate: [K].
+        heading_times: times of the heading [T] in s.
+        heading: heading [T] in rad.
+        rate_times: times of the yaw rate [K] in s on the clock of the gyro.
+        yaw_rate: yaw rate [K].
 
     Returns:
         The refined estimate; the coarse one if the regression does not converge near it.
@@ -221,8 +221,8 @@ def _compute_standard_error(
 
     Args:
         columns: design matrix [N, k].
-        residual: [N].
-        weights: [N].
+        residual: residuals [N].
+        weights: weights [N].
     """
     scales = np.abs(columns).max(axis=0)
     scales[scales == 0.0] = 1.0

@@ -39,10 +39,10 @@ class RankedHypothesis(NamedTuple):
     """A hypothesis and its distance from the best one.
 
     Attributes:
-        name: of the hypothesis.
+        name: name of the hypothesis.
         margin: difference of the BIC from the best one, reduced by the autocorrelation of the
             residuals; 0 for the best one.
-        reconstruction: of the log under this hypothesis.
+        reconstruction: motion of the log under this hypothesis.
     """
 
     name: str

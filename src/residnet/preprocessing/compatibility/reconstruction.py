@@ -43,22 +43,30 @@ _STUDENT_DOF = 5.0
 _MAX_ITERATIONS = 25
 _CURVATURE_ITERATIONS = (4, 8)
 _CURVATURE_STEP = 1e-3
-"""Iterations in which the curvature's gradient is updated, and step of its difference quotient."""
+"""Maximum number of iterations, iterations in which the gradient of the curvature is updated, and
+step of its difference quotient.
+"""
 _N_PROBES = 3
-"""Random vectors per noise level in the estimate of a trace."""
+"""Number of random vectors per noise level in the stochastic estimate of a trace."""
 _N_SECTIONS = 20
-"""Sections of the sandwich covariance, because residuals of filtered channels are correlated."""
+"""Number of sections of a log for the sandwich covariance, because residuals of filtered channels
+are correlated.
+"""
 _WEAKENED_SMOOTHNESS = 100.0
-"""Factor on the jerk intensities that shows which errors the sensors determine."""
+"""Factor on the jerk intensities in the test whether sensors determine an error: without a smooth
+motion the standard error of other errors grows.
+"""
 _MAX_GROWTH = 3.0
-"""Largest growth of a standard error that is determined by the sensors."""
+"""Largest growth of the standard error of an error that the sensors determine."""
 _STANDARD_ERROR_FACTOR = 1.4
 """Factor on standard errors for coverage of 95 % in simulated draws (tests/preprocessing)."""
 _MAX_NODES = 20_000
 _MIN_SAMPLES = 20
 _HEADING_WINDOW = 1.0
 _VELOCITY_WINDOW = 2.0
-"""Windows in s of the polynomials that give the first guess of the states."""
+"""Largest number of nodes, smallest number of samples of a sensor, and windows in s of the polynomials
+for the initial heading and velocities.
+"""
 _POSE_TOLERANCES = (1e-7, 2e-6)
 """Standard deviations in rad and m of the integration over a step, so that it is invertible."""
 
@@ -80,7 +88,7 @@ class ErrorEstimate:
     """Estimated instrument error.
 
     Attributes:
-        value: in SI units.
+        value: estimate in SI units.
         standard_error: larger one of the standard errors from the curvature and from a sandwich
             over sections of the log.
         growth: factor on the standard error if the jerk intensities are a hundred times larger.
@@ -109,7 +117,7 @@ class SensorFit:
 
     Attributes:
         noise_std: standard deviation of the noise in the unit of the values.
-        autocorrelation: of successive residuals.
+        autocorrelation: correlation of successive residuals.
         outlier_share: share of residuals beyond five standard deviations.
     """
 
@@ -171,7 +179,7 @@ class _Residuals:
     Attributes:
         group: name of the noise level.
         nodes: node before each residual [N].
-        values: [N].
+        values: whitened residuals [N].
         by_state: state (those of the next node follow after the ninth) -> derivative [N].
         by_error: index of an error -> derivative [N].
         sensor: sensor of a measurement; None for a dynamic equation.
@@ -211,10 +219,10 @@ class _Solver:
 
     Attributes:
         banded_factor: Cholesky factor of the states.
-        gradient: of the states [K * 9].
+        gradient: gradient of the cost by the states [K * 9].
         border: second derivatives by errors and states [P, K * 9].
         schur: second derivatives by the errors with the states eliminated [P, P].
-        error_gradient: [P].
+        error_gradient: gradient of the cost by the errors [P].
         state_solution: solution for the gradient [K * 9].
         border_solution: solution for the border [K * 9, P].
     """

@@ -37,17 +37,17 @@ class Sensor:
             in earth axes, `course` the direction of the velocity over ground, `drift` the angle
             from the velocity to the bow, positive to starboard.
         t: times [N] in s on the clock of the sensor.
-        values: [N, k] in SI units.
+        values: measured values [N, k] in SI units.
         name: name in reports.
         noise_std: standard deviation of the noise; 0 for a first guess from the values.
-        min_noise_std: lower bound on it, for example from the resolution.
+        min_noise_std: lower bound of `noise_std`, for example from the resolution.
         is_noise_known: whether the standard deviation is not estimated.
         is_through_water: whether a velocity is relative to the water instead of the ground.
         clock: error that is added to the times; empty for none.
         bias: error that is added to the quantity; empty for none.
         scale: error by whose share the quantity is too large; empty for none.
         lever_arm: errors with the position of an antenna forward and to starboard in m.
-        factor: unit or sign; the values are this times the quantity.
+        factor: unit or sign: ratio of the values to the quantity.
     """
 
     kind: SensorKind
