@@ -28,8 +28,8 @@ _MIN_SPIKE_CHANGES = 12.0
 The usual change is the 99 % quantile of the change between samples.
 """
 _MIN_SPIKE_DISTANCES = 30.0
-"""Minimum distance of a spike from the median of its neighbours, relative to the 99 % quantile of this
-distance.
+"""Minimum distance of a spike from the median of its neighbours, relative to the 99 % quantile of
+such distances.
 """
 _MAX_SPIKE_SAMPLES = 2
 """Maximum length of a spike in samples."""

@@ -64,8 +64,8 @@ _MAX_NODES = 20_000
 _MIN_SAMPLES = 20
 _HEADING_WINDOW = 1.0
 _VELOCITY_WINDOW = 2.0
-"""Largest number of nodes, smallest number of samples of a sensor, and windows in s of the polynomials
-for the initial heading and velocities.
+"""Largest number of nodes, smallest number of samples of a sensor, and windows in s of the
+polynomials for the initial heading and velocities.
 """
 _POSE_TOLERANCES = (1e-7, 2e-6)
 """Standard deviations in rad and m of the integration over a step, so that it is invertible."""
