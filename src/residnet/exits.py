@@ -73,10 +73,10 @@ def run_cli(command: Callable[[], object]) -> None:
     """Run a command and report any error in one line on standard error.
 
     Args:
-        command: parses the arguments and does the work.
+        command: function that parses the arguments and does the work.
 
     Raises:
-        SystemExit: with the exit code, if it is not 0.
+        SystemExit: if the exit code is not 0.
     """
     signals = _SignalHandler()
     # a service may start a command with closed streams

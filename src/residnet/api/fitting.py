@@ -211,7 +211,7 @@ def free_run(
     errors are replaced by those of the constant-velocity prediction.
 
     Args:
-        models: one or several models from `fit` or `load`.
+        models: model or models from `fit` or `load`.
         data: dataset from `prepare`.
         split: split of the data; None for `test` if it exists, else the first.
         progress: called with the progress of the free runs.

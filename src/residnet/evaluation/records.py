@@ -730,7 +730,8 @@ class InputExcitationRow(Record):
         bandwidth: frequency in Hz below which 95 % of its power lies; None for a constant input.
         variance_inflation: ratio by which velocities and other inputs increase the variance of the
             estimated effect, by leave-one-log-out regression.
-        feedback_source: what a controller may have fed back; None if it cannot be assessed.
+        feedback_source: quantity that a controller may have fed back; None if it cannot be
+            assessed.
         feedback_share: share of the input that feedback explains beyond its effects.
         effect_share: share of the input that the velocities before and after it explain.
         state: excited; held at one value; set by feedback without excitation; or collinear with

@@ -32,7 +32,7 @@ class GRUEnsembleConfig(NetworkConfig):
     Attributes:
         cell: `gru`, or `lstm` for long short-term memory (Hochreiter and Schmidhuber 1997) with a
             forget gate.
-        encoder: what the memory of the measured past is made from: `innovations` or `measurements`.
+        encoder: input of the networks in the measured past: `innovations` or `measurements`.
         members: number of networks; each predicts its own states, and velocities are averaged.
         hidden_size: number of hidden units of each network.
         step: time step of the gates.

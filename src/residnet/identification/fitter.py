@@ -82,7 +82,7 @@ class FitStore:
     The base class stores nothing.
 
     Args:
-        training_folder: for checkpoints and the TensorBoard log; None for neither.
+        training_folder: folder for checkpoints and the TensorBoard log; None for neither.
     """
 
     def __init__(self, training_folder: Path | None = None) -> None:
@@ -243,7 +243,7 @@ def select_by_free_run(
     Args:
         model: model with the part.
         module: baseline or head that the solutions belong to.
-        solutions: at least one solution; a single solution is used without evaluation.
+        solutions: candidates; a single one is used without evaluation.
         score_model: free-run score on validation data; fewer divergences precede a smaller error.
 
     Returns:

@@ -350,8 +350,8 @@ def _mentions_concept(concept: str, text: str, tokens: list[str]) -> bool:
 
     Args:
         concept: key of `concepts` in the vocabulary.
-        text: the name.
-        tokens: its words without digits, and the parts of compounds.
+        text: normalised name.
+        tokens: words of the name without digits, and the parts of compounds.
     """
     entry = _CONCEPTS[concept]
     if not entry.words.isdisjoint(tokens):

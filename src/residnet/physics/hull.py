@@ -329,11 +329,11 @@ class MassEntries(Config):
     """Entries of the mass matrix with added mass; all other entries are zero.
 
     Attributes:
-        m11: surge in kg.
-        m22: sway in kg.
+        m11: surge force by surge acceleration in kg.
+        m22: sway force by sway acceleration in kg.
         m23: sway force by yaw acceleration in kg m.
         m32: yaw moment by sway acceleration in kg m.
-        m33: yaw in kg m^2.
+        m33: yaw moment by yaw acceleration in kg m^2.
     """
 
     m11: Mass
@@ -374,9 +374,9 @@ class InverseMass(Config):
     """Acceleration per force or moment of each axis.
 
     Attributes:
-        x: surge in 1/kg.
-        y: sway in 1/kg.
-        n: yaw in 1/(kg m^2).
+        x: surge acceleration by surge force in 1/kg.
+        y: sway acceleration by sway force in 1/kg.
+        n: yaw acceleration by yaw moment in 1/(kg m^2).
     """
 
     x: Annotated[Parameter, AfterValidator(require_dimension(-1, 0, 0)), Positive]

@@ -108,9 +108,9 @@ class ReferenceScales:
     """Units of mass, length and time of a non-dimensional system.
 
     Attributes:
-        mass: in kg.
-        length: in m.
-        time: in s.
+        mass: unit of mass in kg.
+        length: unit of length in m.
+        time: unit of time in s.
     """
 
     mass: float

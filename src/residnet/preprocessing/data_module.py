@@ -287,7 +287,7 @@ class RowsDataModule(EpochDataModule):
     """Shuffled rows of tensors; a batch is a tuple with the same rows of each tensor.
 
     Args:
-        tensors: each [N, ...].
+        tensors: tensors with the same N rows, each [N, ...].
         batch_size: rows in a batch; the last batch of an epoch may be smaller.
         seed: seed of the order.
         get_epoch: see `EpochDataModule`.

@@ -120,7 +120,7 @@ def fit_local_polynomials(
     config.
 
     Args:
-        values: [T, n].
+        values: values to smooth [T, n].
         window_samples: window length in samples, odd.
         order: degree of the polynomials.
         dt: time step in s.

@@ -82,7 +82,7 @@ def complete_motion(log: Log, config: MotionConfig, dof: DegreesOfFreedom = SURG
     wind is converted to true wind.
 
     Args:
-        log: in SI units.
+        log: log in SI units.
         config: settings of the completion.
         dof: active velocities; the others are zero. With p the log needs the roll angle.
 

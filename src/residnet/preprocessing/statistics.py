@@ -37,17 +37,17 @@ class OverlappingBlocks:
         """Return the changes of values over the blocks.
 
         Args:
-            values: [T, ...].
+            values: values at the samples [T, ...].
             shift: number of samples by which the blocks are moved to earlier times; scalar or [S].
 
         Returns:
-            [K, ...], or [K, S, ...] for several shifts.
+            Changes [K, ...], or [K, S, ...] for several shifts.
         """
         starts = np.subtract.outer(self.starts, shift)
         return np.asarray(values[starts + self.length] - values[starts])
 
     def are_clear_of(self, invalid: np.ndarray, shift: ArrayLike = 0) -> np.ndarray:
-        """Return [K, ...] bool: shifted blocks without invalid samples [T, ...]."""
+        """Return which shifted blocks have no invalid samples [T, ...], as [K, ...] bool."""
         cumulative_invalid = np.zeros((len(invalid) + 1, *invalid.shape[1:]), dtype=int)
         np.cumsum(invalid, axis=0, out=cumulative_invalid[1:])
         starts = np.subtract.outer(self.starts, shift)
@@ -59,7 +59,7 @@ class OverlappingBlocks:
         """Create a function that integrates columns over the blocks.
 
         Args:
-            columns: [T, ...].
+            columns: values at the samples [T, ...].
 
         Returns:
             Function of the shift as for `compute_changes`; the integral over a block with NaN is

@@ -54,7 +54,7 @@ class LogSet:
     """Set of logs with the channels that all logs have in common.
 
     Args:
-        logs: each with an increasing clock.
+        logs: logs with increasing times.
         inputs: channels that drive the vessel; None takes all channels except states and
             accelerations.
         splits: name of a log -> train, validation or test, as far as a config defines it.
@@ -166,7 +166,7 @@ def _find_shared_rows(
     """Return the rows with equal values by indices of both logs and difference of row numbers.
 
     Args:
-        logs: at least one log.
+        logs: logs to compare; at least one.
         names: channels that are compared.
 
     Returns:

@@ -53,10 +53,10 @@ _PRIORS = {
 def analyse_compatibility(log: Log) -> CompatibilityRow:
     """Estimate the instrument errors of a log, and compare meanings of its velocities.
 
-    The liveliest stretch of 300 nodes is analysed.
+    The stretch of at most 300 nodes in which the motion varies most is analysed.
 
     Args:
-        log: in SI units, with an increasing clock.
+        log: log in SI units with increasing times.
     """
     missing = [name for name in POSE_NAMES if name not in log.channels]
     if missing:

@@ -134,7 +134,7 @@ def compute_block_features(
     Args:
         log: channels at the samples of the blocks, [K, samples of a block] each.
         units: unit of each channel.
-        velocities: surge first.
+        velocities: channels of the velocities, surge first.
         inputs: channels that drive the vessel; wind among them adds its load.
         homogeneous: forces of second degree in velocities and revolutions only, as of a hull in
             water, which extrapolate to other speeds; else a polynomial with constant and linear
@@ -231,7 +231,7 @@ class RidgeFit:
     """A ridge regression, from X'X and X'Y.
 
     Attributes:
-        coef: [k, n].
+        coef: coefficients [k, n].
         gram_inv: regularised (X'X)^-1 [k, k].
         residual_var: usual residual variance [n], 1 until it is set.
     """
@@ -324,13 +324,13 @@ class Fleet:
     """Logs of one vessel as regression data in common scales.
 
     Args:
-        logs: each with an increasing clock, and the same channels.
+        logs: logs with increasing times and the same channels.
         inputs: channels that drive the vessel.
 
     Attributes:
         velocities: channels of the response.
         actuators: inputs without wind and current.
-        data: one entry per log.
+        data: regression data of each log.
         usable: indices of logs with sufficient data.
     """
 
@@ -420,7 +420,7 @@ class Fleet:
         return self._scale_data(self.assemble(log))
 
     def with_data(self, data: Mapping[int, BlockData]) -> Fleet:
-        """Return the fleet with copied_fleet data of some logs."""
+        """Return the fleet with other data for some logs."""
         copied_fleet = copy.copy(self)
         copied_fleet.data = [data.get(i, current) for i, current in enumerate(self.data)]
         return copied_fleet
@@ -528,7 +528,9 @@ class Fleet:
         """Test whether a log needs a scale factor of its own on each contribution (Rao 1948).
 
         Args:
-            variance: of the residuals that is expected [n].
+            i: index of the log.
+            fit: regression that predicts the log.
+            variance: expected variance of the residuals [n].
 
         Returns:
             The statistic, RMS over the contributions, and the share of the response that such
@@ -747,7 +749,7 @@ def find_consensus(logs: Sequence[LogStatistics], inputs: Sequence[str]) -> Cons
     """Return which logs of one vessel agree.
 
     Args:
-        logs: each with an increasing clock, and the same channels.
+        logs: logs with increasing times and the same channels.
         inputs: channels that drive the vessel.
     """
     fleet = Fleet(logs, inputs)
@@ -810,7 +812,7 @@ def replace_channels(log: LogStatistics, channels: Mapping[str, np.ndarray]) -> 
     return LogStatistics(log.log.replace(channels={**log.log.channels, **channels}), log.inputs)
 
 
-# --- what explains an outlier ----------------------------------------------------------------
+# --- causes of an outlier ----------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -118,8 +118,8 @@ class OneStepRegression:
         Changes below the residuals of the fit do not count.
 
         Args:
-            change_of_predictions: RMS change [n].
-            coefficients: of the fit [k, n].
+            change_of_predictions: RMS change of the predictions of each velocity [n].
+            coefficients: coefficients of the fit [k, n].
         """
         counted_changes = np.where(
             change_of_predictions > _MIN_CHANGE_TO_RESIDUAL * self.residual_rms(coefficients),
@@ -149,7 +149,7 @@ class FindingEffects:
 
     Args:
         log: statistics of the log; a long log is represented by a subsample.
-        sample_mask: [T] bool, samples that the subsample must contain; None for evenly spread ones.
+        sample_mask: samples that the subsample must contain [T] bool; None for evenly spread ones.
     """
 
     def __init__(self, log: LogStatistics, sample_mask: np.ndarray | None = None) -> None:
@@ -313,8 +313,8 @@ def compute_reckoning_errors(log: LogStatistics, omitted: np.ndarray | None = No
     it displaces the end of a straight line: half the angle in rad.
 
     Args:
-        log: with an increasing clock.
-        omitted: [T] bool, samples that no window may contain; if too few windows remain, samples at
+        log: statistics of a log with increasing times.
+        omitted: samples that no window may contain [T] bool; if too few windows remain, samples at
             which no window may begin or end.
     """
     window_length = min(round(_RECKONING_DURATION / log.sampling_interval), len(log) // 3)

@@ -154,7 +154,7 @@ def compute_condition_number(columns: np.ndarray, names: Sequence[str]) -> tuple
     """Return the condition number of centred and scaled columns, and the most collinear ones.
 
     Args:
-        columns: [N, k].
+        columns: values of k channels at N samples [N, k].
         names: names of the columns.
 
     Returns:

@@ -52,7 +52,7 @@ FEEDBACK_SOURCES: Final = {
     "the speed": ("speed_integral",),
     "the position": ("position_ahead", "position_abeam"),
 }
-"""What a controller may feed back, in words, and the regressors that stand for it."""
+"""Quantity that a controller may feed back -> its regressors."""
 
 Signals = Mapping[str, np.ndarray]
 """Signals [T] of a log by name on a uniform grid."""
@@ -64,7 +64,7 @@ class InputFeedback:
 
     Attributes:
         name: name of the input.
-        source: what is fed back, a key of `FEEDBACK_SOURCES`.
+        source: quantity that is fed back, a key of `FEEDBACK_SOURCES`.
         share: share of the variance not explained by effects that the source explains, by
             leave-one-log-out cross-validation; at most about 0 in open loop.
         effect_share: share of the variance that velocities before and after the input explain.
@@ -80,7 +80,7 @@ class InputFeedback:
 
     @property
     def is_closed_loop(self) -> bool:
-        """Whether feedback determines the input so far that its effect is not identifiable.
+        """Whether feedback dominates the input, so that its effect is not identifiable.
 
         A relay such as that of a zigzag excites by its switches, although it follows the heading.
         """
@@ -91,8 +91,8 @@ def cross_validated_r2(regressors: Sequence[np.ndarray], responses: Sequence[np.
     """Compute the leave-one-log-out R^2 of a linear regression with a constant.
 
     Args:
-        regressors: of each log [T, k].
-        responses: of each log [T].
+        regressors: regressors [T, k] of each log.
+        responses: response [T] of each log.
 
     Returns:
         One minus the squared errors of the predictions over the variance of all responses; it is

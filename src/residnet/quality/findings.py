@@ -220,7 +220,7 @@ class InspectionReport:
 
     Attributes:
         name: name of the log; `together` for a set of logs.
-        findings: in the order of the stages.
+        findings: findings in the order of the stages.
         source: file of the log; empty if unknown.
     """
 
@@ -271,7 +271,7 @@ def build_inspection(
     """Return the contents of doctor.json.
 
     Args:
-        reports: one per log.
+        reports: report on each log.
         between_logs: report on the set of logs.
     """
     inspection = InspectionFile(
@@ -399,7 +399,7 @@ def describe_unit_confusion(factor: float, *dimensions: str) -> str:
     """Return the confusion of units that explains a scale factor, in brackets.
 
     Args:
-        factor: by which the values are too large.
+        factor: factor by which the values are too large.
         dimensions: SI units of the dimensions in question.
 
     Returns:
@@ -432,9 +432,9 @@ def make_correction(
 
     Args:
         names: channels to correct.
-        factor: by which the channels are too large.
-        offset: added after scaling, SI.
-        delay: by which the channels are late, in s.
+        factor: factor by which the values are too large.
+        offset: offset in SI units that is added after scaling.
+        delay: delay of the channels in s.
     """
 
     def correct_channel(log: Log, name: str) -> np.ndarray:

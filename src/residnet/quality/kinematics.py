@@ -215,7 +215,7 @@ def _explain_increments(
     """Select and estimate the causes that explain the increments of a pose.
 
     Args:
-        measured_pose: [T] real or complex, NaN if missing.
+        measured_pose: measured pose [T], real or complex; NaN if missing.
         integrated_increments: integrals of the velocities [T - 1], NaN if missing.
         dt: time steps [T - 1] in s.
         pose_noise: standard deviation of the noise of the pose.
@@ -538,7 +538,7 @@ def _make_repair(
 
     Args:
         name: name of the cause.
-        estimates: its size.
+        estimates: estimated size of the cause.
         velocity_names: velocities that are compared with the pose.
     """
     cause_kind, _, channel_suffix = name.partition("_")

@@ -42,7 +42,7 @@ class LogInspection(Record):
         name: name of the log.
         source: file of the log; empty if unknown.
         misled: whether a finding is worse than a note.
-        findings: in the order of the checks.
+        findings: findings in the order of the checks.
     """
 
     name: str

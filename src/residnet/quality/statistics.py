@@ -53,7 +53,7 @@ class LogStatistics:
     """Log under inspection with cached statistics.
 
     Args:
-        log: with an increasing clock.
+        log: log with increasing times.
         inputs: channels that drive the vessel.
         seam_times: start times in s of stretches that do not follow the previous one in time.
         subsample: statistics of a subsample; None takes evenly spread stretches of a long log.
@@ -319,7 +319,13 @@ def estimate_resolution(values: np.ndarray) -> float:
 
 
 class LeastSquaresFit(NamedTuple):
-    """Return the bounds [N_SECTIONS + 1] of the sections, whose lengths differ by at most one."""
+    """Linear least-squares fit with a cluster-robust covariance.
+
+    Attributes:
+        coefficients: coefficients [k].
+        covariance: covariance of the coefficients [k, k].
+        residuals: residuals [T].
+    """
 
     coefficients: np.ndarray
     covariance: np.ndarray
@@ -430,7 +436,7 @@ def make_input_terms(
     """Return linear, quadratic and speed-dependent terms of the inputs.
 
     Args:
-        input_values: one array [T] per input.
+        input_values: values [T] of each input.
         u: surge velocity [T]; None omits the terms with the speed.
         is_linear: whether to return the linear terms only.
     """

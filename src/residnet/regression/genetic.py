@@ -227,9 +227,9 @@ class EvolutionResult:
     Attributes:
         terms: terms of the individual of minimum validation error among the best individuals of
             all generations.
-        train: its relative mean squared error on the decimated training samples.
-        validation: its relative mean squared error on all validation samples.
-        generation: generation in which it appeared; 0 is the initial population.
+        train: relative mean squared error of `terms` on the decimated training samples.
+        validation: relative mean squared error of `terms` on all validation samples.
+        generation: generation in which the individual appeared; 0 is the initial population.
         is_goal_reached: whether both errors are below the goal.
         history: best individual of each generation.
         n_fitted: number of distinct sets of terms that were fitted.

@@ -51,7 +51,7 @@ def probe_families(
     high = features.max(axis=0)
     is_excited = high > low
     polynomials = {}
-    for j in np.flatnonzero(is_excited):
+    for j in np.flatnonzero(is_excited).tolist():
         scaled = (2.0 * features[:, j] - low[j] - high[j]) / (high[j] - low[j])
         polynomials[names[j]] = np.polynomial.legendre.legvander(scaled, _SINGLE_DEGREE)[:, 1:]
     families: list[tuple[str, ...]] = [(name,) for name in polynomials]

@@ -40,7 +40,7 @@ class PairSymmetry:
         p_value: probability of such a likelihood ratio for a symmetric pair.
         ratio: factor of the starboard input that makes the pair symmetric, with the largest
             likelihood.
-        p_value_with_sign: as `p_value`, after the starboard input has the sign of `ratio`.
+        p_value_with_sign: p-value if the starboard input has the sign of `ratio`.
         surge_signs: signs of the surge gains of port and starboard.
     """
 

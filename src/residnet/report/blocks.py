@@ -40,7 +40,7 @@ class Text:
     """Paragraphs of plain text.
 
     Attributes:
-        paragraphs: one string or several.
+        paragraphs: a single paragraph or several.
         is_secondary: whether the text is grey, for explanations that most readers skip.
     """
 
@@ -60,7 +60,7 @@ class Bullets:
     """A list of short texts.
 
     Attributes:
-        items: one string for each entry.
+        items: texts of the entries.
         is_warning: whether the list is highlighted, for facts that a reader must know before using
             a result.
     """

@@ -77,7 +77,7 @@ class VariantRow(Record):
         nrmse_sd: standard deviation of the NRMSE over seeds; None for one seed.
         nrmse_range: smallest and largest NRMSE of the seeds.
         difference: mean difference from the reference variant over the same windows.
-        difference_ci95: its 95 % confidence interval; None for the reference variant.
+        difference_ci95: 95 % confidence interval of the difference; None for the reference variant.
         overrides: overrides of config keys that define the variant.
         seconds: mean duration of a run in s.
     """

@@ -64,7 +64,7 @@ class RunFolder:
         summary: task, finished mark, verdict and main figures.
         report: the HTML page.
         metrics: free-run errors of a fit, or the comparison of another task.
-        models: one folder for each model.
+        models: folder with a subfolder for each model.
         figures: pictures of the report.
         rollouts: stored free runs by split.
         exported_models: models for controllers.

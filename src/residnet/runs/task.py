@@ -46,7 +46,7 @@ class ExportRequest(NamedTuple):
         output_path: file to write. If None, it is exports/<model> with the suffix of the format;
             for C formats exports/<run> for the predictor and exports/<run>_<model> otherwise.
         file_format: one of `residnet list formats`.
-        allows_objections: also export a model that is worse than its reference.
+        allows_objections: whether a model that is worse than its reference is exported as well.
     """
 
     run: RunFolder

@@ -98,7 +98,7 @@ class ArduPilotBackend:
 
     Args:
         vehicle: simulated vehicle.
-        servos: one servo for each command of the vehicle.
+        servos: servo of each command of the vehicle.
         port: UDP port; 0 selects a free port.
         host: address to listen on.
     """

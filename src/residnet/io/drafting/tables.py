@@ -109,7 +109,7 @@ def draft_tables(
     """Draft a reader for tables from names, units in headers, values and physics.
 
     Args:
-        files: at least one table.
+        files: tables; at least one.
         draft_notes: receives guesses and notes.
         has_heading: whether other files may have the heading.
 

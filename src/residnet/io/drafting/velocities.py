@@ -65,7 +65,7 @@ class MeasuredVelocities:
     Attributes:
         t: times [T] in s of a uniform grid.
         position: north and east [T, 2] in m.
-        heading: [T] in rad.
+        heading: heading [T] in rad.
         components: surge, sway, north, east, speed -> velocity [T] in m/s, from the positions.
         columns: u, v -> column [T] in any unit.
     """
@@ -111,7 +111,7 @@ def make_measured_velocities(
         t: times [T] in s.
         velocities: surge and sway [T] from the positions in m/s.
         position: north and east [T, 2] in m.
-        heading: [T] in rad.
+        heading: heading [T] in rad.
         columns: u, v -> column [T].
     """
     surge, sway = velocities
@@ -261,9 +261,9 @@ class HeadingOffset(NamedTuple):
     """Constant angle by which a heading is too large.
 
     Attributes:
-        angle: in rad.
-        standard_error: over windows of all logs in rad.
-        source: how it was estimated, for the user.
+        angle: angle in rad.
+        standard_error: standard error in rad, from the residuals of windows of all logs.
+        source: method of the estimate in words, for the user.
     """
 
     angle: float
@@ -280,9 +280,9 @@ class Contradiction(NamedTuple):
     """Difference between integrated velocities and positions.
 
     Attributes:
-        share: of the distance travelled that a heading offset, a scale and a current do not
+        share: share of the distance travelled that a heading offset, a scale and a current do not
             explain.
-        heading_offset: of all logs.
+        heading_offset: common heading offset of all logs.
     """
 
     share: float
@@ -366,7 +366,7 @@ def require_compatible(contradiction: Contradiction, columns: Sequence[str]) -> 
     """Stop if integrated velocities leave the positions.
 
     Args:
-        contradiction: of the logs.
+        contradiction: contradiction of the logs.
         columns: names of the columns of the velocities.
 
     Raises:

@@ -87,7 +87,8 @@ def choose_stretch(
 
     Args:
         t: times [T] in s, increasing.
-        activity: [T], for example the squared deviation of the yaw rate; NaN counts as zero.
+        activity: measure of the motion [T], for example the squared deviation of the yaw rate; NaN
+            counts as zero.
         step: time between nodes in s.
         max_nodes: largest number of nodes of the stretch.
     """

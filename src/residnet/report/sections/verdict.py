@@ -105,8 +105,8 @@ class _OpeningRow(NamedTuple):
 
     Attributes:
         model: name of the model; None for the integrated measured velocities.
-        errors: pose errors at the end of the free runs by name.
-        intervals: their confidence intervals by name.
+        errors: name -> pose error at the end of the free runs.
+        intervals: name -> confidence interval of the error.
         divergence: number of diverged windows in words; empty without divergence.
     """
 
