@@ -140,7 +140,11 @@ LONG = (
 )
 
 
-@pytest.mark.parametrize("buoys", [BUOYS, LOOPS, LONG], ids=["three", "loops", "long"])
+@pytest.mark.parametrize(
+    "buoys",
+    [BUOYS, LOOPS, pytest.param(LONG, marks=pytest.mark.long)],
+    ids=["three", "loops", "long"],
+)
 def test_a_plan_leaves_every_buoy_on_its_side_outside_its_circle(
     vessel: SteeredPlant, buoys: tuple[BuoyConfig, ...]
 ) -> None:
@@ -205,6 +209,7 @@ def test_what_no_course_can_do_is_refused(vessel: SteeredPlant) -> None:
         plan_of(vessel, buoys=(BUOYS[0], buoy(52, 20, "starboard"), BUOYS[2]))
 
 
+@pytest.mark.long
 def test_a_vessel_that_sways_and_rolls_follows_turns_that_join_each_other() -> None:
     patrol = SteeredPlant(load_vessel("patrol_p06_linear").build())
     turning = patrol.estimate_nomoto(LIMIT, 300.0, 0.1)

@@ -188,7 +188,13 @@ def test_attitude_depth_and_place_follow_the_velocities(scheme: Integrator, head
     np.testing.assert_allclose(moved, way, atol=0.06 * np.abs(way).max())
 
 
-@pytest.mark.parametrize("scheme", get_args(Integrator))
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        pytest.param(scheme, marks=[pytest.mark.long] if scheme == "rk4" else [])
+        for scheme in get_args(Integrator)
+    ],
+)
 def test_sensitivities_are_the_derivatives_of_the_step(scheme: Integrator) -> None:
     spec = make_example_spec(None, SUBMERGED_SIGNALS)
     spec = spec.model_copy(update={"integrator": scheme, "baseline": HULL})

@@ -106,7 +106,15 @@ def test_modules_are_fitted_and_run_freely(models: residnet.Models) -> None:
     assert models["plain"].notes["epochs"] == 2
 
 
-@pytest.mark.parametrize("name", ["plain", "filter", "both"])
+# "both" holds the other two
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("plain", marks=pytest.mark.long),
+        pytest.param("filter", marks=pytest.mark.long),
+        "both",
+    ],
+)
 @pytest.mark.parametrize(("kind", "file"), [("torchscript", "model.pt"), ("c", "model.c")])
 def test_modules_are_exported(
     models: residnet.Models, name: str, kind: str, file: str, tmp_path: Path

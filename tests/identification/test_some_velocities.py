@@ -156,7 +156,11 @@ def test_a_vehicle_that_only_dives_is_known_by_its_channels(
 
 @pytest.mark.parametrize(
     ("made", "channels"),
-    [(dive, DIVE), (dive, ("w", "q", "n", "delta_s")), (sink, ("z", "thrust"))],
+    [
+        (dive, DIVE),
+        pytest.param(dive, ("w", "q", "n", "delta_s"), marks=pytest.mark.long),
+        pytest.param(sink, ("z", "thrust"), marks=pytest.mark.long),
+    ],
 )
 def test_a_vehicle_that_only_dives(made: Callable[..., Log], channels: tuple[str, ...]) -> None:
     data = residnet.prepare([made(number, *channels) for number in range(4)])

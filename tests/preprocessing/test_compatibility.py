@@ -90,6 +90,7 @@ def draw(boat: str, seed: int) -> tuple[Reconstruction, dict[str, float]]:
     return reconstruct(measure(motion, rng, errors), PRIORS, STEPS[boat]), errors
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("boat", BOATS)
 def test_intervals_of_determined_errors_cover_the_truth(boat: str) -> None:
     covered = []

@@ -62,7 +62,14 @@ CONFIGS: dict[str, Callable[[Path], dict[str, Any]]] = {
 }
 
 
-@pytest.fixture(scope="session", params=CONFIGS)
+# the run of scikit-learn takes the longest and has no code of its own in the readers
+@pytest.fixture(
+    scope="session",
+    params=[
+        pytest.param(kind, marks=[pytest.mark.long] if kind == "sklearn" else [])
+        for kind in CONFIGS
+    ],
+)
 def finished(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of each kind."""
 
@@ -445,7 +452,7 @@ def stranger(tiny_run: Path, tmp_path: Path) -> Path:
     return tmp_path / "stranger"
 
 
-@pytest.mark.parametrize("absolute", [True, False])
+@pytest.mark.parametrize("absolute", [pytest.param(True, marks=pytest.mark.long), False])
 def test_a_report_deletes_no_file_of_the_user(
     absolute: bool, command: Command, stranger: Path, tmp_path: Path
 ) -> None:
