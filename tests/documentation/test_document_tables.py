@@ -1,4 +1,4 @@
-"""The audit of the five documents: every row is whole, and every command that it names exists."""
+"""Tables of claims of the five documents: rows are complete, and commands in them exist."""
 
 from __future__ import annotations
 
@@ -8,10 +8,23 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "documents" / "audit.md"
+PAGES = {
+    "000": "halvorsen2019",
+    "001": "moreno2019",
+    "002": "jervan2020",
+    "003": "woo2018",
+    "004": "gouletas2020",
+}
+TABLES = {
+    document: (ROOT / "docs" / "documents" / f"{page}.md")
+    .read_text(encoding="utf-8")
+    .partition("## Claims and results, row by row")[2]
+    for document, page in PAGES.items()
+}
 ROWS = [
     [cell.strip() for cell in line.strip().strip("|").split(" | ")]
-    for line in PAGE.read_text(encoding="utf-8").splitlines()
+    for table in TABLES.values()
+    for line in table.splitlines()
     if line.startswith("| ") and not line.startswith(("| item", "| ---"))
 ]
 COMMANDS = sorted({command for row in ROWS for command in re.findall(r"`([^`]+)`", row[3])})
@@ -46,9 +59,10 @@ def numbers(spans: str) -> set[str]:
 
 @pytest.mark.parametrize("document", CAPTIONS)
 def test_every_figure_table_and_listing_has_a_row(document: str) -> None:
-    text = PAGE.read_text(encoding="utf-8").partition(f"## Document {document}")[2]
-    lines = text.partition("\n## ")[0].splitlines()
+    lines = TABLES[document].splitlines()
     items = "\n".join(line.split(" | ")[0] for line in lines if line.startswith("| "))
+    # captions of pictures stand in one sentence, each with its kind
+    items += "".join(line for line in lines if line.startswith("Without a computation"))
     for kind, spans in CAPTIONS[document].items():
         # "Figure 8 (a), 11 (a)" and "Figure 7, (21), (22)": numbers of equations are in brackets
         named = re.findall(rf"{kind} (\S+(?: \(a\), \d+)?)", items)
@@ -59,7 +73,7 @@ def test_every_figure_table_and_listing_has_a_row(document: str) -> None:
 
 
 def test_every_row_is_whole() -> None:
-    assert len(ROWS) > 250
+    assert len(ROWS) > 200
     for row in ROWS:
         assert len(row) == 5, row
         item, published, _, command, status = row
