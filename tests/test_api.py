@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,7 +17,7 @@ from tiny import TINY
 
 import residnet
 from residnet.core.config import validate_config
-from residnet.core.errors import ResidnetError
+from residnet.core.errors import ResidnetError, UsageError
 from residnet.evaluation.metrics import build_metrics_table
 from residnet.evaluation.protocol import EvaluationConfig
 from residnet.evaluation.records import MetricsFile
@@ -140,12 +141,36 @@ def test_tables_and_figures(models: residnet.Models, data: residnet.Dataset) -> 
     assert found == pytest.approx(np.mean(rmse), rel=1e-12)
     for figure in (runs.plot_track(models=["ridge"]), runs.plot_history(protocol="T30")):
         assert len(figure.axes) in (1, 4)
+    assert runs.plot_track(width=3.4).get_figwidth() == pytest.approx(3.4)
     assert residnet.select_model(models).name == models.selected_name
     assert models.verdict[0].startswith(f"10 s ahead {models.selected_name} is off by ")
     told = f"On test data model {models.selected_name} is "
     assert any(sentence.startswith(told) for sentence in models.verdict)
     assert models.selection.reason in models.verdict
     assert list(models["baseline"].coefficients["axis"].unique()) == ["u_dot", "v_dot", "r_dot"]
+
+
+def test_figures_are_drawn_on_axes_of_the_caller(
+    models: residnet.Models, data: residnet.Dataset, tmp_path: Path
+) -> None:
+    runs = residnet.free_run(models, data)
+    with plt.rc_context({"font.size": 6.0}):
+        figure, axes = plt.subplots(2, 3, figsize=(3.4, 2.0))
+        track, *histories, spare = axes.ravel()
+        assert runs.plot_track(models=["ridge"], ax=track) is figure
+        assert runs.plot_history(models=["ridge"], ax=histories) is figure
+    assert {line.get_label() for line in track.lines} >= {"measured", "ridge"}
+    assert all(len(part.lines) >= 2 for part in histories)
+    assert not spare.lines
+    # the caller's size of letters and figure
+    assert track.xaxis.label.get_size() == 6.0
+    assert figure.get_figwidth() == pytest.approx(3.4)
+    for name, start in (("track.pdf", b"%PDF"), ("track.svg", b"<?xml")):
+        figure.savefig(tmp_path / name)
+        assert (tmp_path / name).read_bytes().startswith(start)
+    with pytest.raises(UsageError, match=r"expected 4 axes, one each for .*; got 1"):
+        runs.plot_history(ax=[track])
+    plt.close(figure)
 
 
 def test_other_logs_are_judged_as_those_of_the_fit(

@@ -3,9 +3,10 @@
     python scripts/bench/feed_forward.py [--ferries 10] [--seed 0]
 
 So many ferries are drawn, each with a course of its own: every mass and every damping times 0.5 to
-1.5, thrusters of 1.5 to 3 rad/s. A study as a user writes it (`fit: {kind: plsr}`) identifies the
-residual. What it exports is flown on two courses, ahead and astern. Printed are position errors,
-and why one is withheld.
+1.5, thrusters of 1.5 to 3 rad/s. A study as a user writes it identifies the residual with three
+models. The exported feed-forwards are flown on three new courses: ahead, astern, and with any
+heading. Printed are mean position errors, the model that the study selects by its own judging
+courses, and the models that it withholds.
 """
 
 from __future__ import annotations
@@ -18,41 +19,21 @@ from typing import Any
 import bench
 import torch
 import yaml
-from torch import Tensor, nn
 
-from residnet.export.feed_forward import ExportedForce, RequiredForce
-from residnet.export.torchscript import TorchScriptExporter
 from residnet.physics.force_model import ForceModel
-from residnet.physics.plant import HullPlant
-from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
 from residnet.studies.jervan2020.ferry.config import FerryStudyConfig
 from residnet.studies.jervan2020.ferry.execute import (
+    find_best_flown_model,
+    find_best_model,
     list_feed_forward_objections,
     run_ferry_study,
     write_results,
 )
+from residnet.studies.jervan2020.ferry.judging import ExportedFeedForward
 
 VESSEL = bench.CONFIGS / "vessels" / "milliampere.yaml"
 CONFIG = bench.CONFIGS / "studies" / "jervan2020" / "operation.yaml"
-
-
-class AsExported(nn.Module):
-    """What is exported of a model, in the place of the model that a course is flown with."""
-
-    def __init__(self, model: Any, ranges: list[list[float]]) -> None:
-        super().__init__()
-        force = RequiredForce(*model.force.parts(), is_mirrored=True)
-        limits = [(low, high) for low, high in ranges]
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "feed_forward.pt"
-            TorchScriptExporter().export(ExportedForce("plsr", force, limits, None), file)
-            self.exported = torch.jit.load(str(file))
-
-    def at_heading(self, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
-        """Return the force [..., 3] at nu_dot and nu [..., 3], at any heading."""
-        tau: Tensor = self.exported(nu_dot.reshape(-1, 3), nu.reshape(-1, 3))[0]
-        return tau.reshape(nu.shape)
 
 
 def drawn_ferry(folder: Path, random: torch.Generator) -> Path:
@@ -95,38 +76,53 @@ def drawn_course(random: torch.Generator, *, kind: str = "any", count: int = 12)
     return {"waypoints": points, "interval": 60.0, "frequency": [0.195, 0.195, 0.415]}
 
 
+MODELS = {
+    "plsr": {"fit": {"kind": "plsr"}},
+    "surface": {"fit": {"kind": "surface"}},
+    "lag_ridge": {"lag": True, "fit": {"kind": "ridge"}},
+}
+"""Models of the study, as a user lists them."""
+
+
 def judge_ferry(number: int, random: torch.Generator, folder: Path) -> str:
-    """Return what a drawn ferry's exported feed-forward does on courses that nothing has seen."""
+    """Return the flights of all exported feed-forwards of a drawn ferry on new courses."""
     true = drawn_ferry(folder, random)
     base = yaml.safe_load(CONFIG.read_text())
     content = {key: base[key] for key in ("task", "believed")} | {
         "name": "drawn",
         "true": str(true),
-        "loop": base["loop"] | {"step": 0.05, "every": 2},
+        "loop": base["loop"] | {"step": 0.05, "steps_per_sample": 2},
         "course": drawn_course(random),
-        "models": {"plsr": {"fit": {"kind": "plsr"}, "fly": True}},
+        "models": MODELS,
     }
     config = FerryStudyConfig.model_validate(content)
-    found = run_ferry_study(config)
-    results, _ = write_results(config, found, RunFolder(folder / f"run_{number}"))
-    against = list_feed_forward_objections("plsr", results)
-    model = found.whole_course_models.get("plsr", found.models["plsr"])
-    required = AsExported(model, results["models"]["plsr"]["exported"]["range"])
-    hull = load_vessel("milliampere").build()
-    assert isinstance(hull, HullPlant)
+    study = run_ferry_study(config)
+    results, _ = write_results(config, study, RunFolder(folder / f"run_{number}"))
+    selected = find_best_flown_model(results)
     ferry = config.build_loop(str(true))
-    told = []
-    for kind in ("ahead", "astern"):
-        path = config.course.model_validate(drawn_course(random, kind=kind, count=6))
-        feeds: list[Any] = [(ForceModel(hull.hull), None), (required, model.lag)]
-        known, own = (
-            flight.tracking_metrics.to_json()["position_mae"]
-            for flight in ferry.simulate(path, feeds)
+    feeds: list[Any] = [(ForceModel(ferry.believed_hull), None)]
+    for name in MODELS:
+        model = study.whole_course_models.get(name, study.models[name])
+        ranges = [(low, high) for low, high in results["models"][name]["exported"]["range"]]
+        feeds.append((ExportedFeedForward(model.force, ranges), model.lag))
+    paths = [
+        config.course.model_validate(drawn_course(random, kind=kind, count=6))
+        for kind in ("ahead", "astern", "any")
+    ]
+    errors = {
+        name: sum(flight.tracking_metrics.position_mae for flight in flights if flight) / len(paths)
+        for name, flights in zip(
+            ["believed", *MODELS], ferry.simulate_courses(paths, feeds), strict=True
         )
-        told.append(f"{kind} {known:.4f} -> {own:.4f} m ({own / known:.2f})")
-    chosen = f"order {model.fit.notes.get('order')}, {'with' if model.lag else 'without'} lag"
-    state = f"withheld: {'; '.join(against)}" if against else "exported"
-    return f"ferry {number:2d}  {chosen}; {', '.join(told)}; {state}"
+    }
+    best = min(errors.values())
+    withheld = [name for name in MODELS if list_feed_forward_objections(name, results)]
+    error_text = ", ".join(f"{name} {error:.4f} m" for name, error in errors.items())
+    return (
+        f"ferry {number:2d}  {error_text}; selected {selected}"
+        f" ({errors[selected] / best:.2f} of the best); smallest residual"
+        f" {find_best_model(results)}; withheld: {', '.join(withheld) or 'none'}"
+    )
 
 
 def main() -> None:

@@ -4,12 +4,14 @@ what is refused.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+import yaml
 from kinds import of_kind
 
 import residnet
@@ -17,7 +19,7 @@ from residnet.autopilot.motion import PoseDerivatives, required_force, sample_fi
 from residnet.autopilot.motion_config import ActuatorLag
 from residnet.baselines.given_config import BelievedConfig
 from residnet.core.config import load_config
-from residnet.core.errors import FitError
+from residnet.core.errors import ConfigError, FitError
 from residnet.export import get_exporter
 from residnet.export.feed_forward import ExportedForce, RequiredForce
 from residnet.physics.force_model import ForceCorrection, ForceModel
@@ -31,12 +33,14 @@ from residnet.studies.jervan2020.ferry.execute import (
     build_record,
     build_sections,
     compare_residuals,
+    find_best_flown_model,
     identify_model,
     list_feed_forward_objections,
     run_ferry_study,
     summarize,
     write_results,
 )
+from residnet.studies.jervan2020.ferry.judging import draw_judging_courses
 from residnet.studies.jervan2020.residual import (
     derive_forward_equations,
     estimate_earth_force,
@@ -195,15 +199,78 @@ def test_what_searches_its_settings_leaves_with_the_whole_course(short: FerryStu
     assert all(more < less for more, less in zip(whole, half, strict=True))
 
 
-def test_a_feed_forward_worse_than_the_believed_one_is_objected_to() -> None:
-    flown = {"believed": {"position_mae": 0.232}, "plsr": {"position_mae": 0.688}}
-    results: dict[str, Any] = {"course": flown, "crossing": {}, "feed_forward_alone": {}}
-    results["models"] = {"plsr": {"share_left": [1.47, 1.47, 1.28]}}
-    _, worse = list_feed_forward_objections("plsr", results)
-    assert "0.688 m, the believed model's 0.232 m" in worse
-    results["models"]["plsr"]["share_left"] = [0.1, 0.2, 1.1]
-    flown["plsr"]["position_mae"] = 0.1
-    assert list_feed_forward_objections("plsr", results) == []
+def test_a_feed_forward_is_judged_by_its_flights() -> None:
+    judging: dict[str, Any] = {
+        "believed": {"position_mae": 0.232},
+        "plsr": {"position_mae": 0.688},
+        "ridge": {"position_mae": 0.1},
+    }
+    # the better flyer has the larger residual
+    results: dict[str, Any] = {
+        "judging": judging,
+        "crossing": {},
+        "models": {"plsr": {"share_left": [0.1] * 3}, "ridge": {"share_left": [1.4] * 3}},
+    }
+    (worse,) = list_feed_forward_objections("plsr", results)
+    assert "judging courses is 0.688 m, the believed model's 0.232 m" in worse
+    assert list_feed_forward_objections("ridge", results) == []
+    assert find_best_flown_model(results) == "ridge"
+    results["crossing"] = {"believed": {"position_mae": 0.1}, "ridge": {"position_mae": 0.3}}
+    assert "in the crossing is 0.300 m" in list_feed_forward_objections("ridge", results)[0]
+    judging["ridge"]["position_mae"] = None
+    assert "unstable" in list_feed_forward_objections("ridge", results)[0]
+    assert find_best_flown_model(results) == "plsr"
+
+
+def test_judging_courses_are_flown_as_exported(short: FerryStudy) -> None:
+    assert list(short.judging) == ["believed", "lag_ridge", "plsr"]
+    for metrics in short.judging.values():
+        assert list(metrics) == ["ahead", "astern", "mixed"]
+    errors = {
+        name: [run.position_mae for run in metrics.values() if run is not None]
+        for name, metrics in short.judging.items()
+    }
+    assert all(len(values) == 3 for values in errors.values())
+    assert sum(errors["lag_ridge"]) < 0.5 * sum(errors["believed"])
+
+
+def test_judging_courses_resemble_the_course() -> None:
+    course = config("operation").course
+    courses = draw_judging_courses(course, seed=3)
+    assert courses == draw_judging_courses(course, seed=3)
+    for name, judging in courses.items():
+        points = torch.tensor([(0.0, 0.0), *(point[:2] for point in judging.waypoints)])
+        steps = points.diff(dim=0)
+        # all segments of the course are 15 m long
+        assert bool(((steps.norm(dim=1) >= 7.5) & (steps.norm(dim=1) <= 15.001)).all())
+        drift = torch.tensor([point[2] for point in judging.waypoints]) - torch.atan2(
+            steps[:, 1], steps[:, 0]
+        )
+        if name != "mixed":
+            assert bool((drift.cos() - {"ahead": 1.0, "astern": -1.0}[name]).abs().max() < 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("vessel", "key"),
+    [
+        ("milliampere", "response"),
+        ("milliampere_azimuth", "shaft"),
+    ],
+)
+def test_the_advice_for_a_vessel_without_lag_names_a_key_that_exists(
+    vessel: str, key: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "ferry.yaml"
+    immediate = {"response": {"kind": "immediate"}} if key == "response" else {}
+    content: dict[str, Any] = {"kind": "mass_matrix", "base": vessel, "name": "ferry"}
+    file.write_text(yaml.safe_dump(content | ({"actuators": immediate} if immediate else {})))
+    with pytest.raises(ConfigError, match="no lag") as caught:
+        config("operation", *SHORT, f"true={file}")
+    advice = re.search(r"`(actuators: .*?)` in a vessel file", str(caught.value))
+    assert advice is not None
+    assert key in advice[1]
+    file.write_text(yaml.safe_dump(content | yaml.safe_load(advice[1])))
+    config("operation", *SHORT, f"true={file}")
 
 
 @pytest.mark.long

@@ -54,6 +54,7 @@ from residnet.runs.task import torch_threads
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from residnet.training.trainer import Callback, Logger
@@ -111,11 +112,21 @@ class FreeRuns:
         ]
         return pd.concat(tables, ignore_index=True)
 
-    def plot_track(self, log: str | None = None, **selection: Any) -> Figure:
+    def plot_track(
+        self,
+        log: str | None = None,
+        *,
+        ax: Axes | None = None,
+        width: float | None = None,
+        **selection: Any,
+    ) -> Figure:
         """Plot the measured and predicted tracks; north up, equal scales.
 
         Args:
             log: name of the log; None for the first.
+            ax: matplotlib axes to draw on, in the caller's style and without a legend; None for a
+                new figure.
+            width: width of a new figure in inches; None for the text width of an A4 page.
             selection: `models`, names of models, by default all but `constant_velocity`;
                 `protocol`, by default `manoeuvre` if it exists, else the first; `window`, number of
                 the window in the log, by default the longest.
@@ -123,30 +134,45 @@ class FreeRuns:
         Raises:
             UsageError: if there is no such log, model, protocol or window.
         """
-        return self._plot(log, True, **selection)
+        axes = None if ax is None else [ax]
+        return self._plot(log, True, axes, width, **selection)
 
-    def plot_history(self, log: str | None = None, **selection: Any) -> Figure:
+    def plot_history(
+        self,
+        log: str | None = None,
+        *,
+        ax: Sequence[Axes] | None = None,
+        width: float | None = None,
+        **selection: Any,
+    ) -> Figure:
         """Plot measured and predicted velocities and heading against time.
 
         Args:
             log: name of the log; None for the first.
+            ax: matplotlib axes to draw on, one for each quantity, in the caller's style and without
+                a legend; None for a new figure.
+            width: width of a new figure in inches; None for the text width of an A4 page.
             selection: see `plot_track`.
 
         Raises:
-            UsageError: if there is no such log, model, protocol or window.
+            UsageError: if there is no such log, model, protocol or window, or if the number of axes
+                differs from the number of quantities.
         """
-        return self._plot(log, False, **selection)
+        axes = None if ax is None else list(np.ravel(np.asarray(ax, dtype=object)))
+        return self._plot(log, False, axes, width, **selection)
 
     def _plot(
         self,
         log: str | None,
         is_track: bool,
+        axes: Sequence[Axes] | None,
+        width: float | None,
         models: str | Sequence[str] = (),
         protocol: str | None = None,
         window: int | None = None,
     ) -> Figure:
         from residnet.report.sections.runs import plot_window
-        from residnet.report.still import render_matplotlib
+        from residnet.report.still import FIGURE_WIDTH, draw_on_axes, render_matplotlib
 
         default_protocol = "manoeuvre" if "manoeuvre" in self.protocols else self.protocols[0]
         protocol_name = _require_known(protocol or default_protocol, self.protocols, "protocol")
@@ -188,7 +214,18 @@ class FreeRuns:
             raise UsageError(
                 f"log {log_name} has no track: {stored_window.dof.description}; draw its history"
             )
-        figure: Figure = render_matplotlib(window_plot, panel_numbers=panels)
+        if axes is not None:
+            quantities = [window_plot.panels[i].y_label or "track" for i in panels]
+            if len(axes) != len(panels):
+                raise UsageError(
+                    f"ax: expected {len(panels)} axes, one each for {', '.join(quantities)}; got"
+                    f" {len(axes)}"
+                )
+            draw_on_axes(window_plot, axes, panels)
+            return axes[0].figure  # type: ignore[return-value]
+        figure: Figure = render_matplotlib(
+            window_plot, panel_numbers=panels, width=FIGURE_WIDTH if width is None else width
+        )
         return figure
 
 

@@ -19,6 +19,7 @@ from residnet.autopilot.base import Policy, Reference
 from residnet.autopilot.courses.course_plan import Course
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.motion import (
+    FeedForwardForce,
     PoseDerivatives,
     filter_derivatives,
     required_force,
@@ -29,7 +30,6 @@ from residnet.core.columns import dynamic_states, heading, motion_accelerations,
 from residnet.core.config import Config, Metres, MetresPerSecond, RadiansPerSecond, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.frames import wrap_angle
-from residnet.physics.force_model import ForceModel
 
 _ANGLES = 181
 """Number of course changes in the table, one per degree."""
@@ -699,7 +699,7 @@ class Crossing(Reference):
         self,
         config: CrossingConfig,
         dt: float,
-        models: Sequence[tuple[ForceModel, ActuatorLag | None]],
+        models: Sequence[tuple[FeedForwardForce, ActuatorLag | None]],
     ) -> None:
         super().__init__()
         self.n_state = 13

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple, final
+from typing import TYPE_CHECKING, NamedTuple, Protocol, final
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +18,6 @@ from residnet.core import columns
 from residnet.core.columns import dynamic_states, motion_accelerations, pose
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body, wrap_angle
-from residnet.physics.force_model import ForceModel
 from residnet.physics.plant import Hull
 
 if TYPE_CHECKING:
@@ -279,8 +278,15 @@ def filter_derivatives(
     return PoseDerivatives(pose, rate, acceleration, jerk, snap)
 
 
+class FeedForwardForce(Protocol):
+    """A model that computes the thruster force of a motion."""
+
+    def thruster_force(self, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
+        """Return the force tau [..., 3] at nu_dot, nu [..., 3] and heading psi [...] rad."""
+
+
 def required_force(
-    model: ForceModel, motion: PoseDerivatives, lag: ActuatorLag | None, hold_time: float
+    model: FeedForwardForce, motion: PoseDerivatives, lag: ActuatorLag | None, hold_time: float
 ) -> Tensor:
     """Return the required force, with first and second derivative, when a command acts, [..., 9].
 

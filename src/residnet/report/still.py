@@ -55,13 +55,18 @@ RC_PARAMS: Any = {
 
 
 def render_matplotlib(
-    figure: Figure, case: Case | None = None, panel_numbers: Sequence[int] = ()
+    figure: Figure,
+    case: Case | None = None,
+    panel_numbers: Sequence[int] = (),
+    width: float = FIGURE_WIDTH,
 ) -> Any:
     """Return a matplotlib figure of a case: maps in one row, other panels below.
 
     Args:
+        figure: the figure.
         case: a case of the figure; the first one if None.
         panel_numbers: numbers of the panels to draw; all if empty.
+        width: width in inches.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -83,7 +88,7 @@ def render_matplotlib(
     map_lines = [_MAP_HEIGHT if len(maps) < 3 else 3.0] if maps else []
     with rc_context(RC_PARAMS):
         canvas = Canvas(
-            figsize=(FIGURE_WIDTH, 0.5 + sum([*map_lines, *heights])), dpi=DPI, layout="constrained"
+            figsize=(width, 0.5 + sum([*map_lines, *heights])), dpi=DPI, layout="constrained"
         )
         FigureCanvasAgg(canvas)
         grid = canvas.add_gridspec(
@@ -110,9 +115,27 @@ def render_matplotlib(
                 axes.set_xlabel("")
         canvas.align_ylabels()
         labels = dict.fromkeys(style.label for style in figure.styles.values())
-        _legend_above(canvas, {label: handles[label] for label in labels if label in handles})
+        shown_handles = {label: handles[label] for label in labels if label in handles}
+        _legend_above(canvas, shown_handles, width)
         canvas.canvas.draw()
     return canvas
+
+
+def draw_on_axes(figure: Figure, axes: Sequence[Any], panel_numbers: Sequence[int]) -> None:
+    """Draw panels of the first case on axes of the caller, in the style of the caller.
+
+    Curves have labels, so that `legend()` of the axes lists them.
+
+    Args:
+        figure: the figure.
+        axes: matplotlib axes, one for each panel.
+        panel_numbers: numbers of the panels.
+    """
+    for panel_axes, number in zip(axes, panel_numbers, strict=True):
+        handles: dict[str, Any] = {}
+        _draw_panel(panel_axes, figure, figure.cases[0], number, handles)
+        for label, handle in handles.items():
+            handle.set_label(label)
 
 
 def _draw_panel(
@@ -219,7 +242,7 @@ def _draw_curve(axes: Any, style: GlyphStyle, x: np.ndarray, y: np.ndarray) -> A
     return artist
 
 
-def _legend_above(canvas: Any, handles: dict[str, Any]) -> None:
+def _legend_above(canvas: Any, handles: dict[str, Any], width: float) -> None:
     """Place a legend above the panels, with the largest number of columns that fit."""
     # in points: the sample and its spaces, then the text at 9 pt
     widths = [46.0 + 4.9 * len(text) for text in handles]
@@ -227,8 +250,7 @@ def _legend_above(canvas: Any, handles: dict[str, Any]) -> None:
     # matplotlib fills a legend column by column
     while (
         columns > 1
-        and sum(max(part) for part in np.array_split(np.array(widths), columns))
-        > 72.0 * FIGURE_WIDTH
+        and sum(max(part) for part in np.array_split(np.array(widths), columns)) > 72.0 * width
     ):
         columns -= 1
     if handles:

@@ -20,6 +20,7 @@ from residnet.autopilot.guidance import Crossing, CrossingConfig
 from residnet.autopilot.heading.conditions import compile_or_fallback
 from residnet.autopilot.motion import (
     AllocatedPolicy,
+    FeedForwardForce,
     LagCompensatedPID,
     MotionPID,
     required_force,
@@ -49,14 +50,14 @@ from residnet.engine.compiled import CompiledRollout
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import FreeRun, Rollout, Source
 from residnet.physics.actuators.base import ForceActuators
-from residnet.physics.force_model import ForceModel
+from residnet.physics.actuators.thrusters import AzimuthThrusters
 from residnet.physics.hull import HullConfig
 from residnet.physics.plant import HullPlant
 from residnet.physics.vessel import load_vessel
 
 _MIN_COMPILED_STEPS = 2500
 """Number of steps of a simulation from which compilation pays."""
-FeedForwardModel = tuple[ForceModel, ActuatorLag | None]
+FeedForwardModel = tuple[FeedForwardForce, ActuatorLag | None]
 """A model as feed-forward, and the thruster lag that it compensates; None for none."""
 
 
@@ -247,9 +248,12 @@ class FerrySimulation:
         self.plant, self.thrusters = load_force_vessel(plant_name)
         self.believed_hull = load_force_vessel(believed_name)[0].hull
         if not self.thrusters.state_names:
+            response = "response: {kind: first_order, time: 1 s}"
+            has_shafts = isinstance(self.thrusters, AzimuthThrusters)
+            lag_key = f"shaft: {{{response}}}" if has_shafts else response
             raise ConfigError(
-                f"vessel '{plant_name}': its forces have no lag, which this study identifies; set"
-                " actuators.response"
+                f"vessel '{plant_name}': its thrusters have no lag, which this study identifies;"
+                f" set `actuators: {{{lag_key}}}` in a vessel file with `base: {plant_name}`"
             )
         if disturbance == Disturbance():
             self.plant.without_environment()
@@ -271,6 +275,42 @@ class FerrySimulation:
         Raises:
             DataError: if the closed loop is unstable.
         """
+        runs = self._simulate_batch([path] * len(feeds), feeds, feedback=feedback)
+        finite_runs = [run for run in runs if run is not None]
+        if len(finite_runs) < len(runs):
+            raise DataError(
+                "the states of the ferry are not finite: with these gains and models the closed"
+                " loop is unstable"
+            )
+        return finite_runs
+
+    def simulate_courses(
+        self, courses: Sequence[ReferenceFilterConfig], feeds: Sequence[FeedForwardModel]
+    ) -> list[list[FerryRun | None]]:
+        """Simulate courses of equal duration with each model as feed-forward, all in one batch.
+
+        Returns:
+            For each model its run along each course; None for an unstable closed loop.
+        """
+        runs = self._simulate_batch(
+            [course for _ in feeds for course in courses],
+            [feed for feed in feeds for _ in courses],
+            feedback=True,
+        )
+        n_courses = len(courses)
+        return [runs[k * n_courses : (k + 1) * n_courses] for k in range(len(feeds))]
+
+    def _simulate_batch(
+        self,
+        paths: Sequence[ReferenceFilterConfig | CrossingConfig],
+        feeds: Sequence[FeedForwardModel],
+        *,
+        feedback: bool,
+    ) -> list[FerryRun | None]:
+        """Simulate each path with its feed-forward; a run that is not finite is None.
+
+        The paths are courses of equal duration, or the same crossing.
+        """
         gains = self.loop
         step = self.loop.step
         lags = [lag for _, lag in feeds]
@@ -282,13 +322,21 @@ class FerrySimulation:
         policy = AllocatedPolicy(LagCompensatedPID(pid, lags, step), self.thrusters.allocate)
         n_inputs = len(self.plant.input_names)
         references = torch.zeros(len(feeds), 0, 0, dtype=torch.float64)
-        if isinstance(path, CrossingConfig):
-            steps = round(path.duration / step)
+        first_path = paths[0]
+        if isinstance(first_path, CrossingConfig):
+            steps = round(first_path.duration / step)
         else:
-            motion = sample_filtered_course(path, step)
-            steps = len(motion.pose)
-            required_forces = [required_force(model, motion, lag, step) for model, lag in feeds]
-            references = torch.stack([stack_reference(motion, force) for force in required_forces])
+            courses = [path for path in paths if isinstance(path, ReferenceFilterConfig)]
+            motions = {course: sample_filtered_course(course, step) for course in set(courses)}
+            steps = len(motions[courses[0]].pose)
+            references = torch.stack(
+                [
+                    stack_reference(
+                        motions[course], required_force(model, motions[course], lag, step)
+                    )
+                    for course, (model, lag) in zip(courses, feeds, strict=True)
+                ]
+            )
         w = torch.zeros(len(feeds), steps, n_inputs, dtype=torch.float64)
         if self.disturbance != Disturbance():
             for key, force in self.disturbance:
@@ -296,8 +344,8 @@ class FerrySimulation:
         noise = (self.noise or MotionNoise()).sample_noise((len(feeds), steps), self.seed)
         x0 = torch.zeros(len(feeds), len(self.plant.state_names), dtype=torch.float64)
         with torch.no_grad():
-            if isinstance(path, CrossingConfig):
-                guidance = Crossing(path, step, feeds)
+            if isinstance(first_path, CrossingConfig):
+                guidance = Crossing(first_path, step, feeds)
                 plant = RecordedPlantDynamics(self.plant, step)
                 loop = ClosedLoop(policy, guidance)
                 model: FreeRun = Rollout(plant, NoisyLoop(loop))
@@ -322,13 +370,9 @@ class FerrySimulation:
                     )
             states, applied_inputs, _ = model(*rollout_arguments)
             states = states[:, :-1]
-            if not bool(torch.isfinite(states).all()):
-                raise DataError(
-                    "the states of the ferry are not finite: with these gains and models the closed"
-                    " loop is unstable"
-                )
+            is_finite = torch.isfinite(states).flatten(1).all(dim=1).tolist()
             measured_states = measured(states, noise[..., MOTION])
-            if isinstance(path, CrossingConfig):
+            if isinstance(first_path, CrossingConfig):
                 memory = guidance.initial_state(states[:, 0])
                 rows = []
                 for k in range(steps):
@@ -339,6 +383,8 @@ class FerrySimulation:
                 self._build_run(
                     states[i], applied_inputs[i], references[i], measured_states[i], noise[i], pid
                 )
+                if is_finite[i]
+                else None
                 for i in range(len(feeds))
             ]
 

@@ -103,6 +103,9 @@ class FerryStudyConfig(StudyTask, ComputingTask):
         course: waypoints and reference filter; the first half is for identification, the second
             for tests.
         loop: controller and sampling.
+        judging_courses: courses on which the exported feed-forwards are compared with the believed
+            model, of equal duration; null for three drawn ones: ahead, astern, and with the drift
+            angles of the course.
         crossing: an operational crossing that is also simulated; null for none.
         noise: measurement noise; null for none.
         disturbance: constant force in earth axes.
@@ -121,6 +124,7 @@ class FerryStudyConfig(StudyTask, ComputingTask):
     true: str = "milliampere_half"
     course: ReferenceFilterConfig
     loop: LoopConfig
+    judging_courses: tuple[ReferenceFilterConfig, ...] | None = Field(default=None, min_length=1)
     crossing: CrossingConfig | None = None
     noise: MotionNoise | None = None
     disturbance: Disturbance = Disturbance()
@@ -159,10 +163,18 @@ class FerryStudyConfig(StudyTask, ComputingTask):
                 "course: at least four waypoints, since half of the segments are for"
                 " identification and half for tests"
             )
+        durations = sorted({course.duration for course in self.judging_courses or ()})
+        if len(durations) > 1:
+            raise ValueError(
+                f"judging_courses: their durations differ ({durations[0]:g} s and"
+                f" {durations[-1]:g} s); give courses with equal numbers of waypoints and intervals"
+            )
         try:
             for plant_name in (self.true, self.later or self.true):
                 self.build_loop(plant_name)
             self.course.build(self.loop.step)
+            for course in self.judging_courses or ():
+                course.build(self.loop.step)
         except ConfigError as error:
             raise ValueError(str(error)) from None
         return self
@@ -177,6 +189,6 @@ class FerryStudyConfig(StudyTask, ComputingTask):
         )
 
     def export_model(self, request: ExportRequest) -> Path:
-        """Write the feed-forward of a model; `selected` has the smallest residual force."""
+        """Write the feed-forward of a model; `selected` has the best judging flights."""
         file: Path = self.call_executor("export_model", request)
         return file

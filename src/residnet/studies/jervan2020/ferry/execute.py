@@ -6,7 +6,8 @@ from this run, and the course is repeated with them as feed-forward.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from residnet.autopilot.evaluation import mean_squares_by_axis
+from residnet.autopilot.evaluation import TrackingMetrics, mean_squares_by_axis
 from residnet.autopilot.guidance import CrossingConfig
 from residnet.autopilot.motion_config import ReferenceFilterConfig
 from residnet.baselines.given_config import BelievedConfig, HullEquations
@@ -44,6 +45,7 @@ from residnet.studies.jervan2020.ferry.config import (
     FerryModelConfig,
     FerryStudyConfig,
 )
+from residnet.studies.jervan2020.ferry.judging import ExportedFeedForward, draw_judging_courses
 from residnet.studies.jervan2020.ferry_loop import (
     FeedForwardModel,
     FerryRun,
@@ -111,10 +113,19 @@ def exports(config: FerryStudyConfig, folder: RunFolder) -> ExportWriters:
 
 
 def export_model(config: FerryStudyConfig, request: ExportRequest) -> Path:
-    """Write the feed-forward of a model; `selected` is the model with the smallest residual."""
+    """Write the feed-forward of a model; `selected` has the smallest error in judging flights.
+
+    Raises:
+        UsageError: if the run has no such model or no judging flights.
+    """
     run = request.run
     results = read_json(request.run.path / config.results_file)
-    name = find_best_model(results) if request.model == "selected" else request.model
+    if "judging" not in results:
+        raise UsageError(
+            f"{run.path}: {config.results_file} has no flights on judging courses (key 'judging');"
+            " it is from an earlier version, so run the study again"
+        )
+    name = find_best_flown_model(results) if request.model == "selected" else request.model
     if name not in config.models:
         raise UsageError(f"{run.path}: no model '{name}'{suggest_name(name, config.models)}")
     chain = [name]
@@ -143,6 +154,14 @@ def summarize(config: FerryStudyConfig, results: StudyResults) -> list[str]:
         f" the unseen half of the course: {remaining_text} % of its mean square in surge,"
         f" sway and yaw."
     ]
+    judging = results["judging"]
+    best_flown = find_best_flown_model(results)
+    sentences.append(
+        f"On {len(judging[BELIEVED_NAME]['courses'])} judging courses the exported feed-forward"
+        f" of {best_flown} has the smallest mean position error:"
+        f" {_error_text(judging[best_flown])}; the believed model's is"
+        f" {_error_text(judging[BELIEVED_NAME])}."
+    )
     for run_kind in ("course", "crossing"):
         position_errors = {name: run["position_mae"] for name, run in results[run_kind].items()}
         believed_error = position_errors.pop(BELIEVED_NAME, None)
@@ -168,12 +187,22 @@ def summarize(config: FerryStudyConfig, results: StudyResults) -> list[str]:
 def main_figures(config: FerryStudyConfig, results: StudyResults) -> dict[str, SummaryMetric]:
     best_name = find_best_model(results)
     shares = zip(AXES, results["models"][best_name]["share_left"], strict=True)
-    return {
-        f"residual left by {best_name}, {axis}": SummaryMetric(share) for axis, share in shares
-    } | {
-        f"mean position error on the course with {name}": SummaryMetric(run["position_mae"], "m")
-        for name, run in results["course"].items()
-    }
+    return (
+        {f"residual left by {best_name}, {axis}": SummaryMetric(share) for axis, share in shares}
+        | {
+            f"mean position error on the judging courses with {name}": SummaryMetric(
+                run["position_mae"], "m"
+            )
+            for name, run in results["judging"].items()
+            if run["position_mae"] is not None
+        }
+        | {
+            f"mean position error on the course with {name}": SummaryMetric(
+                run["position_mae"], "m"
+            )
+            for name, run in results["course"].items()
+        }
+    )
 
 
 def build_sections(config: FerryStudyConfig, results: StudyResults, run: Path) -> list[Section]:
@@ -184,6 +213,7 @@ def build_sections(config: FerryStudyConfig, results: StudyResults, run: Path) -
     sections_written = [
         Section("", [*run_pictures[:1], residual_table.select_columns(3, 6)]),
         Section("Residual force on the unseen half", [residual_table]),
+        Section("Judging courses", [_judging_table(results)]),
     ]
     for run_kind, title in (
         ("course", "Course in closed loop"),
@@ -292,6 +322,8 @@ class FerryStudy:
             export.
         runs: simulations by model, `believed` first, of the `course`, the `crossing`, and the
             course without feedback (`feed_forward_alone`); empty if not simulated.
+        judging: tracking metrics of every exported feed-forward, `believed` first, by judging
+            course; None for an unstable closed loop.
         updates: for each feed-forward model on the changed vessel: whether it is still valid, and
             the tracking errors before and after a new identification.
     """
@@ -302,6 +334,7 @@ class FerryStudy:
     models: dict[str, ResidualForceModel]
     whole_course_models: dict[str, ResidualForceModel]
     runs: dict[str, dict[str, FerryRun]]
+    judging: dict[str, dict[str, TrackingMetrics | None]]
     updates: dict[str, dict[str, Any]]
 
 
@@ -354,6 +387,7 @@ def run_ferry_study(config: FerryStudyConfig) -> FerryStudy:
         for name, model in config.models.items()
         if model.searches_settings and not model.on and models[name].fit.notes["order"] > 0
     }
+    judging = _simulate_judging_courses(config, ferry, record, models, whole_course_models)
     feed_forward_models = {name: models[name] for name, model in config.models.items() if model.fly}
     feeds_by_name: dict[str, FeedForwardModel] = {BELIEVED_NAME: (believed, None)}
     feeds_by_name |= {name: (model.force, model.lag) for name, model in feed_forward_models.items()}
@@ -414,8 +448,38 @@ def run_ferry_study(config: FerryStudyConfig) -> FerryStudy:
                 feedback=False,
             ),
         },
+        judging,
         updates,
     )
+
+
+def _simulate_judging_courses(
+    config: FerryStudyConfig,
+    ferry: FerrySimulation,
+    record: ForceRecord,
+    models: Mapping[str, ResidualForceModel],
+    whole_course_models: Mapping[str, ResidualForceModel],
+) -> dict[str, dict[str, TrackingMetrics | None]]:
+    """Simulate the judging courses with the believed model and every exported feed-forward."""
+    if config.judging_courses is None:
+        courses = draw_judging_courses(config.course, config.seed)
+    else:
+        courses = {
+            f"course {number}": course
+            for number, course in enumerate(config.judging_courses, start=1)
+        }
+    feeds: dict[str, FeedForwardModel] = {BELIEVED_NAME: (ForceModel(ferry.believed_hull), None)}
+    for name, model in {**models, **whole_course_models}.items():
+        ranges = exported_ranges(record, model, is_whole_course=name in whole_course_models)
+        feeds[name] = (ExportedFeedForward(model.force, ranges), model.lag)
+    runs_by_model = ferry.simulate_courses(list(courses.values()), list(feeds.values()))
+    return {
+        name: {
+            course: None if run is None else run.tracking_metrics
+            for course, run in zip(courses, runs, strict=True)
+        }
+        for name, runs in zip(feeds, runs_by_model, strict=True)
+    }
 
 
 def forward_runs(
@@ -517,20 +581,33 @@ def write_results(
             run_kind: {name: run.tracking_metrics.to_json() for name, run in runs.items()}
             for run_kind, runs in study_result.runs.items()
         },
+        "judging": {name: _summarize_judging(runs) for name, runs in study_result.judging.items()},
         "later": study_result.updates,
         "forward": forward,
     }
     return content, figures
 
 
+def exported_ranges(
+    record: ForceRecord, model: ResidualForceModel, *, is_whole_course: bool
+) -> list[tuple[float, float]]:
+    """Return the training ranges of nu_dot and nu (six rows) of an exported model.
+
+    Args:
+        record: log of the course.
+        model: the exported model.
+        is_whole_course: whether the model is fitted to the whole course instead of its first half.
+    """
+    if is_whole_course:
+        record = replace(record, is_training=torch.ones_like(record.is_training))
+    return record.motion_ranges(mirror=bool(model.fit.notes.get("mirror")))
+
+
 def _exported_model(terms: Sequence[str], study_result: FerryStudy, name: str) -> dict[str, Any]:
     """Return the model for export, with its training range."""
-    record = study_result.record
-    model = study_result.models[name]
-    if name in study_result.whole_course_models:
-        record = replace(record, is_training=torch.ones_like(record.is_training))
-        model = study_result.whole_course_models[name]
-    ranges = record.motion_ranges(mirror=bool(model.fit.notes.get("mirror")))
+    is_whole_course = name in study_result.whole_course_models
+    model = study_result.whole_course_models.get(name, study_result.models[name])
+    ranges = exported_ranges(study_result.record, model, is_whole_course=is_whole_course)
     return {**fit_to_json(terms, model.fit), "notes": model.fit.notes, "range": ranges}
 
 
@@ -597,38 +674,105 @@ def _run_figures(runs: Mapping[str, FerryRun], run_kind: str) -> list[Figure]:
     return [errors, forces]
 
 
+def _summarize_judging(metrics: Mapping[str, TrackingMetrics | None]) -> dict[str, Any]:
+    """Return the mean errors over the judging courses; None if a flight is unstable."""
+    stable_runs = [run for run in metrics.values() if run is not None]
+    is_stable = len(stable_runs) == len(metrics)
+    position_errors = [run.position_mae for run in stable_runs]
+    heading_errors = [run.heading_mae for run in stable_runs]
+    return {
+        "position_mae": sum(position_errors) / len(metrics) if is_stable else None,
+        "heading_mae": sum(heading_errors) / len(metrics) if is_stable else None,
+        "courses": {
+            name: None if run is None else run.to_json() for name, run in metrics.items()
+        },
+    }
+
+
+def _error_text(judging: StudyResults) -> str:
+    """Return the mean position error of the judging flights with its unit."""
+    error = judging["position_mae"]
+    return "unstable" if error is None else f"{format_number(error)} m"
+
+
 def list_feed_forward_objections(name: str, results: StudyResults) -> list[str]:
     """Return objections to a feed-forward instead of the believed one.
 
-    Criteria are the residual force on the test half, averaged over the axes, and the position error
-    of every run with it.
+    The criterion is the mean position error of simulated flights: on the judging courses, and in
+    the operational crossing if there is one. The residual force is no criterion, because a model
+    with a larger residual may track courses better.
     """
-    shares = results["models"][name]["share_left"]
-    reasons = []
-    if sum(shares) > len(shares):
-        remaining_text = join_numbers([100 * share for share in shares])
-        reasons.append(
-            f"on the unseen half it leaves {remaining_text} % of the residual force in surge,"
-            f" sway and yaw"
+    model_error, believed_error = (
+        results["judging"][model_name]["position_mae"] for model_name in (name, BELIEVED_NAME)
+    )
+    if model_error is None:
+        return ["the closed loop with it is unstable on a judging course"]
+    compared_errors = {"judging courses": (model_error, believed_error)}
+    if name in (crossing := results["crossing"]):
+        compared_errors["crossing"] = (
+            crossing[name]["position_mae"],
+            crossing[BELIEVED_NAME]["position_mae"],
         )
-    for run_kind in ("course", "crossing", "feed_forward_alone"):
-        if name in (runs := results[run_kind]):
-            model_error, believed_error = (
-                runs[model_name]["position_mae"] for model_name in (name, BELIEVED_NAME)
-            )
-            if model_error > believed_error:
-                reasons.append(
-                    f"its mean position error in the {run_kind.replace('_', ' ')} is"
-                    f" {format_number(model_error)} m,"
-                    f" the believed model's {format_number(believed_error)} m"
-                )
-    return reasons
+    return [
+        f"its mean position error in the {flights} is {format_number(errors[0])} m, the believed"
+        f" model's {format_number(errors[1])} m"
+        for flights, errors in compared_errors.items()
+        if errors[1] is not None and errors[0] > errors[1]
+    ]
 
 
 def find_best_model(results: StudyResults) -> str:
     """Return the model with the smallest remaining residual."""
     models: StudyResults = results["models"]
     return min(models, key=lambda name: float(sum(models[name]["share_left"])))
+
+
+def find_best_flown_model(results: StudyResults) -> str:
+    """Return the model with the smallest mean position error on the judging courses."""
+
+    def position_error(name: str) -> float:
+        error = results["judging"][name]["position_mae"]
+        return math.inf if error is None else float(error)
+
+    names: list[str] = list(results["models"])
+    return min(names, key=position_error)
+
+
+def _judging_table(results: StudyResults) -> Table:
+    """Return the table of position errors on the judging courses."""
+    judging = results["judging"]
+    rows = [
+        {
+            "name": name,
+            **judging[name],
+            "decision": "the controller's"
+            if name == BELIEVED_NAME
+            else "; ".join(list_feed_forward_objections(name, results)) or "exported",
+        }
+        for name in judging
+    ]
+    course_names = list(judging[BELIEVED_NAME]["courses"])
+
+    def course_cell(course: str) -> Callable[[Mapping[str, Any]], Cell]:
+        def format_cell(row: Mapping[str, Any]) -> Cell:
+            run = row["courses"][course]
+            return Cell("unstable" if run is None else format_number(run["position_mae"]))
+
+        return format_cell
+
+    return build_table(
+        rows,
+        [
+            ("feed-forward", "name"),
+            *((f"{course} m", course_cell(course)) for course in course_names),
+            ("mean m", lambda row: Cell(_error_text(row).removesuffix(" m"))),
+            ("export", "decision"),
+        ],
+        caption="Mean position errors on courses that were not used for identification, with the"
+        " feed-forwards as exported. A feed-forward is exported if its mean error is smaller than"
+        " that of the believed model.",
+        is_selected=lambda row: row["name"] == find_best_flown_model(results),
+    )
 
 
 def _residual_table(config: FerryStudyConfig, results: StudyResults) -> Table:
