@@ -86,3 +86,28 @@ def test_a_rudder_that_a_controller_set_is_refused() -> None:
         identify_steering(logs)
     found = identify_steering([steered_log("set_points", seed) for seed in (0, 1)])
     assert found.response.gain == pytest.approx(0.7, rel=0.1)
+
+
+def test_set_points_identify_a_rudder_that_a_controller_set() -> None:
+    # disturbances that outweigh the steps of the course, so that a direct fit is biased
+    logs = [steered_log("set_points", seed, disturbance=0.6) for seed in range(5)]
+    response = identify_steering(logs).response
+    assert response.gain == pytest.approx(0.7, rel=0.2)
+    assert response.time == pytest.approx(0.8, rel=0.3)
+    assert abs(response.gain - 0.7) < 3.0 * response.standard_errors[0]
+    without = [
+        log.replace(channels={k: v for k, v in log.channels.items() if k != "psi_d"})
+        for log in logs
+    ]
+    try:
+        direct = identify_steering(without).response
+    except (DataError, FitError):
+        return
+    assert abs(direct.gain - 0.7) > 2.0 * abs(response.gain - 0.7)
+
+
+def test_a_set_point_without_steps_identifies_nothing() -> None:
+    logs = [steered_log("controller", seed) for seed in range(3)]
+    constant = [log.replace(channels={**log.channels, "psi_d": np.zeros(len(log))}) for log in logs]
+    with pytest.raises(DataError, match="psi_d explains 0 % of the rudder"):
+        identify_steering(constant)

@@ -14,7 +14,12 @@ import fmpy
 import numpy as np
 import pytest
 import torch
-from exported_models import built
+from exported_models import (
+    built,
+    draw_samples_around_ranges,
+    expected_flags,
+    exported_with_domain,
+)
 from fmpy.fmi1 import FMICallException
 from fmpy.simulation import instantiate_fmu
 from fmpy.validation import validate_fmu
@@ -66,6 +71,26 @@ def test_a_unit_is_imported_and_stepped(variant: str, tmp_path: Path) -> None:
         assert not table["outside"].any()
     with pytest.raises(fmpy.fmi1.FMICallException, match="DoStep failed"):
         flown(0.25)
+
+
+def test_a_unit_flags_the_same_samples_as_the_model(tmp_path: Path) -> None:
+    made = exported_with_domain()
+    get_exporter("fmu2").export(made, tmp_path / "boat.fmu")
+    x, w = draw_samples_around_ranges(30)
+    flags = []
+    for state, inputs in zip(x.tolist(), w.tolist(), strict=True):
+        unit = Unit(tmp_path)
+        unit.initialize(0.0)
+        for name, value in zip(("x", "y", "psi", "u", "v", "r"), state, strict=True):
+            unit.set(f"{name}_start", value)
+        for name, value in zip(made.spec.signals.input_columns, inputs, strict=True):
+            unit.set(name, value)
+        unit.unit.exitInitializationMode()
+        unit.step(0.0, made.spec.dt)
+        flags.append(bool(unit.unit.getBoolean([unit.references["outside"]])[0]))
+        unit.unit.terminate()
+        unit.unit.freeInstance()
+    assert flags == expected_flags(made, x, w)
 
 
 class Unit:

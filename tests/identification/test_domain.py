@@ -51,6 +51,34 @@ def test_new_logs_of_the_same_kind_are_inside() -> None:
     assert np.mean(shares) < 0.02
 
 
+def test_ranges_have_a_margin_for_the_amplitudes_of_new_logs() -> None:
+    signals = SignalsConfig(inputs=("delta",))
+
+    def scaled_log(seed: int, amplitude: float) -> Any:
+        log = steered_log("steps", seed)
+        # the equation of the logs is linear, so that a scaled log is a log of another amplitude
+        scaled = {name: amplitude * log.channels[name] for name in ("v", "r", "delta")}
+        return prepared(log, ("delta",), **scaled)
+
+    logs = [scaled_log(seed, a) for seed, a in enumerate((0.5, 0.6, 0.7, 0.8, 0.9, 0.8))]
+    new_logs = [scaled_log(seed, a) for seed, a in enumerate((0.6, 0.97, 0.8, 1.0), start=10)]
+    domain = estimate_domain(logs, signals, 0.1)
+    margins = np.array([domain.range_margins[name] for name in ("u", "v", "r", "delta")])
+    values = np.concatenate([np.column_stack((log.y[:, 3:], log.w)) for log in logs])
+    new_values = np.concatenate([np.column_stack((log.y[:, 3:], log.w)) for log in new_logs])
+
+    def share_beyond(margin: np.ndarray) -> float:
+        lower = values.min(axis=0) - margin
+        upper = values.max(axis=0) + margin
+        return float(((new_values < lower) | (new_values > upper)).any(axis=1).mean())
+
+    assert share_beyond(np.zeros(4)) > 0.02
+    assert share_beyond(margins) < 0.005
+    # the margin is no licence to extrapolate
+    assert np.all(margins <= 0.75 * values.std(axis=0) + 1e-9)
+    assert np.mean([flagged(domain, log, ("delta",)) for log in new_logs]) < 0.02
+
+
 def test_open_loop_is_outside_of_logs_of_a_controller() -> None:
     signals = SignalsConfig(inputs=("delta",))
     domain = estimate_domain(logs_of("controller", range(6)), signals, 0.1)
@@ -92,6 +120,25 @@ def test_inputs_that_were_held_or_alike_have_a_relation() -> None:
     assert [row.text for row in file.directions if not row.is_excited] == [
         "differential thrust of n_port and n_stbd: not excited"
     ]
+
+
+def test_collinear_inputs_have_a_relation() -> None:
+    random = np.random.default_rng(0)
+    names = ("n_port", "n_stbd", "delta")
+    signals = SignalsConfig(inputs=names)
+    logs = []
+    for seed in range(5):
+        n = np.repeat(random.uniform(6, 14, 30), 100)
+        log = steered_log("steps", seed)
+        n_port = n + 0.05 * random.standard_normal(3000)
+        logs.append(prepared(log, names, n_port=n_port, n_stbd=n))
+    domain = estimate_domain(logs[:4], signals, 0.1)
+    assert [(one.input, one.channels) for one in domain.relations] == [("n_stbd", ("n_port",))]
+    assert flagged(domain, logs[4], names) < 0.02
+    apart = prepared(
+        steered_log("steps", 4), names, n_port=logs[4].w[:, 0], n_stbd=logs[4].w[:, 0] - 0.5
+    )
+    assert flagged(domain, apart, names) > 0.95
 
 
 def test_inputs_without_excitation_have_a_state() -> None:

@@ -12,6 +12,7 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.registry import load_kinds
 from residnet.core.samples import Samples
+from residnet.dynamics.domain_config import InputRelation, OperatingDomain
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
@@ -164,3 +165,74 @@ class AsTensors:
             states.append(x)
             flags.append(outside)
         return torch.stack(states, dim=1), s, torch.stack(flags, dim=1)
+
+
+DOMAIN_CHANNELS = ("u", "v", "r", "n_port", "n_stbd")
+
+
+def exported_with_domain() -> ExportedVessel:
+    """A model whose domain is a ball of ranges, with alike propellers on one course."""
+    spec, model = built("mlp")
+    centre = [0.5 * (low + high) for low, high in zip(LOW[:5], HIGH[:5], strict=True)]
+    scale = [0.5 * (high - low) for low, high in zip(LOW[:5], HIGH[:5], strict=True)]
+    random = np.random.default_rng(0)
+    z = random.uniform(-1, 1, (400, 5))
+    features = np.column_stack(
+        (np.ones(400), z, *(z[:, i] * z[:, j] for i in range(5) for j in range(i, 5)))
+    )
+    factor = np.linalg.inv(np.linalg.cholesky(features.T @ features / 400))
+    domain = OperatingDomain(
+        channels=DOMAIN_CHANNELS,
+        centre=tuple(centre),
+        scale=tuple(scale),
+        factor=tuple(factor.reshape(-1).tolist()),
+        limit=25.0,
+        n_logs=4,
+        range_margins={"u": 0.2 * (HIGH[0] - LOW[0]), "n_port": 0.1 * (HIGH[3] - LOW[3])},
+        relations=(
+            InputRelation(
+                input="n_stbd",
+                kind="proportional",
+                offset=0.0,
+                channels=("n_port",),
+                gains=(1.0,),
+                tolerance=12.0,
+            ),
+            InputRelation(
+                input="n_port",
+                kind="feedback",
+                offset=10.0,
+                channels=("r",),
+                gains=(5.0,),
+                heading=0.5,
+                heading_gain=8.0,
+                max_heading=1.5,
+                tolerance=14.0,
+            ),
+        ),
+    )
+    return ExportedVessel(spec.model_copy(update={"domain": domain}), model)
+
+
+def draw_samples_around_ranges(n_samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Draw states [K, 6] and inputs [K, m] in float32, a few beyond the training range."""
+    random = np.random.default_rng(1)
+    low = np.array(LOW)
+    high = np.array(HIGH)
+    share = random.random((n_samples, len(LOW)))
+    # within the margin of u and beyond it
+    share[: n_samples // 5, 0] = random.uniform(1.02, 1.4, n_samples // 5)
+    values = (low + (high - low) * share).astype(np.float32)
+    x = np.zeros((n_samples, 6), np.float32)
+    x[:, 2] = random.uniform(-3, 3, n_samples)
+    x[:, 3:] = values[:, :3]
+    return x, values[:, 3:]
+
+
+def expected_flags(vessel: ExportedVessel, x: np.ndarray, w: np.ndarray) -> list[bool]:
+    """Return the flags of single steps by the guarded model."""
+    guarded = vessel.guard_model(torch.float32)
+    memory = torch.zeros(len(x), guarded.n_state)
+    with torch.no_grad():
+        flags = guarded.flagged_step(torch.from_numpy(x), torch.from_numpy(w), memory)[2]
+    return [bool(flag) for flag in flags]

@@ -21,6 +21,7 @@ def steered_log(
     rate = moment = rudder = course = integral = 0.0
     side = 1.0
     rows = []
+    courses = []
     for k in range(round(duration / dt)):
         if k % 60 == 0:
             course = random.uniform(-0.5, 0.5)
@@ -34,6 +35,7 @@ def steered_log(
         else:
             rudder = float(np.clip(-1.2 * error - 0.1 * integral - 0.8 * rate, -0.5, 0.5))
         rows.append((psi, rate, rudder))
+        courses.append(course)
         moment += -moment * dt / 4.0 + 0.7 * disturbance * np.sqrt(dt) * random.standard_normal()
         rate += dt * ((0.7 * rudder - rate) / 0.8 + moment)
         psi += dt * rate
@@ -50,4 +52,6 @@ def steered_log(
         "r": rates + 0.005 * noise[2],
         "delta": rudders,
     }
+    if steering == "set_points":
+        channels["psi_d"] = np.array(courses)
     return Log(f"{steering}_{seed}", dt * np.arange(len(rows)), channels)

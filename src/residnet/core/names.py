@@ -78,6 +78,7 @@ CHANNEL_UNITS: dict[str, str] = {
     "y": "m",
     "z": "m",
     "psi": "rad",
+    "psi_d": "rad",
     "phi": "rad",
     "theta": "rad",
     "u": "m/s",

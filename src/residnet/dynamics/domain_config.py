@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field, model_validator
 
@@ -56,8 +56,10 @@ class OperatingDomain(Config):
         scale: standard deviation of each channel, SI.
         factor: square matrix F by rows with q = |F v|^2.
         limit: largest q of the domain.
-        false_flags: share of samples of held-out training logs beyond the limit.
+        false_flags: share of samples of held-out training logs outside the domain.
         n_logs: number of training logs.
+        range_margins: margin of the training range on both sides by velocity and input, SI; no
+            margin for other channels.
         relations: relations of inputs.
         is_closed_loop_only: whether a controller without a reference that the model can see set an
             input, so that no sample can be said to lie in the domain.
@@ -70,6 +72,7 @@ class OperatingDomain(Config):
     limit: float = Field(default=1.0, gt=0)
     false_flags: float = Field(default=0.0, ge=0, le=1)
     n_logs: int = Field(ge=1)
+    range_margins: dict[str, Annotated[float, Field(ge=0)]] = Field(default_factory=dict)
     relations: tuple[InputRelation, ...] = ()
     is_closed_loop_only: bool = False
 

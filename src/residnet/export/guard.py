@@ -16,9 +16,10 @@ All formats follow these rules, so that a bad sample never yields a non-finite r
   velocities before the step.
 
 The flag `outside` is true for each row to which one of these rules was applied, for each row with
-an entry beyond the training range, and for each row outside the operating domain: the relations and
-the density of the training data (`residnet.dynamics.domain`). The rules are stateless: the next
-good sample is processed from the state and memory given to it.
+an entry beyond the training range by more than its margin, and for each row outside the operating
+domain: the relations and the density of the training data (`residnet.dynamics.domain`). The margins
+belong to the domain and are zero without one. The rules are stateless: the next good sample is
+processed from the state and memory given to it.
 """
 
 from __future__ import annotations
@@ -61,19 +62,33 @@ class GuardRanges(nn.Module):
         upper: upper limits of the training range [k].
         margin: extension of the accepted range beyond the training range [k].
         dtype: precision of the limits.
+        flag_margin: extension of the range without a flag beyond the training range [k]; None for
+            no extension.
     """
 
-    def __init__(self, lower: Tensor, upper: Tensor, margin: Tensor, dtype: torch.dtype) -> None:
+    def __init__(
+        self,
+        lower: Tensor,
+        upper: Tensor,
+        margin: Tensor,
+        dtype: torch.dtype,
+        flag_margin: Tensor | None = None,
+    ) -> None:
         super().__init__()
         self.lower = nn.Buffer(lower.to(dtype))
         self.upper = nn.Buffer(upper.to(dtype))
         self.accepted_lower = nn.Buffer((lower - margin).to(dtype))
         self.accepted_upper = nn.Buffer((upper + margin).to(dtype))
         self.midpoint = nn.Buffer((0.5 * (lower + upper)).to(dtype))
+        flag_margin = torch.zeros_like(margin) if flag_margin is None else flag_margin
+        # an accepted value without a flag needs no replacement
+        flag_margin = torch.minimum(flag_margin, margin)
+        self.unflagged_lower = nn.Buffer((lower - flag_margin).to(dtype))
+        self.unflagged_upper = nn.Buffer((upper + flag_margin).to(dtype))
 
     def is_in_training_range(self, values: Tensor) -> Tensor:
-        """Return which rows [...] of values [..., k] are in the training range."""
-        return ((values >= self.lower) & (values <= self.upper)).all(dim=-1)
+        """Return which rows [...] of values [..., k] are in the training range and its margin."""
+        return ((values >= self.unflagged_lower) & (values <= self.unflagged_upper)).all(dim=-1)
 
     def is_accepted(self, values: Tensor) -> Tensor:
         """Return which rows [...] of values [..., k] are accepted."""
@@ -126,7 +141,8 @@ class GuardedDynamics(Dynamics):
         lower = torch.cat((-pose_limit, lower))
         upper = torch.cat((pose_limit, upper))
         margin = torch.cat((torch.zeros_like(pose_limit), margin))
-        self.ranges = GuardRanges(lower, upper, margin, torch.float32)
+        flag_margin = torch.cat((torch.zeros_like(pose_limit), _flag_margins(spec)))
+        self.ranges = GuardRanges(lower, upper, margin, torch.float32, flag_margin)
         n_states = len(spec.signals.dof.state_names)
         self.domain_check = (
             None
@@ -283,3 +299,10 @@ def _accepted_margins(spec: ModelSpec) -> list[float]:
         max(accepted_margin(lower, upper), _FULL_TURN if units[name] == "rad" else 0.0)
         for name, (lower, upper) in spec.ranges.items()
     ]
+
+
+def _flag_margins(spec: ModelSpec) -> Tensor:
+    """Return the extension [k] of the range without a flag of each velocity and input."""
+    domain = spec.domain
+    margins = {} if domain is None else domain.range_margins
+    return torch.tensor([margins.get(name, 0.0) for name in spec.ranges], dtype=torch.float64)

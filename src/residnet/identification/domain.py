@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+import scipy.stats
 import torch
 
 from residnet.core.layout import SURGE
@@ -22,25 +24,39 @@ from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.prepare import PreparedLog
 from residnet.quality.feedback import InputFeedback, cross_validated_r2, detect_feedback
 
-_LIMIT_LEVEL: Final = 0.993
-"""Share of the samples of held-out logs within the limit of the density."""
+FALSE_FLAG_SHARE: Final = 0.008
+"""Share of the samples of a new log of the same kind that may be flagged, all criteria together.
+
+It is less than half of the 2 % that `scripts/bench/excitation.py` allows, because a few logs
+estimate a quantile with much scatter."""
+_MAX_RANGE_MARGIN: Final = 0.75
+"""Largest margin of the ranges in standard deviations of a channel: a quarter of the range of a
+uniform distribution. Logs that differ more are of different kinds, and the space between them is no
+evidence for what lies beyond."""
 _RIDGE: Final = 1e-4
 """Second moment that is added to that of each monomial. Channels that vary by less than 1 % of
 their scale in a direction count as if they varied by 1 %.
 """
-_MAX_SAMPLES_PER_LOG: Final = 20_000
+_MAX_SAMPLES: Final = 200_000
+"""Samples of all logs that are used, about; they bound time and memory of the estimate."""
+_MIN_SAMPLES_PER_LOG: Final = 1_000
 _MAX_FOLDS: Final = 10
 _MIN_LOGS: Final = 3
 """Number of logs below which parts of logs, not complete logs, are held out."""
+_NEW_EXTREME_SHARE: Final = 0.01
+"""Share of new logs whose largest value of a channel lies beyond the margin of its range."""
 _HELD_TOLERANCE: Final = 0.02
-"""Tolerance of a held input, as a share of its magnitude, and of a proportional input, as a share
-of its range."""
+"""Smallest tolerance of a held input, as a share of its magnitude, and of a proportional input, as
+a share of its range."""
+MAX_VARIANCE_INFLATION: Final = 400.0
+"""Largest variance inflation of an input: 5 % of its standard deviation vary by themselves."""
 _MIN_LAW_R2: Final = 0.3
 """R^2 of a control law in leave-one-log-out cross-validation, below which the reference of the
 controller is no function of the channels of the model.
 """
-_EXCESS: Final = 1.5
-"""Factor by which new data may exceed the largest deviations from a relation in the logs."""
+_HEADING_EXCESS: Final = 1.5
+"""Factor by which new headings may exceed the largest deviation from the reference of a controller.
+"""
 
 
 def detect_feedback_of_logs(
@@ -74,18 +90,25 @@ def _fill_gaps(values: np.ndarray) -> np.ndarray:
 def estimate_domain(
     logs: Sequence[PreparedLog], signals: SignalsConfig, step: float
 ) -> OperatingDomain:
-    """Estimate relations and density of velocities and inputs of the training logs.
+    """Estimate ranges, relations and density of velocities and inputs of the training logs.
+
+    All limits are calibrated together by leave-one-log-out cross-validation: each criterion is
+    estimated from the other logs and scores the held-out samples. The scores are divided by their
+    quantile at the level 1 - FALSE_FLAG_SHARE, the joint score of a sample is its largest ratio,
+    and the quantile of the joint scores at the same level multiplies every limit. Each log has the
+    same weight. Hence all criteria together flag FALSE_FLAG_SHARE of the held-out samples.
 
     Args:
         logs: training logs.
         signals: inputs of the model.
         step: step of the grid in s.
     """
-    samples = [_usable_samples(log) for log in logs if log.usable.any()]
+    samples = [_usable_samples(log, len(logs)) for log in logs if log.usable.any()]
     names = (*signals.dof.state_names, *signals.input_columns)
     relations = [
         _relate_unexcited_input(name, samples, names, signals.inputs) for name in signals.unexcited
     ]
+    relations += _relate_collinear_inputs(samples, names, signals.inputs)
     is_closed_loop_only = False
     for feedback in detect_feedback_of_logs(logs, signals, step):
         if not feedback.is_closed_loop:
@@ -93,60 +116,128 @@ def estimate_domain(
         law = _fit_control_law(feedback, samples, names)
         is_closed_loop_only |= law is None
         relations += [] if law is None else [law]
-    channels, columns = _density_channels(samples, names, signals)
-    common = {
-        "n_logs": len(logs),
-        "relations": tuple(relations),
-        "is_closed_loop_only": is_closed_loop_only,
-    }
-    if not channels:
-        return OperatingDomain.model_validate(common)
-    rows = [sample[:, columns] for sample in samples]
-    centre = np.concatenate(rows).mean(axis=0)
-    scale = np.concatenate(rows).std(axis=0)
-    fits_table = 8 * count_features(len(channels), 2) ** 2 <= MAX_TABLE_BYTES
-    features = [
-        monomials(torch.from_numpy((row - centre) / scale), 2 if fits_table else 1).numpy()
-        for row in rows
-    ]
-    moments = np.array([feature.T @ feature / len(feature) for feature in features])
-    scores = _held_out_scores(features, moments)
-    # each log counts alike, however long it is
-    quantile = _weighted_quantile(scores, _LIMIT_LEVEL)
-    false_flags = float(np.mean([(score > quantile).mean() for score in scores]))
-    factor = _factorize(moments.mean(axis=0))
-    return OperatingDomain.model_validate(
-        {
-            **common,
-            "channels": channels,
+    parts = samples
+    if len(samples) < _MIN_LOGS:
+        parts = [part for sample in samples for part in np.array_split(sample, 4) if len(part)]
+    folds = _make_folds(len(parts))
+    scores = [_held_out_deviations(relation, parts, folds, names) for relation in relations]
+    smallest_limits = [relation.tolerance for relation in relations]
+    channels, columns = _varying_channels(parts, names, signals)
+    margins = np.zeros(0)
+    if channels:
+        rows = [part[:, columns] for part in parts]
+        scale = np.concatenate(rows).std(axis=0)
+        margins = np.minimum(_predict_range_margins(rows), _MAX_RANGE_MARGIN * scale)
+        scores.append(_held_out_range_excesses(rows, np.maximum(margins, 1e-9 * scale), folds))
+        smallest_limits.append(1.0)
+    density: dict[str, object] = {}
+    is_in_density = [name not in (*WIND_INPUTS, *signals.unexcited) for name in channels]
+    density_channels = list(itertools.compress(channels, is_in_density))
+    if density_channels:
+        density_columns = list(itertools.compress(columns, is_in_density))
+        rows = [part[:, density_columns] for part in parts]
+        centre = np.concatenate(rows).mean(axis=0)
+        scale = np.concatenate(rows).std(axis=0)
+        fits_table = 8 * count_features(len(density_channels), 2) ** 2 <= MAX_TABLE_BYTES
+        degree = 2 if fits_table else 1
+        features = [
+            monomials(torch.from_numpy((row - centre) / scale), degree).numpy() for row in rows
+        ]
+        moments = np.array([feature.T @ feature / len(feature) for feature in features])
+        scores.append(_held_out_scores(features, moments, folds))
+        smallest_limits.append(1e-9)
+        density = {
+            "channels": density_channels,
             "centre": centre.tolist(),
             "scale": scale.tolist(),
-            "factor": factor.reshape(-1).tolist(),
-            "limit": float(quantile),
+            "factor": _factorize(moments.mean(axis=0)).reshape(-1).tolist(),
+        }
+    limits, false_flags = _calibrate_limits(scores, smallest_limits)
+    for k, relation in enumerate(relations):
+        relations[k] = relation.model_copy(update={"tolerance": limits[k]})
+    if channels:
+        scale = np.concatenate(parts)[:, columns].std(axis=0)
+        margins = np.minimum(limits[len(relations)] * margins, _MAX_RANGE_MARGIN * scale)
+    if density:
+        density["limit"] = limits[-1] ** 2
+    return OperatingDomain.model_validate(
+        {
+            "n_logs": len(logs),
+            "relations": tuple(relations),
+            "is_closed_loop_only": is_closed_loop_only,
+            "range_margins": dict(zip(channels, margins.tolist(), strict=True)),
             "false_flags": false_flags,
+            **density,
         }
     )
 
 
-def _usable_samples(log: PreparedLog) -> np.ndarray:
-    """Return evenly spread usable states and inputs of a log [K, nx + m]."""
+def _calibrate_limits(
+    scores: Sequence[Sequence[np.ndarray]], smallest_limits: Sequence[float]
+) -> tuple[list[float], float]:
+    """Return the limits of some criteria at the joint level 1 - FALSE_FLAG_SHARE.
+
+    Args:
+        scores: of each criterion, the scores [K] of the held-out samples of each log.
+        smallest_limits: smallest limit of each criterion.
+
+    Returns:
+        The limit of each criterion, and the share of the samples beyond any of them.
+    """
+    if not scores:
+        return [], 0.0
+    level = 1.0 - FALSE_FLAG_SHARE
+    limits = [
+        max(_weighted_quantile(score, level), smallest_limit)
+        for score, smallest_limit in zip(scores, smallest_limits, strict=True)
+    ]
+    joint_scores = [
+        np.max([score[k] / limit for score, limit in zip(scores, limits, strict=True)], axis=0)
+        for k in range(len(scores[0]))
+    ]
+    factor = max(_weighted_quantile(joint_scores, level), 1.0)
+    false_flags = float(np.mean([(score > factor).mean() for score in joint_scores]))
+    return [factor * limit for limit in limits], false_flags
+
+
+Fold = tuple[np.ndarray, np.ndarray]
+"""Indices of the other parts of the logs, and of the held-out ones."""
+
+
+def _make_folds(n_parts: int) -> list[Fold]:
+    """Return the folds of leave-one-log-out cross-validation, at most `_MAX_FOLDS`.
+
+    A single part is scored with itself.
+    """
+    n_folds = min(n_parts, _MAX_FOLDS)
+    fold_numbers = np.arange(n_parts) % n_folds
+    if n_folds == 1:
+        return [(np.array([0]), np.array([0]))]
+    return [
+        (np.flatnonzero(fold_numbers != fold), np.flatnonzero(fold_numbers == fold))
+        for fold in range(n_folds)
+    ]
+
+
+def _usable_samples(log: PreparedLog, n_logs: int) -> np.ndarray:
+    """Return evenly spread usable states and inputs of one of some logs [K, nx + m]."""
     indices = np.flatnonzero(log.usable)
-    indices = indices[:: max(len(indices) // _MAX_SAMPLES_PER_LOG, 1)]
+    max_samples = max(_MAX_SAMPLES // n_logs, _MIN_SAMPLES_PER_LOG)
+    indices = indices[:: -(-len(indices) // max_samples)]
     table = np.column_stack((log.y[indices], log.w[indices]))
     return np.asarray(table[np.isfinite(table).all(axis=1)])
 
 
-def _density_channels(
+def _varying_channels(
     samples: Sequence[np.ndarray], names: Sequence[str], signals: SignalsConfig
 ) -> tuple[list[str], list[int]]:
-    """Return names and columns of the velocities and commanded inputs that vary."""
+    """Return names and columns of the velocities and inputs that vary."""
     joined = np.concatenate(samples)
-    first = SURGE
     columns = [
         k
         for k, name in enumerate(names)
-        if k >= first
-        and name not in (*WIND_INPUTS, *signals.unexcited, *signals.dof.unmodelled_states)
+        if k >= SURGE
+        and name not in signals.dof.unmodelled_states
         # the depth of a vessel that dives has no range
         and name != "z"
         and joined[:, k].std() > 1e-6 * max(float(np.abs(joined[:, k]).max()), 1e-9)
@@ -161,22 +252,97 @@ def _factorize(moment: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(moment + ridge)))
 
 
-def _held_out_scores(features: Sequence[np.ndarray], moments: np.ndarray) -> list[np.ndarray]:
-    """Return the score of each sample with the moments of the other logs, or of other parts."""
-    if len(features) < _MIN_LOGS:
-        features = [part for feature in features for part in np.array_split(feature, 4)]
-        features = [feature for feature in features if len(feature)]
-        moments = np.array([feature.T @ feature / len(feature) for feature in features])
-    n_folds = min(len(features), _MAX_FOLDS)
-    scores = []
-    for fold in range(n_folds):
-        is_held_out = np.arange(len(features)) % n_folds == fold
-        factor = _factorize(moments[~is_held_out if n_folds > 1 else is_held_out].mean(axis=0))
-        scores += [
-            ((features[k] @ factor.T) ** 2).sum(axis=1)
-            for k in np.flatnonzero(is_held_out).tolist()
-        ]
+def _held_out_scores(
+    features: Sequence[np.ndarray], moments: np.ndarray, folds: Sequence[Fold]
+) -> list[np.ndarray]:
+    """Return the root of the inverse Christoffel function of each sample by the other logs."""
+    scores = [np.zeros(0)] * len(features)
+    for others, held_out in folds:
+        factor = _factorize(moments[others].mean(axis=0))
+        for k in held_out.tolist():
+            scores[k] = np.linalg.norm(features[k] @ factor.T, axis=1)
     return scores
+
+
+def _predict_range_margins(rows: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the margins [c] beyond the ranges of some logs that hold the ranges of a new log.
+
+    The largest value of a new log exceeds that of K logs with probability 1 / (K + 1), and then for
+    many samples where each log has its own amplitude. The margin is the distance of the upper
+    prediction limit of a new extreme value, mean + t sqrt(1 + 1 / K) times the standard deviation
+    of the extreme values of the logs, to the largest of them. Source: G. J. Hahn and W. Q. Meeker,
+    Statistical Intervals (1991), section 4.7.
+    """
+    n_logs = len(rows)
+    if n_logs < 2:
+        return np.zeros(rows[0].shape[1])
+    quantile = float(scipy.stats.t.ppf(1.0 - _NEW_EXTREME_SHARE, n_logs - 1))
+    factor = quantile * math.sqrt(1.0 + 1.0 / n_logs)
+    margins = np.zeros(rows[0].shape[1])
+    for sign in (-1.0, 1.0):
+        extremes = np.array([(sign * row).max(axis=0) for row in rows])
+        limit = extremes.mean(axis=0) + factor * extremes.std(axis=0, ddof=1)
+        margins = np.maximum(margins, limit - extremes.max(axis=0))
+    return margins
+
+
+def _held_out_range_excesses(
+    rows: Sequence[np.ndarray], scale: np.ndarray, folds: Sequence[Fold]
+) -> list[np.ndarray]:
+    """Return by how much each sample exceeds the ranges of the other logs.
+
+    Args:
+        rows: channels of each log [K, c].
+        scale: unit of the excess of each channel [c].
+        folds: folds of the logs.
+
+    Returns:
+        The largest excess of a channel at each sample [K]; 0 within all ranges.
+    """
+    lowest = np.array([row.min(axis=0) for row in rows])
+    highest = np.array([row.max(axis=0) for row in rows])
+    excesses = [np.zeros(0)] * len(rows)
+    for others, held_out in folds:
+        lower = lowest[others].min(axis=0)
+        upper = highest[others].max(axis=0)
+        for k in held_out.tolist():
+            excess = np.maximum(lower - rows[k], rows[k] - upper) / scale
+            excesses[k] = np.maximum(excess.max(axis=1), 0.0)
+    return excesses
+
+
+def _held_out_deviations(
+    relation: InputRelation,
+    samples: Sequence[np.ndarray],
+    folds: Sequence[Fold],
+    names: Sequence[str],
+) -> list[np.ndarray]:
+    """Return the deviation of each sample from a relation whose gains are those of other logs."""
+    designs = [_relation_regressors(relation, sample, names) for sample in samples]
+    responses = [sample[:, names.index(relation.input)] for sample in samples]
+    deviations = [np.zeros(0)] * len(samples)
+    for others, held_out in folds:
+        response = np.concatenate([responses[k] for k in others])
+        design = np.concatenate([designs[k] for k in others])
+        if relation.kind == "held":
+            # the level is a median, so that a few other values do not move it
+            coefficients = np.array([np.median(response)])
+        else:
+            coefficients = np.linalg.lstsq(design, response, rcond=None)[0]
+        for k in held_out.tolist():
+            deviations[k] = np.abs(responses[k] - designs[k] @ coefficients)
+    return deviations
+
+
+def _relation_regressors(
+    relation: InputRelation, sample: np.ndarray, names: Sequence[str]
+) -> np.ndarray:
+    """Return a constant, the sine of the heading if it counts, and the channels [K, 1 + c]."""
+    columns = [np.ones(len(sample))]
+    if relation.heading is not None:
+        columns.append(np.sin(sample[:, names.index("psi")] - relation.heading))
+    columns += [sample[:, names.index(channel)] for channel in relation.channels]
+    return np.column_stack(columns)
 
 
 def _weighted_quantile(scores: Sequence[np.ndarray], level: float) -> float:
@@ -191,7 +357,10 @@ def _weighted_quantile(scores: Sequence[np.ndarray], level: float) -> float:
 def _relate_unexcited_input(
     name: str, samples: Sequence[np.ndarray], names: Sequence[str], input_names: Sequence[str]
 ) -> InputRelation:
-    """Return the value that an unexcited input held, or its relation to the nearest other input."""
+    """Return the value that an unexcited input held, or its relation to the nearest other input.
+
+    The tolerance is the smallest one that the resolution of the input justifies.
+    """
     joined = np.concatenate(samples)
     values = joined[:, names.index(name)]
     best: tuple[float, str, np.ndarray] = (0.0, "", np.zeros(2))
@@ -206,19 +375,33 @@ def _relate_unexcited_input(
     # a gain of an almost constant input would be noise
     if abs(correlation) < 0.9:
         level = float(np.median(values))
-        deviation = float(np.quantile(np.abs(values - level), 0.999))
-        tolerance = max(_EXCESS * deviation, _HELD_TOLERANCE * abs(level), 1e-9)
+        tolerance = max(_HELD_TOLERANCE * abs(level), 1e-9)
         return InputRelation(input=name, kind="held", offset=level, tolerance=tolerance)
-    other = joined[:, names.index(input_name)]
-    deviation = float(np.quantile(np.abs(values - gain * other - offset), 0.999))
     return InputRelation(
         input=name,
         kind="proportional",
         offset=float(offset),
         channels=(input_name,),
         gains=(float(gain),),
-        tolerance=max(_EXCESS * deviation, _HELD_TOLERANCE * float(np.ptp(values)), 1e-9),
+        tolerance=max(_HELD_TOLERANCE * float(np.ptp(values)), 1e-9),
     )
+
+
+def _relate_collinear_inputs(
+    samples: Sequence[np.ndarray], names: Sequence[str], input_names: Sequence[str]
+) -> list[InputRelation]:
+    """Return the relations of inputs that another input before them explains almost completely."""
+    joined = np.concatenate(samples)
+    relations = []
+    for k, name in enumerate(input_names):
+        relation = _relate_unexcited_input(name, samples, names, input_names[:k])
+        if relation.kind != "proportional":
+            continue
+        other = joined[:, names.index(relation.channels[0])]
+        correlation = float(np.corrcoef(joined[:, names.index(name)], other)[0, 1])
+        if correlation**2 > 1.0 - 1.0 / MAX_VARIANCE_INFLATION:
+            relations.append(relation)
+    return relations
 
 
 def _fit_control_law(
@@ -232,33 +415,32 @@ def _fit_control_law(
     """
     if feedback.source != "the heading" or "psi" not in names:
         return None
-    column = names.index(feedback.name)
     heading_column = names.index("psi")
-    velocity_names = [name for name in ("v", "r") if name in names]
     joined = np.concatenate(samples)
     reference = float(np.angle(np.exp(1j * joined[:, heading_column]).mean()))
-
-    def regressors(sample: np.ndarray) -> np.ndarray:
-        velocities = [sample[:, names.index(name)] for name in velocity_names]
-        return np.column_stack((np.sin(sample[:, heading_column] - reference), *velocities))
-
-    designs = [regressors(sample) for sample in samples]
-    responses = [sample[:, column] for sample in samples]
+    heading = np.angle(np.exp(1j * (joined[:, heading_column] - reference)))
+    velocity_names = tuple(name for name in ("v", "r") if name in names)
+    law = InputRelation(
+        input=feedback.name,
+        kind="feedback",
+        offset=0.0,
+        channels=velocity_names,
+        gains=(0.0,) * len(velocity_names),
+        heading=reference,
+        max_heading=min(float(np.abs(heading).max()) * _HEADING_EXCESS + 0.01, math.pi),
+        tolerance=1e-9,
+    )
+    # the regression has a constant of its own
+    designs = [_relation_regressors(law, sample, names)[:, 1:] for sample in samples]
+    responses = [sample[:, names.index(law.input)] for sample in samples]
     if len(samples) < 2 or cross_validated_r2(designs, responses) < _MIN_LAW_R2:
         return None
     design = np.column_stack((np.ones(len(joined)), np.concatenate(designs)))
-    response = np.concatenate(responses)
-    coefficients = np.linalg.lstsq(design, response, rcond=None)[0]
-    deviation = np.abs(response - design @ coefficients)
-    heading = np.angle(np.exp(1j * (joined[:, heading_column] - reference)))
-    return InputRelation(
-        input=feedback.name,
-        kind="feedback",
-        offset=float(coefficients[0]),
-        channels=tuple(velocity_names),
-        gains=tuple(coefficients[2:].tolist()),
-        heading=reference,
-        heading_gain=float(coefficients[1]),
-        max_heading=min(float(np.abs(heading).max()) * _EXCESS + 0.01, math.pi),
-        tolerance=max(float(np.quantile(deviation, _LIMIT_LEVEL)), 1e-9),
+    coefficients = np.linalg.lstsq(design, np.concatenate(responses), rcond=None)[0]
+    return law.model_copy(
+        update={
+            "offset": float(coefficients[0]),
+            "heading_gain": float(coefficients[1]),
+            "gains": tuple(coefficients[2:].tolist()),
+        }
     )

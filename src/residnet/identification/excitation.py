@@ -22,14 +22,12 @@ from residnet.dynamics.domain_config import (
     describe_domain,
 )
 from residnet.evaluation.records import DirectionRow, ExcitationFile, InputExcitationRow
-from residnet.identification.domain import detect_feedback_of_logs
+from residnet.identification.domain import MAX_VARIANCE_INFLATION, detect_feedback_of_logs
 from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.prepare import PreparedLog
 from residnet.quality.feedback import InputFeedback, cross_validated_r2
 
 SCHEMA = "residnet.excitation/1"
-MAX_VARIANCE_INFLATION: Final = 400.0
-"""Largest variance inflation of an input: 5 % of its standard deviation vary by themselves."""
 _HELD_SHARE: Final = 0.02
 """Standard deviation of an input relative to its magnitude, below which it counts as held."""
 _MIN_DIRECTION_RATIO: Final = 0.05

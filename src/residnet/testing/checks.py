@@ -1010,8 +1010,9 @@ def _check_answer(
     assert_finite(next_state, f"{subject}: a state is not finite")
     assert_finite(memory, f"{subject}: a memory is not finite")
     channels = torch.cat((x, w), dim=-1)
-    is_inside = ((channels >= guard.ranges.lower) & (channels <= guard.ranges.upper)).all(dim=-1)
-    is_inside &= guard.is_valid_memory(s)
+    is_inside = guard.ranges.is_in_training_range(channels) & guard.is_valid_memory(s)
+    if guard.domain_check is not None:
+        is_inside &= guard.domain_check(x, w)
     is_unflagged = ~is_inside & ~outside
     assert_true(
         not bool(is_unflagged.any()),

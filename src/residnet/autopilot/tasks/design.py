@@ -13,6 +13,11 @@ import numpy as np
 import yaml
 from pydantic import Field
 
+from residnet.autopilot.heading.set_points import (
+    InstrumentedResponse,
+    fit_with_set_points,
+    is_direct_estimate_rejected,
+)
 from residnet.autopilot.heading.turning import (
     ManoeuvreRecord,
     NomotoModel,
@@ -28,7 +33,7 @@ from residnet.core.config import (
     load_mapping,
     validate_config,
 )
-from residnet.core.errors import DataError, UsageError
+from residnet.core.errors import DataError, FitError, UsageError
 from residnet.core.files import write_owned
 from residnet.core.log import Log
 from residnet.core.ownership import require_replaceable
@@ -37,10 +42,12 @@ from residnet.io.drafting.questions import DraftNotes
 from residnet.io.drafting.reading import find_log_files, read_drafted
 from residnet.preprocessing.channel_values import estimate_noise_std
 from residnet.preprocessing.motion import MotionConfig, complete_motion
-from residnet.quality.feedback import detect_feedback
+from residnet.quality.feedback import InputFeedback, detect_feedback
 from residnet.tasks.registry import open_finished_task
 
 _RUDDER_CHANNELS = ("cmd_delta", "delta")
+_SET_POINT = "psi_d"
+"""Channel of the set point of the heading (Fossen's psi_d)."""
 _MIN_SAMPLES = 50
 """Smallest number of usable samples for an identification of K and T."""
 _MIN_RUDDER_STD = 1e-3
@@ -72,12 +79,15 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
     Args:
         logs: logs with yaw rate `r` or heading `psi`, and the rudder; turns to both sides are best.
             The rudder command is preferred to the measured angle, since the identified delay must
-            include the steering gear.
+            include the steering gear. With the set point of the heading `psi_d` in every log, K
+            and T are also estimated with it as instrument. That estimate is used if a controller
+            set the rudder, or if the two contradict each other.
         longest_delay: largest delay of the search, in s.
 
     Raises:
         DataError: if a log lacks the channels, the rudder is nearly constant, or a controller set
-            it without independent excitation, so that K and T cannot be identified.
+            it without independent excitation and without steps of a logged set point, so that K
+            and T cannot be identified.
         FitError: if no response to the rudder is found.
     """
     if not logs:
@@ -91,7 +101,7 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
             f"steering: the rudder of the logs varies by only {max_rudder_std:.2g} rad (rms);"
             " K and T need turns, such as a zigzag"
         )
-    _require_excitation(logs, records)
+    response = _fit_steering(logs, records, longest_delay, commands=names == {"cmd_delta"})
     logs_with_motion = [
         complete_motion(log, MotionConfig()) if {"x", "y", "psi"} <= log.channels.keys() else log
         for log in logs
@@ -99,7 +109,7 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
     speeds = [log["u"][log.usable] for log in logs_with_motion if "u" in log.channels]
     speed = float(np.nanmean(np.concatenate(speeds))) if speeds else float("nan")
     return IdentifiedSteering(
-        fit_response(records, longest_delay, commands=names == {"cmd_delta"}),
+        response,
         speed,
         (_estimate_noise(logs, "psi"), _estimate_noise(logs, "r")),
         float(np.median([record.dt for record in records])),
@@ -107,29 +117,84 @@ def identify_steering(logs: Sequence[Log], longest_delay: float = 2.0) -> Identi
     )
 
 
-def _require_excitation(logs: Sequence[Log], records: Sequence[ManoeuvreRecord]) -> None:
-    """Refuse a rudder that a controller set from the heading, without steps or manoeuvres.
+def _fit_steering(
+    logs: Sequence[Log],
+    records: Sequence[ManoeuvreRecord],
+    longest_delay: float,
+    *,
+    commands: bool,
+) -> SteeringResponse:
+    """Fit K, T and delay; in closed loop with the set point of the heading as instrument.
 
     Raises:
-        DataError: if feedback explains the rudder beyond its effect on the yaw rate.
+        DataError: if feedback explains the rudder beyond its effect on the yaw rate, and no set
+            point identifies the response.
+        FitError: if no response to the rudder is found.
     """
+    feedback = _detect_rudder_feedback(logs, records)
+    instrumented: InstrumentedResponse | None = None
+    objection = "log a zigzag, 3-2-1-1 or steps of the course with the set point as psi_d"
+    if all(_SET_POINT in log.channels for log in logs):
+        set_points = [
+            _interpolate_heading(log, _SET_POINT, record)
+            for log, record in zip(logs, records, strict=True)
+        ]
+        try:
+            instrumented = fit_with_set_points(
+                records, set_points, longest_delay, commands=commands
+            )
+        except FitError as error:
+            objection = str(error).removeprefix("steering: ")
+    if feedback is not None and instrumented is None:
+        raise DataError(
+            "steering: a controller set the rudder: feedback from the heading explains"
+            f" {100 * feedback.share:.0f} % of what the yaw rate does not, so that K and T"
+            f" cannot be identified; {objection}, or give K and T, such as 0.12,18"
+        )
+    if instrumented is not None and feedback is not None:
+        log_message(
+            "steering: a controller set the rudder; K and T are estimated with the set point"
+            " psi_d as instrument"
+        )
+        return instrumented.response
+    direct = fit_response(records, longest_delay, commands=commands)
+    if instrumented is None or not is_direct_estimate_rejected(direct, instrumented.response):
+        return direct
+    log_message(
+        f"steering: K {direct.gain:.3g} 1/s and T {direct.time:.3g} s by simulation error"
+        f" contradict K {instrumented.response.gain:.3g} 1/s and T {instrumented.response.time:.3g}"
+        " s with the set point psi_d as instrument (Durbin-Wu-Hausman test): feedback biases the"
+        " former, and the latter are used"
+    )
+    return instrumented.response
+
+
+def _detect_rudder_feedback(
+    logs: Sequence[Log], records: Sequence[ManoeuvreRecord]
+) -> InputFeedback | None:
+    """Return the feedback in a rudder that a controller set without steps or manoeuvres."""
     signals = []
     for log, record in zip(logs, records, strict=True):
         heading = np.cumsum(record.yaw_rate) * record.dt
         if "psi" in log.channels and np.isfinite(log["psi"]).sum() > _MIN_SAMPLES:
-            is_finite = np.isfinite(log["psi"])
-            grid = log.t[0] + record.dt * np.arange(len(record.rudder))
-            heading = np.interp(grid, log.t[is_finite], np.unwrap(log["psi"][is_finite]))
+            heading = _interpolate_heading(log, "psi", record)
         signals.append({"psi": heading, "r": record.yaw_rate, "rudder": record.rudder})
     step = float(np.median([record.dt for record in records]))
-    for feedback in detect_feedback(signals, ("rudder",), step):
-        if feedback.is_closed_loop:
-            raise DataError(
-                "steering: a controller set the rudder: feedback from the heading explains"
-                f" {100 * feedback.share:.0f} % of what the yaw rate does not, so that K and T"
-                " cannot be identified; log a zigzag, 3-2-1-1 or steps of the course, or give K"
-                " and T, such as 0.12,18"
-            )
+    closed_loops = (
+        feedback
+        for feedback in detect_feedback(signals, ("rudder",), step)
+        if feedback.is_closed_loop
+    )
+    return next(closed_loops, None)
+
+
+def _interpolate_heading(log: Log, name: str, record: ManoeuvreRecord) -> np.ndarray:
+    """Return a heading of a log, unwrapped, on the time grid of its record; 0 if it is unknown."""
+    is_finite = np.isfinite(log[name])
+    grid = log.t[0] + record.dt * np.arange(len(record.rudder))
+    if not is_finite.any():
+        return np.zeros(len(grid))
+    return np.asarray(np.interp(grid, log.t[is_finite], np.unwrap(log[name][is_finite])))
 
 
 def _estimate_noise(logs: Sequence[Log], name: str) -> float:

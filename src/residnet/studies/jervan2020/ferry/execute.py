@@ -683,9 +683,7 @@ def _summarize_judging(metrics: Mapping[str, TrackingMetrics | None]) -> dict[st
     return {
         "position_mae": sum(position_errors) / len(metrics) if is_stable else None,
         "heading_mae": sum(heading_errors) / len(metrics) if is_stable else None,
-        "courses": {
-            name: None if run is None else run.to_json() for name, run in metrics.items()
-        },
+        "courses": {name: None if run is None else run.to_json() for name, run in metrics.items()},
     }
 
 
