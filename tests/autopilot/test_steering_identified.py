@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from steered_logs import steered_log
 
+from residnet.autopilot.heading.set_points import fit_with_set_points
+from residnet.autopilot.heading.turning import ManoeuvreRecord, fit_response
 from residnet.autopilot.tasks.design import identify_steering
 from residnet.core.errors import DataError, FitError
 from residnet.core.log import Log
+from residnet.core.progress import on_progress
 
 
 def sailed(
@@ -89,21 +92,32 @@ def test_a_rudder_that_a_controller_set_is_refused() -> None:
 
 
 def test_set_points_identify_a_rudder_that_a_controller_set() -> None:
-    # disturbances that outweigh the steps of the course, so that a direct fit is biased
-    logs = [steered_log("set_points", seed, disturbance=0.6) for seed in range(5)]
-    response = identify_steering(logs).response
-    assert response.gain == pytest.approx(0.7, rel=0.2)
-    assert response.time == pytest.approx(0.8, rel=0.3)
+    # disturbances as large as the steps of the course, so that the direct fit is biased
+    logs = [steered_log("set_points", seed, disturbance=0.1) for seed in range(5)]
+    messages: list[str] = []
+    with on_progress(lambda event: messages.append(event.message)):
+        response = identify_steering(logs).response
+    assert any("Durbin-Wu-Hausman test" in message for message in messages)
+    assert response.gain == pytest.approx(0.7, rel=0.1)
+    assert response.time == pytest.approx(0.8, rel=0.2)
     assert abs(response.gain - 0.7) < 3.0 * response.standard_errors[0]
+    # without the set point the same logs give a gain that is a third too small
     without = [
         log.replace(channels={k: v for k, v in log.channels.items() if k != "psi_d"})
         for log in logs
     ]
-    try:
-        direct = identify_steering(without).response
-    except (DataError, FitError):
-        return
-    assert abs(direct.gain - 0.7) > 2.0 * abs(response.gain - 0.7)
+    assert identify_steering(without).response.gain < 0.55
+
+
+def test_set_points_without_disturbances_confirm_the_direct_estimate() -> None:
+    logs = [steered_log("set_points", seed, disturbance=0.0) for seed in range(4)]
+    records = [
+        ManoeuvreRecord(0.1, log["delta"], log["r"], np.ones(len(log), dtype=bool)) for log in logs
+    ]
+    direct = fit_response(records, 2.0)
+    instrumented = fit_with_set_points(records, [log["psi_d"] for log in logs], 2.0)
+    assert instrumented.instrument_share > 0.9
+    assert instrumented.response.gain == pytest.approx(direct.gain, rel=0.02)
 
 
 def test_a_set_point_without_steps_identifies_nothing() -> None:

@@ -19,6 +19,7 @@ __all__ = [
     "CHANNEL_UNITS",
     "POSE_ERROR_UNITS",
     "POSE_NAMES",
+    "SET_POINT_CHANNELS",
     "STATE_NAMES",
     "VELOCITY_NAMES",
     "WIND_INPUTS",
@@ -66,6 +67,8 @@ POSE_ERROR_UNITS = {"position": "m", "heading": "rad", "depth": "m", "attitude":
 
 ACCELERATION_NAMES = tuple(f"{name}_dot" for name in VELOCITY_NAMES)
 
+SET_POINT_CHANNELS = ("psi_d",)
+"""Set points of a controller: the desired heading (Fossen's psi_d) [rad]. They drive no vessel."""
 WIND_INPUTS = ("wind_speed", "wind_dir")
 """Inputs of the true wind: speed [m/s] and the direction it comes FROM [rad], earth-fixed."""
 BOW_WIND_CHANNELS = ("wind_angle", "apparent_wind_speed", "apparent_wind_angle")

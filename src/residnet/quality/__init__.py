@@ -13,6 +13,7 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
+from residnet.core.names import SET_POINT_CHANNELS
 from residnet.preprocessing.align import GridConfig, align_to_grid
 from residnet.preprocessing.masks import MaskRule, apply_masks
 from residnet.preprocessing.motion import original_input_names
@@ -91,7 +92,9 @@ def inspect_log(
             raise DataError(
                 f"log {log.name}: channel {name} holds no number; remove it from the channel map"
             )
-    driving_inputs = [name for name in log.channels if name not in MOTION_CHANNELS]
+    driving_inputs = [
+        name for name in log.channels if name not in (*MOTION_CHANNELS, *SET_POINT_CHANNELS)
+    ]
     driving_inputs = driving_inputs if inputs is None else original_input_names(log, inputs)
     log.stack(driving_inputs)
     raw_statistics = LogStatistics(log, driving_inputs)

@@ -14,6 +14,7 @@ from residnet.core.arrays.paged import MAX_SAMPLES_IN_MEMORY
 from residnet.core.log import Log
 from residnet.core.names import (
     POSE_NAMES,
+    SET_POINT_CHANNELS,
     VELOCITY_NAMES,
     get_pair_parity,
     port_starboard_pairs,
@@ -67,7 +68,9 @@ class LogSet:
         self.channels = [name for name in logs[0].channels if name in common_channels]
         input_names = self.channels if inputs is None else inputs
         self.inputs = [
-            name for name in input_names if name in common_channels and name not in MOTION_CHANNELS
+            name
+            for name in input_names
+            if name in common_channels and name not in (*MOTION_CHANNELS, *SET_POINT_CHANNELS)
         ]
         self.logs = [LogStatistics(log, self.inputs) for log in logs]
         self.splits = splits

@@ -36,6 +36,7 @@ from residnet.core.config import (
 from residnet.core.errors import DataError, FitError, UsageError
 from residnet.core.files import write_owned
 from residnet.core.log import Log
+from residnet.core.names import SET_POINT_CHANNELS
 from residnet.core.ownership import require_replaceable
 from residnet.core.progress import log_message
 from residnet.io.drafting.questions import DraftNotes
@@ -46,8 +47,6 @@ from residnet.quality.feedback import InputFeedback, detect_feedback
 from residnet.tasks.registry import open_finished_task
 
 _RUDDER_CHANNELS = ("cmd_delta", "delta")
-_SET_POINT = "psi_d"
-"""Channel of the set point of the heading (Fossen's psi_d)."""
 _MIN_SAMPLES = 50
 """Smallest number of usable samples for an identification of K and T."""
 _MIN_RUDDER_STD = 1e-3
@@ -134,9 +133,9 @@ def _fit_steering(
     feedback = _detect_rudder_feedback(logs, records)
     instrumented: InstrumentedResponse | None = None
     objection = "log a zigzag, 3-2-1-1 or steps of the course with the set point as psi_d"
-    if all(_SET_POINT in log.channels for log in logs):
+    if all(SET_POINT_CHANNELS[0] in log.channels for log in logs):
         set_points = [
-            _interpolate_heading(log, _SET_POINT, record)
+            _interpolate_heading(log, SET_POINT_CHANNELS[0], record)
             for log, record in zip(logs, records, strict=True)
         ]
         try:
