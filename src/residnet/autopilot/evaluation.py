@@ -145,7 +145,15 @@ def build_step_row(
     trajectories: ClosedLoopTrajectories,
     tolerance: float,
 ) -> dict[str, Any]:
-    """Build a row of metrics.json with distributions and the number of unsettled simulations."""
+    """Build a row of metrics.json with distributions and the number of unsettled simulations.
+
+    Args:
+        controller: name of the controller.
+        model_kind: role of the controller, such as `classical`.
+        protocol: name of the test.
+        trajectories: simulations of the test.
+        tolerance: half width in rad of the band of the error in which a simulation has settled.
+    """
     is_finite = torch.isfinite(trajectories.states).all(dim=2).all(dim=1)
     is_unsettled = (trajectories.error[:, -1].abs() > tolerance) | ~is_finite
     return _build_row(
@@ -201,7 +209,16 @@ def simulate_steps(
 def simulate_steps_in_wind(
     plant: Plant, policy: Policy, speed: float, heading_step: float, dt: float, duration: float
 ) -> ClosedLoopTrajectories:
-    """Simulate reference steps of the nominal vessel in wind from eight directions."""
+    """Simulate reference steps of the nominal vessel in wind from eight directions.
+
+    Args:
+        plant: simulated vessel.
+        policy: controller of the heading.
+        speed: wind speed in m/s.
+        heading_step: change of the reference heading in rad.
+        dt: time step in s.
+        duration: duration of a simulation in s.
+    """
     wind_channels: dict[str, float | Tensor] = {
         "wind_speed": speed,
         "wind_dir": torch.arange(8) * (torch.pi / 4.0),
@@ -228,7 +245,17 @@ def simulate_steps_in_waves(
     duration: float,
     seed: int,
 ) -> ClosedLoopTrajectories:
-    """Simulate reference steps of the nominal vessel in eight seaways."""
+    """Simulate reference steps of the nominal vessel in eight seaways.
+
+    Args:
+        plant: simulated vessel.
+        policy: controller of the heading.
+        waves: spectrum of the waves.
+        heading_step: change of the reference heading in rad.
+        dt: time step in s.
+        duration: duration of a simulation in s.
+        seed: seed of the phases of the waves.
+    """
     disturbance = DisturbanceConfig(waves=waves)
     n_seaways = 8
     return simulate_heading_steps(
@@ -316,6 +343,14 @@ def evaluate_under_conditions(
 
     A simulation with a NaN heading counts as diverged, with a heading error of 180 deg at all
     times in the means.
+
+    Args:
+        controller: name of the controller.
+        model_kind: role of the controller, such as `classical`.
+        protocol: name of the test.
+        run: closed loop of vessel and controller.
+        conditions: conditions of the simulations, and weights of their cost.
+        changes: changes of the reference heading.
     """
     trajectories = run.simulate(changes)
     controlled_angle = trajectories.state(trajectories.axis.value)[:, :-1]

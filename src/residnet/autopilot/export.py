@@ -115,7 +115,19 @@ class _GuardedController(nn.Module):
         last_command: Tensor,
         is_valid: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return command [B, 1], memory [B, n] and fault [B] with limits and fallback applied."""
+        """Apply rate limit and fallback to a command, and update the memory of valid steps.
+
+        Args:
+            wanted_command: command of the policy [B, 1].
+            next_memory: memory of the policy after the step [B, n - 1].
+            s: memory before the step [B, n], whose last column is the last command.
+            fresh_memory: initial memory [B, n] for steps with an invalid memory.
+            last_command: last command [B, 1].
+            is_valid: whether measurements and memory are valid [B, 1] bool.
+
+        Returns:
+            Command [B, 1], memory [B, n] and fault [B] bool.
+        """
         # an inconsistent memory within its ranges can still lead to a memory outside of them
         is_inside = (next_memory >= self.memory_low[:-1]) & (next_memory <= self.memory_high[:-1])
         is_sound = is_inside.all(dim=-1, keepdim=True)

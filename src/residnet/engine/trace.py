@@ -774,7 +774,16 @@ def _lower_data_movement(
     keyword_arguments: Any,
     example: Any,
 ) -> Any:
-    """Return the result of a data movement, which torch applies to the indices of the entries."""
+    """Return the result of a data movement, which torch applies to the indices of the entries.
+
+    Args:
+        target: operation of torch.
+        args: positional arguments of the operation.
+        to_examples: function that replaces traced values in an argument by their example tensors.
+        moved_arguments: positions of the arguments whose entries are moved.
+        keyword_arguments: keyword arguments of the operation.
+        example: result of the operation for the example tensors.
+    """
     columns: list[Any] = []
     count = 0
 

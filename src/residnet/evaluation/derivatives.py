@@ -214,7 +214,13 @@ class _OperatingPoint:
 
 
 class _Variable(NamedTuple):
-    """A variable of the expansion: name, and column in the vector (u, v, r, inputs)."""
+    """A variable of the expansion.
+
+    Attributes:
+        name: name of the variable.
+        column: column in the vector (u, v, r, inputs).
+        dimension: dimension of the variable.
+    """
 
     name: str
     column: int
@@ -576,7 +582,18 @@ def _make_row(
     scale: float,
     density_ratio: float,
 ) -> DerivativeRow:
-    """Return a derivative at the target scale, in SI units and in the non-dimensional systems."""
+    """Return a derivative at the target scale, in SI units and in the non-dimensional systems.
+
+    Args:
+        axis: index of the force or acceleration: surge, sway or yaw.
+        monomial: variables of the derivative; a power repeats its variable.
+        value: derivative at the scale of the logs in SI units.
+        error: standard error of `value`; None if it is unknown.
+        particulars: particulars of the target vessel.
+        is_force: whether the derivative is one of a force, otherwise of an acceleration.
+        scale: length of the target vessel divided by that of the vessel in the logs.
+        density_ratio: water density at the target scale divided by that of the logs.
+    """
     dimension = (_FORCE_DIMENSIONS if is_force else _ACCELERATION_DIMENSIONS)[axis]
     for variable in monomial:
         dimension = dimension.times(variable.dimension, -1.0)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,11 +117,32 @@ def _refine_course_turns(
     return problem, solution
 
 
-_INITIAL_SEARCHES = ((1.0, 1.0, 1), (0.5, 1.0, 1), (0.0, 1.0, 1))
-_EXTENDED_SEARCHES = ((1.0, 1.5, 2), (1.0, 1.0, 2), (0.0, 1.0, 2), (0.5, 2.0, 2))
-"""Settings of further outline searches: fraction of the straight lengths at turns, multiple of
-the turning radius, and number of passing distances.
-"""
+class _OutlineSearch(NamedTuple):
+    """Settings of a search for an outline.
+
+    Attributes:
+        room_share: fraction of the straight lengths before and after turns.
+        radius_multiple: factor on the turning radius.
+        n_rings: number of distances from its circle at which a buoy may be passed.
+    """
+
+    room_share: float
+    radius_multiple: float
+    n_rings: int
+
+
+_INITIAL_SEARCHES = (
+    _OutlineSearch(1.0, 1.0, 1),
+    _OutlineSearch(0.5, 1.0, 1),
+    _OutlineSearch(0.0, 1.0, 1),
+)
+_EXTENDED_SEARCHES = (
+    _OutlineSearch(1.0, 1.5, 2),
+    _OutlineSearch(1.0, 1.0, 2),
+    _OutlineSearch(0.0, 1.0, 2),
+    _OutlineSearch(0.5, 2.0, 2),
+)
+"""Searches after the initial ones have found no course."""
 _MAX_EVALUATIONS = 600
 """Number of route evaluations after which a round fits no further outline."""
 _DISTANCE_TOLERANCE = 2e-3
@@ -212,15 +234,30 @@ def find_quickest_course(
             "no course to plan: the start is within all circles that are to be entered; move a buoy"
             " or the start"
         )
-    reasons: list[tuple[float, int, str]] = []
-    course = _find_course(request, step, extension_length, turn_maker, reasons)
+    rejections: list[RejectedRoute] = []
+    course = _find_course(request, step, extension_length, turn_maker, rejections)
     if course is None:
         raise ConfigError(
             _no_course_message(
-                request, reasons, _find_excluding_buoys(request, step, turn_maker, reasons)
+                request, rejections, _find_excluding_buoys(request, step, turn_maker, rejections)
             )
         )
     return course
+
+
+class RejectedRoute(NamedTuple):
+    """A route that does not pass the check.
+
+    Attributes:
+        violation: violation of a circle in m; 0 if the route meets its constraints and only the
+            sampled course violates the passing rule.
+        buoy_index: index of the buoy.
+        description: description of the violation.
+    """
+
+    violation: float
+    buoy_index: int
+    description: str
 
 
 def _find_course(
@@ -228,11 +265,18 @@ def _find_course(
     step: float,
     extension_length: float,
     turn_maker: TurnMaker | None,
-    reasons: list[tuple[float, int, str]],
+    rejections: list[RejectedRoute],
 ) -> Course | None:
-    """Search the quickest valid course; returns None and appends to `reasons` if none is found.
+    """Search the quickest valid course; None if none is found.
 
     If the courses of an outline violate a circle, the next outline has more clearance from it.
+
+    Args:
+        request: requirements.
+        step: distance between samples of the course in m.
+        extension_length: length of the straight extension after the end in m.
+        turn_maker: see `find_quickest_course`.
+        rejections: receives the routes that do not pass the check.
     """
     tried_outlines: set[tuple[object, ...]] = set()
     extra_clearance = np.zeros(len(request.circles))
@@ -240,48 +284,60 @@ def _find_course(
         (_INITIAL_SEARCHES, *(_EXTENDED_SEARCHES,) * _MAX_CLEARANCE_ROUNDS)
     ):
         report_progress("planning", round_number, 1 + _MAX_CLEARANCE_ROUNDS)
-        n_previous_reasons = len(reasons)
+        n_previous_rejections = len(rejections)
         candidates = _solve_new_outlines(
-            request, searches, extra_clearance, tried_outlines, step, reasons
+            request, searches, extra_clearance, tried_outlines, step, rejections
         )
-        route = _first_valid_route(request, candidates, turn_maker, step, reasons)
+        route = _first_valid_route(request, candidates, turn_maker, step, rejections)
         if route is not None:
             problem, solution = route
             return _sample_route(problem.route, solution.z, step, extension_length)
-        worst = min(reasons[n_previous_reasons:] or reasons, default=None)
+        worst = min(rejections[n_previous_rejections:] or rejections, default=None)
         if worst is None:
             return None
-        extra_clearance[worst[1]] += _CLEARANCE_STEP * request.turns.min_radius
+        extra_clearance[worst.buoy_index] += _CLEARANCE_STEP * request.turns.min_radius
     return None
 
 
 def _solve_new_outlines(
     request: CourseRequest,
-    searches: Sequence[tuple[float, float, int]],
+    searches: Sequence[_OutlineSearch],
     extra_clearance: Array,
     tried_outlines: set[tuple[object, ...]],
     step: float,
-    reasons: list[tuple[float, int, str]],
+    rejections: list[RejectedRoute],
 ) -> list[tuple[RouteProblem, RouteSolution]]:
-    """Return the valid routes of outlines that were not tried before, which are added to these.
+    """Return the valid routes of outlines that were not tried before.
 
     Each search stops at its first outline with a valid route, and all of them at a limit of
     evaluations.
+
+    Args:
+        request: requirements.
+        searches: searches in order.
+        extra_clearance: additional clearance from each circle in m.
+        tried_outlines: keys of the outlines that were tried; new outlines are added.
+        step: distance between samples of the course in m.
+        rejections: receives the routes that do not pass the check.
     """
     candidates: list[tuple[RouteProblem, RouteSolution]] = []
     n_evaluations = 0
-    for room_share, radius_multiple, rings in searches:
+    for search in searches:
         if n_evaluations > _MAX_EVALUATIONS:
             break
         sketch = _search_outline(
-            request, extra_clearance, room_share, radius_multiple, RINGS[:rings]
+            request,
+            extra_clearance,
+            search.room_share,
+            search.radius_multiple,
+            RINGS[: search.n_rings],
         )
         for outline in () if sketch is None else _simplified_outlines(request, sketch):
             if (outline_key := _outline_key(outline)) in tried_outlines:
                 continue
             tried_outlines.add(outline_key)
             solutions = _solve_outline(request, outline)
-            candidates += _select_valid_routes(request, solutions, step, reasons)
+            candidates += _select_valid_routes(request, solutions, step, rejections)
             n_evaluations += sum(problem.n_evaluations for problem, _ in solutions)
             if candidates:
                 break
@@ -292,11 +348,11 @@ def _select_valid_routes(
     request: CourseRequest,
     solutions: Sequence[tuple[RouteProblem, RouteSolution]],
     step: float,
-    reasons: list[tuple[float, int, str]],
+    rejections: list[RejectedRoute],
 ) -> list[tuple[RouteProblem, RouteSolution]]:
     """Return the solutions that pass the check, after one repair if all feasible ones fail it."""
     valid = [
-        candidate for candidate in solutions if _passes_check(request, *candidate, step, reasons)
+        candidate for candidate in solutions if _passes_check(request, *candidate, step, rejections)
     ]
     max_violation = _DISTANCE_TOLERANCE * request.turns.min_radius
     feasible = [candidate for candidate in solutions if candidate[1].max_violation <= max_violation]
@@ -306,7 +362,9 @@ def _select_valid_routes(
     # may be violated slightly
     problem, solution = min(feasible, key=lambda candidate: candidate[1].time)
     solution = problem.solve_with_hard_penalty(solution.z)
-    return [(problem, solution)] if _passes_check(request, problem, solution, step, reasons) else []
+    return (
+        [(problem, solution)] if _passes_check(request, problem, solution, step, rejections) else []
+    )
 
 
 def _first_valid_route(
@@ -314,7 +372,7 @@ def _first_valid_route(
     candidates: list[tuple[RouteProblem, RouteSolution]],
     turn_maker: TurnMaker | None,
     step: float,
-    reasons: list[tuple[float, int, str]],
+    rejections: list[RejectedRoute],
 ) -> tuple[RouteProblem, RouteSolution] | None:
     """Return the quickest candidate that is valid with the turns of the vessel, or None."""
     max_violation = _DISTANCE_TOLERANCE * request.turns.min_radius
@@ -322,12 +380,12 @@ def _first_valid_route(
     for problem, solution in (
         candidates if turn_maker is None else refine_turns(request.turns, candidates, turn_maker)
     ):
-        if _passes_check(request, problem, solution, step, reasons):
+        if _passes_check(request, problem, solution, step, rejections):
             return problem, solution
         if solution.max_violation <= max_violation:
             # all hard constraints are met: a short move with harder penalties may be enough
             repaired = problem.solve_with_hard_penalty(solution.z, _REPAIR_STEP)
-            if _passes_check(request, problem, repaired, step, reasons):
+            if _passes_check(request, problem, repaired, step, rejections):
                 return problem, repaired
     return None
 
@@ -336,7 +394,7 @@ def _find_excluding_buoys(
     request: CourseRequest,
     step: float,
     turn_maker: TurnMaker | None,
-    reasons: Sequence[tuple[float, int, str]],
+    rejections: Sequence[RejectedRoute],
 ) -> tuple[int, ...]:
     """Return the numbers (from 1) of two or three consecutive buoys that have no course alone.
 
@@ -344,7 +402,7 @@ def _find_excluding_buoys(
     partial courses exist.
     """
     count = len(request.circles)
-    worst = min(reasons)[1] if reasons else 0
+    worst = min(rejections).buoy_index if rejections else 0
     for length in (2, 3):
         if length >= count:
             break
@@ -376,15 +434,14 @@ def _passes_check(
     problem: RouteProblem,
     solution: RouteSolution,
     step: float,
-    reasons: list[tuple[float, int, str]],
+    rejections: list[RejectedRoute],
 ) -> bool:
-    """Return whether a course passes the check, and append the reason to `reasons` if not.
-
-    A reason is the violation in m, the number of the buoy (from 0) and a description.
-    """
+    """Return whether a course passes the check, and append it to `rejections` if not."""
     if solution.max_violation > _DISTANCE_TOLERANCE * request.turns.min_radius:
-        reasons.append(
-            (solution.max_violation, solution.worst_buoy, f"buoy {solution.worst_buoy + 1}")
+        rejections.append(
+            RejectedRoute(
+                solution.max_violation, solution.worst_buoy, f"buoy {solution.worst_buoy + 1}"
+            )
         )
         return False
     course = _sample_route(problem.route, solution.z, step, step)
@@ -395,12 +452,12 @@ def _passes_check(
         track, request.buoys, request.protocol, radius, solution.max_violation
     )
     if violation is not None:
-        reasons.append((0.0, *violation))
+        rejections.append(RejectedRoute(0.0, *violation))
     return violation is None
 
 
 def _no_course_message(
-    request: CourseRequest, reasons: Sequence[tuple[float, int, str]], buoy_numbers: Sequence[int]
+    request: CourseRequest, rejections: Sequence[RejectedRoute], buoy_numbers: Sequence[int]
 ) -> str:
     if buoy_numbers:
         *leading_numbers, last_number = (str(number) for number in buoy_numbers)
@@ -411,12 +468,13 @@ def _no_course_message(
             " smaller circles, or allow more rudder"
         )
     advice = "move it, give it a smaller circle, or allow more rudder"
-    if not reasons:
+    if not rejections:
         return (
             f"no course found past the {len(request.circles)} buoys: circles leave no way between"
             f" them; {advice}"
         )
-    miss_distance, _, problem_text = min(reasons)
+    miss_distance = min(rejections).violation
+    problem_text = min(rejections).description
     if miss_distance > 0:
         problem_text += (
             f": the best course found with this vessel's turns misses its circle by"

@@ -46,7 +46,8 @@ class TurnPaths(NamedTuple):
     """Paths of a turn, a straight line and a turn; all fields have the same shape.
 
     Attributes:
-        first, last: angles of the two turns in rad.
+        first_angle: angle of the first turn in rad.
+        last_angle: angle of the last turn in rad.
         straight_length: length of the line in m.
         heading: heading of the line in rad.
         length: total length in m; infinite for an impossible path.
@@ -77,6 +78,13 @@ def find_paths(
 
     Start and target poses are broadcast against each other. The straight line is at least as long
     as the straight lengths that both turns need.
+
+    Args:
+        positions: start positions, complex in m.
+        headings: start headings in rad.
+        target_positions: end positions, complex in m.
+        target_headings: end headings in rad.
+        turn_room: turning radius, and straight lengths before and after a turn.
     """
     path_parts = []
     for first_side, last_side in PATH_SIDES:
@@ -189,7 +197,18 @@ def _distance_from_arcs(
     radius: float,
     points: np.ndarray,
 ) -> Array:
-    """Return the distances [K, C] of points from arcs [K]."""
+    """Return the distances [K, C] of points from arcs.
+
+    Args:
+        centre: centres of the arcs [K].
+        turn_signs: +1 for arcs to starboard, -1 to port, [K].
+        heading: headings at the start of the arcs [K] in rad.
+        angle: angles of the arcs [K] in rad.
+        arc_start: start points of the arcs [K].
+        arc_end: end points of the arcs [K].
+        radius: radius of all arcs in m.
+        points: points [C].
+    """
     offsets = points[None] - centre[:, None]
     heading_at_point = np.angle(offsets) + turn_signs[:, None] * (0.5 * math.pi)
     is_on_arc = (turn_signs[:, None] * (heading_at_point - heading[:, None])) % _FULL_TURN <= angle[
@@ -473,7 +492,17 @@ class RouteSearch:
         target_headings: Array,
         radii: Array,
     ) -> tuple[Array, NDArray[np.intp]]:
-        """Return the lowest cost [M] of a collision-free path to each pose, and its index."""
+        """Return the lowest cost [M] of a collision-free path to each pose, and its index.
+
+        Args:
+            cost: cost of each path [4, S, M]: types in `PATH_SIDES`, S start and M target poses.
+            candidate_paths: the paths, [4, S, M] each.
+            path_starts: start positions [S].
+            headings: start headings [S] in rad.
+            path_ends: end positions [M].
+            target_headings: end headings [M] in rad.
+            radii: radii of the circles [C] in m.
+        """
         flat_cost = cost.reshape(-1, cost.shape[-1])
         best = np.full(flat_cost.shape[1], np.inf)
         path_number = np.zeros(flat_cost.shape[1], dtype=np.intp)
