@@ -98,6 +98,7 @@ class Hull(nn.Module):
         force_rows: coefficients C of the force of each axis by term; those of damping are negative.
         channels: channels of the motion: velocities through the water, then phi with roll and theta
             with pitch.
+        vessel: name of the vessel, for the message.
 
     Raises:
         ConfigError: if the mass matrix is not positive definite or is singular.
@@ -299,6 +300,7 @@ class HullPlant(Plant):
         return torch.cat((pose_derivative, nu_dot, actuator_derivative), dim=-1)
 
     def _hull_channels(self, pose: Tensor, nu: Tensor) -> Tensor:
+        """Return velocities, and roll and pitch of a vessel that has them: the hull's channels."""
         if self.is_submerged:
             return torch.cat((nu, pose[..., 3:5]), dim=-1)
         return torch.cat((nu, pose[..., 2:3]), dim=-1) if self.has_roll else nu

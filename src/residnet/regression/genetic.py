@@ -74,6 +74,23 @@ def expression_limits(config: EvolutionConfig) -> ExpressionLimits:
     )
 
 
+class FitErrors(NamedTuple):
+    """Errors of the least-squares fit of a set of terms.
+
+    Attributes:
+        train: relative mean squared error on the training samples; infinite without a fit.
+        validation: relative mean squared error on the validation samples; infinite without a fit.
+        terms: the fitted terms; empty without a fit.
+    """
+
+    train: float
+    validation: float
+    terms: Terms
+
+
+_FAILED_FIT = FitErrors(np.inf, np.inf, ())
+
+
 class FitnessEvaluator:
     """Computes relative mean squared errors of individuals on training and validation samples.
 
@@ -112,11 +129,11 @@ class FitnessEvaluator:
             for values in (self.y, self.y_validation)
         ]
         self.n_fitted = 0
-        self._results: dict[Terms, tuple[float, float, Terms]] = {}
+        self._results: dict[Terms, FitErrors] = {}
         self._clear_cache()
 
-    def evaluate(self, individuals: Sequence[Terms | None]) -> list[tuple[float, float, Terms]]:
-        """Return (training error, validation error, terms) of each set of terms.
+    def evaluate(self, individuals: Sequence[Terms | None]) -> list[FitErrors]:
+        """Return the errors of each set of terms.
 
         Errors are infinite for an empty set, a non-finite term and linearly dependent terms.
         """
@@ -133,7 +150,7 @@ class FitnessEvaluator:
                 if not terms or not bool(
                     self._is_usable[[self._cache_rows[p] for p in terms]].all()
                 ):
-                    self._results[terms] = (np.inf, np.inf, ())
+                    self._results[terms] = _FAILED_FIT
                 else:
                     by_width.setdefault(len(terms), []).append(terms)
             for n_terms, same_size_sets in by_width.items():
@@ -143,8 +160,7 @@ class FitnessEvaluator:
                 for start in range(0, len(same_size_sets), batch_size):
                     self._fit_batch(same_size_sets[start : start + batch_size])
             self.n_fitted += len(new_term_sets)
-        failed_result = (np.inf, np.inf, ())
-        return [failed_result if terms is None else self._results[terms] for terms in individuals]
+        return [_FAILED_FIT if terms is None else self._results[terms] for terms in individuals]
 
     def _clear_cache(self) -> None:
         """Forget all columns of products; results of term sets are retained."""
@@ -207,13 +223,19 @@ class FitnessEvaluator:
             strict=True,
         ):
             self._results[terms] = (
-                (train_value, validation_value, terms) if is_fitted else (np.inf, np.inf, ())
+                FitErrors(train_value, validation_value, terms) if is_fitted else _FAILED_FIT
             )
 
 
 @dataclass(frozen=True)
 class GenerationRecord:
-    """Relative mean squared errors and number of terms of the best individual of a generation."""
+    """The best individual of a generation.
+
+    Attributes:
+        train: relative mean squared error on the training samples.
+        validation: relative mean squared error on the validation samples.
+        terms: number of terms.
+    """
 
     train: float
     validation: float
@@ -450,10 +472,10 @@ class _Evolution:
     def _evaluate_and_sort(self, individuals: list[Individual]) -> list[Individual]:
         """Evaluate individuals and sort them by fitness, ties by the number of terms."""
         results = self.fitness.evaluate([self._to_terms(individual) for individual in individuals])
-        for individual, (train, validation, terms) in zip(individuals, results, strict=True):
-            individual.fitness = -train
-            individual.validation = validation
-            individual.terms = terms
+        for individual, result in zip(individuals, results, strict=True):
+            individual.fitness = -result.train
+            individual.validation = result.validation
+            individual.terms = result.terms
         return sorted(individuals, key=lambda i: (-i.fitness, len(i.terms)))
 
     def _to_terms(self, individual: Individual) -> Terms | None:

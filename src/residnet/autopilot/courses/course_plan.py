@@ -22,8 +22,8 @@ from residnet.autopilot.courses.course_check import BuoyConfig, PassingRule, fin
 from residnet.autopilot.courses.fitting import RouteProblem, RouteSolution
 from residnet.autopilot.courses.outline import RINGS, Circle, RouteSearch, TurnRoom
 from residnet.autopilot.courses.turns import (
-    LEG,
-    POINTS,
+    N_LEG_POINTS,
+    N_TURN_POINTS,
     Array,
     Route,
     RouteOutline,
@@ -584,10 +584,10 @@ def _outline_of_solution(
         nearest_index = buoy_window.start + int(
             np.abs(points[buoy_window] - circle.centre).argmin()
         )
-        k, index_in_part = divmod(max(nearest_index - 1, 0), LEG + POINTS)
+        k, index_in_part = divmod(max(nearest_index - 1, 0), N_LEG_POINTS + N_TURN_POINTS)
         (
             passed_on_legs[k]
-            if index_in_part < LEG or k >= len(passed_in_turns)
+            if index_in_part < N_LEG_POINTS or k >= len(passed_in_turns)
             else passed_in_turns[k]
         ).append(number)
     turn_specs: list[TurnSpec] = []

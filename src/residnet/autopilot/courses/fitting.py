@@ -18,7 +18,13 @@ from scipy.optimize import linprog
 
 from residnet.autopilot.courses.course_check import first_checked_sample
 from residnet.autopilot.courses.outline import Circle
-from residnet.autopilot.courses.turns import LEG, POINTS, Array, Route, RouteGeometry
+from residnet.autopilot.courses.turns import (
+    N_LEG_POINTS,
+    N_TURN_POINTS,
+    Array,
+    Route,
+    RouteGeometry,
+)
 
 _MAX_ITERATIONS = 45
 """Largest number of iterations of a fit; converged fits need far fewer."""
@@ -26,12 +32,15 @@ _ACTIVE_SET_INTERVAL = 8
 """Number of iterations after which the set of constraints is selected again."""
 _MIN_PREDICTED_GAIN = 2e-2
 """Predicted decrease of the merit function below which the solver stops."""
-_TRUST_RADII = (5e-4, 0.3, 1.0)
-"""Smallest, initial and largest trust radius."""
-_GAIN_RATIOS = (0.05, 0.3, 0.7)
-"""Ratios of actual to predicted decrease: a step is accepted above the first; the trust radius
-shrinks below the second and grows above the third.
-"""
+_MIN_TRUST_RADIUS = 5e-4
+_INITIAL_TRUST_RADIUS = 0.3
+_MAX_TRUST_RADIUS = 1.0
+_ACCEPTED_GAIN_RATIO = 0.05
+"""Ratio of actual to predicted decrease of the merit function above which a step is accepted."""
+_SHRINKING_GAIN_RATIO = 0.3
+"""Ratio below which the trust radius shrinks."""
+_GROWING_GAIN_RATIO = 0.7
+"""Ratio above which the trust radius grows."""
 _HARD_PENALTY = 40.0
 """Penalty of a violated constraint: increase of the course length per violation, both in turning
 radii.
@@ -107,7 +116,14 @@ class LinearizedProblem(NamedTuple):
 
 
 class RouteSolution(NamedTuple):
-    """A fitted route: its variables z, its duration in s and its largest violation in m."""
+    """A fitted route.
+
+    Attributes:
+        z: variables of the route.
+        time: duration in s.
+        max_violation: largest violation of a hard constraint in m.
+        worst_buoy: index of the buoy of this constraint.
+    """
 
     z: Array
     time: float
@@ -129,6 +145,34 @@ class _TrialStep(NamedTuple):
     linearized: LinearizedProblem
     gain: float
     predicted_gain: float
+
+
+class _Constraint(NamedTuple):
+    """A constraint of the route at z.
+
+    Attributes:
+        buoy: index of the buoy.
+        value: value in m; feasible if not negative.
+        gradient: derivatives [nz] of the value.
+    """
+
+    buoy: int
+    value: float
+    gradient: Array
+
+
+class _OtherPart(NamedTuple):
+    """A part of the course that must keep its distance from a circle.
+
+    Attributes:
+        circle: index of the circle.
+        turn: index of the buoy whose turn contains the part.
+        points: range of points of the part.
+    """
+
+    circle: int
+    turn: int
+    points: slice
 
 
 class _NearestPoints(NamedTuple):
@@ -179,7 +223,7 @@ class RouteProblem:
         # each buoy is assigned the points up to the middle between its passing and the next one
         window_boundaries = (passing_indices[1:] + passing_indices[:-1] + 1) // 2
         self.window_edges = np.concatenate(([0], window_boundaries, [-1]))
-        self.other_parts: list[tuple[int, int, slice]] = []
+        self.other_parts: list[_OtherPart] = []
         self.passing_margins = [self._passing_margin(circle) for circle in circles]
         self.soft_penalty = _SOFT_PENALTY
         self.n_evaluations = 0
@@ -216,9 +260,15 @@ class RouteProblem:
         # turns are divided into pieces: the nearest point of a whole turn would jump between its
         # beginning and its end, and the constraint would not be differentiable
         count = len(points)
-        part_boundaries = {0, count - 1, *range(LEG, count, LEG + POINTS)}
+        part_boundaries = {0, count - 1, *range(N_LEG_POINTS, count, N_LEG_POINTS + N_TURN_POINTS)}
         for k in range(_PARTS_PER_TURN):
-            part_boundaries |= set(range(LEG + k * POINTS // _PARTS_PER_TURN, count, LEG + POINTS))
+            part_boundaries |= set(
+                range(
+                    N_LEG_POINTS + k * N_TURN_POINTS // _PARTS_PER_TURN,
+                    count,
+                    N_LEG_POINTS + N_TURN_POINTS,
+                )
+            )
         turn_windows = [self.turn_window(number, count) for number in range(len(self.circles))]
         turn_parts = []
         for i, turn_window in enumerate(turn_windows):
@@ -241,7 +291,7 @@ class RouteProblem:
             first_counted = self._first_counted_point(points, circle)
             distance = np.abs(points - circle.centre)
             self.other_parts += [
-                (j, i, turn_part)
+                _OtherPart(j, i, turn_part)
                 for i, turn_part in turn_parts
                 # a route on the wrong side of its buoy must be free to cross the circle
                 if (i != j or is_on_passing_side[j])
@@ -270,7 +320,7 @@ class RouteProblem:
             constrained_parts.append(
                 (j, slice(count - 2, count) if j == last and circle.turn_sign == 0 else part)
             )
-        constrained_parts += [(j, part) for j, _, part in self.other_parts]
+        constrained_parts += [(part.circle, part.points) for part in self.other_parts]
         return [
             (j, slice(max(part.start, min(first_counted[j], part.stop - 2)), part.stop))
             for j, part in constrained_parts
@@ -338,7 +388,7 @@ class RouteProblem:
         self.n_evaluations += 1
         last_circle = self.circles[-1]
         n_circles = len(self.circles)
-        constraints: list[tuple[int, float, Array]] = []
+        constraints: list[_Constraint] = []
         nearest_points = self._nearest_points(geometry, self._constrained_parts(geometry.points))
         # on the wrong side, distances are negative
         is_entered = self.passing_sides == 0
@@ -355,20 +405,22 @@ class RouteProblem:
         )
         for j, circle in enumerate(self.circles):
             if circle.turn_sign == 0:
-                constraints.append((j, circle.radius - passing_distance[j], -passing_jacobian[j]))
+                constraints.append(
+                    _Constraint(j, circle.radius - passing_distance[j], -passing_jacobian[j])
+                )
             else:
                 excess_distance = (
                     circle.radius + MAX_PASSING_DISTANCE * self.length_unit - passing_distance[j]
                 )
                 constraints += [
-                    (j, passing_distance[j] - circle.radius, passing_jacobian[j]),
-                    (j, excess_distance, -passing_jacobian[j]),
+                    _Constraint(j, passing_distance[j] - circle.radius, passing_jacobian[j]),
+                    _Constraint(j, excess_distance, -passing_jacobian[j]),
                 ]
-        for k, (j, _, _) in enumerate(self.other_parts, start=n_circles):
+        for k, part in enumerate(self.other_parts, start=n_circles):
             constraints.append(
-                (
-                    j,
-                    nearest_points.distance[k] - self.circles[j].radius,
+                _Constraint(
+                    part.circle,
+                    nearest_points.distance[k] - self.circles[part.circle].radius,
                     nearest_points.distance_jacobian[k],
                 )
             )
@@ -379,15 +431,16 @@ class RouteProblem:
             endpoint_jacobian = geometry.point_jacobian(np.array([len(geometry.points) - 1]))[0]
             alongside_jacobian = (
                 -(endpoint_jacobian * final_direction.conjugate()).real
-                + goal_offset.imag * geometry.d_heading
+                + goal_offset.imag * geometry.heading_gradient
             )
             constraints += [
-                (n_circles - 1, goal_offset.real, alongside_jacobian),
-                (n_circles - 1, -goal_offset.real, -alongside_jacobian),
+                _Constraint(n_circles - 1, goal_offset.real, alongside_jacobian),
+                _Constraint(n_circles - 1, -goal_offset.real, -alongside_jacobian),
             ]
         n_hard = len(constraints)
-        for k, (j, i, _) in enumerate(self.other_parts, start=n_circles):
-            if i != j:
+        for k, part in enumerate(self.other_parts, start=n_circles):
+            j = part.circle
+            if part.turn != j:
                 # where it lies on its side too, a buoy may be as near
                 margin = (
                     self.passing_margins[j]
@@ -395,7 +448,7 @@ class RouteProblem:
                     else 0.0
                 )
                 constraints.append(
-                    (
+                    _Constraint(
                         j,
                         nearest_points.distance[k] - passing_distance[j] - margin,
                         nearest_points.distance_jacobian[k] - passing_jacobian[j],
@@ -404,11 +457,12 @@ class RouteProblem:
         time_unit = self.length_unit / self.route.turns.speed
         linearized = LinearizedProblem(
             geometry.time / time_unit,
-            geometry.d_time / time_unit,
-            np.array([value for _, value, _ in constraints]) / self.length_unit,
-            np.array([row for _, _, row in constraints]).reshape(-1, len(z)) / self.length_unit,
+            geometry.time_gradient / time_unit,
+            np.array([constraint.value for constraint in constraints]) / self.length_unit,
+            np.array([constraint.gradient for constraint in constraints]).reshape(-1, len(z))
+            / self.length_unit,
             np.where(np.arange(len(constraints)) < n_hard, _HARD_PENALTY, self.soft_penalty),
-            [j for j, _, _ in constraints],
+            [constraint.buoy for constraint in constraints],
             n_hard,
         )
         self.cached_linearization = z.copy(), linearized
@@ -462,7 +516,7 @@ class RouteProblem:
         every linear program is feasible. A rejected step is followed by one second-order
         correction.
         """
-        trust_radius = _TRUST_RADII[1]
+        trust_radius = _INITIAL_TRUST_RADIUS
         self.refresh_constraints(z)
         linearized = self.linearize(z)
         for iteration in range(1, _MAX_ITERATIONS + 1):
@@ -473,15 +527,15 @@ class RouteProblem:
             if trial.predicted_gain < _MIN_PREDICTED_GAIN:
                 break
             step_size = float(np.abs(trial.z - z).max())
-            if trial.gain > _GAIN_RATIOS[0] * trial.predicted_gain:
+            if trial.gain > _ACCEPTED_GAIN_RATIO * trial.predicted_gain:
                 z = trial.z
                 linearized = trial.linearized
             # the linearisation was too optimistic: shrink; it was accurate: grow
-            if trial.gain < _GAIN_RATIOS[1] * trial.predicted_gain:
+            if trial.gain < _SHRINKING_GAIN_RATIO * trial.predicted_gain:
                 trust_radius = 0.4 * min(trust_radius, step_size)
-            elif trial.gain > _GAIN_RATIOS[2] * trial.predicted_gain:
-                trust_radius = min(2.0 * trust_radius, _TRUST_RADII[2])
-            if trust_radius < _TRUST_RADII[0]:
+            elif trial.gain > _GROWING_GAIN_RATIO * trial.predicted_gain:
+                trust_radius = min(2.0 * trust_radius, _MAX_TRUST_RADIUS)
+            if trust_radius < _MIN_TRUST_RADIUS:
                 break
         self.refresh_constraints(z)
         return z
@@ -512,7 +566,7 @@ class RouteProblem:
         if predicted_gain < _MIN_PREDICTED_GAIN:
             return _TrialStep(z, linearized, 0.0, predicted_gain)
         trial = evaluate_step(step)
-        if trial.gain < _GAIN_RATIOS[0] * predicted_gain:
+        if trial.gain < _ACCEPTED_GAIN_RATIO * predicted_gain:
             # the constraints at the trial point contain the curvature that the first program lacks
             corrected = linearized._replace(
                 constraints=trial.linearized.constraints

@@ -26,8 +26,10 @@ from residnet.engine.rollout import Rollout
 Array = NDArray[np.float64]
 _COUNTER_RUDDER_TIME = 1.5
 """Simulated duration of the counter-rudder in time constants; Nomoto's model needs T ln 2."""
-_STEP_SEARCH = (0.25, 6)
-"""Largest time step of simulated turns in time constants, and largest number of halvings."""
+_MAX_TURN_STEP = 0.25
+"""Largest time step of simulated turns in time constants."""
+_MAX_STEP_HALVINGS = 6
+"""Largest number of times that this step is halved."""
 _STEP_TOLERANCE = 1e-3
 """Accepted difference from a simulation with half the step, in turning radii and in rad."""
 
@@ -241,10 +243,10 @@ def choose_time_step(vessel: SteeredVessel, nomoto: NomotoModel, rudder: float) 
     """
     hold_times = nomoto.time * np.array([[0.5, 1.5, 3.0]])
     radius = nomoto.speed / (nomoto.gain * rudder)
-    dt = _STEP_SEARCH[0] * nomoto.time
+    dt = _MAX_TURN_STEP * nomoto.time
     # the first step has no coarser simulation to compare with
     previous_ends = None
-    for _ in range(_STEP_SEARCH[1]):
+    for _ in range(_MAX_STEP_HALVINGS):
         turn_maker = TurnMaker(vessel, nomoto, dt)
         (turns,) = turn_maker(
             hold_times, np.array([rudder]), [turn_maker.straight_state], nomoto.time
@@ -313,7 +315,7 @@ def simulate_steady_turn(
     return SteadyTurn(distance / heading_change, distance / elapsed, heading_change / elapsed, dt)
 
 
-POINTS = 28
+N_TURN_POINTS = 28
 """Number of points of a turn, without its start."""
 _MAX_TURN_ANGLE = math.radians(500.0)
 """The largest angle of a turn in a table."""
@@ -347,9 +349,9 @@ class TurnTable:
 
     Args:
         hold_times: hold times [K] in s, increasing from 0.
-        points: complex positions [K, POINTS] in m in the frame of the start; the last one is the
-            start of the leg.
-        headings: headings [K, POINTS] of the vessel in rad; the last one is the direction of the
+        points: complex positions [K, P] at `N_TURN_POINTS` times in m in the frame of the start;
+            the last one is the start of the leg.
+        headings: headings [K, P] of the vessel in rad; the last one is the direction of the
             leg.
         times: durations [K] of the turns in s.
         rudder: rudder angle in rad.
@@ -378,9 +380,13 @@ class TurnTable:
         self.end_positions = points[:, -1]
 
     def __call__(self, hold_time: float) -> tuple[np.ndarray, Array, float]:
-        """Return points [POINTS], headings [POINTS] and duration of the turn with a hold time."""
+        """Return points [P], headings [P] and duration of the turn with a hold time; P points."""
         row = self.spline(hold_time)
-        return row[:POINTS] + 1j * row[POINTS : 2 * POINTS], row[2 * POINTS : -1], float(row[-1])
+        return (
+            row[:N_TURN_POINTS] + 1j * row[N_TURN_POINTS : 2 * N_TURN_POINTS],
+            row[2 * N_TURN_POINTS : -1],
+            float(row[-1]),
+        )
 
     def leg_at(self, lengths: Array) -> tuple[TrackPart, TrackPart]:
         """Return the leg at lengths [..., K] in m, and its derivatives by each length."""
@@ -455,13 +461,15 @@ class TurnTables:
         self, table_numbers: Sequence[int], hold_times: Array
     ) -> tuple[TrackPart, TrackPart]:
         """Return starboard turns of n tables for hold times [n] in s, and their derivatives."""
-        rows, slopes = np.zeros((2, len(hold_times), 3 * POINTS + 1))
+        rows, slopes = np.zeros((2, len(hold_times), 3 * N_TURN_POINTS + 1))
         for number, turn_indices in _group_by_table(table_numbers):
             rows[turn_indices] = self.tables[number].spline(hold_times[turn_indices])
             slopes[turn_indices] = self.tables[number].spline_derivative(hold_times[turn_indices])
         turn_parts, derivatives = (
             TrackPart(
-                part[:, :POINTS] + 1j * part[:, POINTS : 2 * POINTS], part[:, -2], part[:, -1]
+                part[:, :N_TURN_POINTS] + 1j * part[:, N_TURN_POINTS : 2 * N_TURN_POINTS],
+                part[:, -2],
+                part[:, -1],
             )
             for part in (rows, slopes)
         )
@@ -497,7 +505,7 @@ def _group_by_table(table_indices: Sequence[int]) -> list[tuple[int, NDArray[np.
 def arc_turns(radii: Array, speed: float) -> TurnTables:
     """Return turn tables of a vessel without yaw inertia: arcs of the radii [n] in m."""
     angles = np.linspace(0.0, _MAX_TURN_ANGLE, _N_HOLD_TIMES)
-    headings = angles[:, None] * np.linspace(0.0, 1.0, POINTS + 1)[1:]
+    headings = angles[:, None] * np.linspace(0.0, 1.0, N_TURN_POINTS + 1)[1:]
     tables = [
         TurnTable(
             angles * radius / speed,
@@ -530,7 +538,7 @@ def simulate_turns(turn_maker: TurnMaker, rudder: Array, radius: float) -> TurnT
     simulated = turn_maker(
         hold_grid[:, 1:], rudder, [turn_maker.straight_state] * len(rudder), settling_time
     )
-    share = np.linspace(0.0, 1.0, POINTS + 1)[1:]
+    share = np.linspace(0.0, 1.0, N_TURN_POINTS + 1)[1:]
     tables = []
     residual_motion = 0.0
     for angle, table_holds, group in zip(rudder, hold_grid, simulated, strict=True):
@@ -551,7 +559,7 @@ def simulate_turns(turn_maker: TurnMaker, rudder: Array, radius: float) -> TurnT
             # unchanged
             points[k] += share**3 * (leg_origin - points[k, -1])
             headings[k] += share**3 * (course[-1] - headings[k, -1])
-        zero_row = np.zeros((1, POINTS))
+        zero_row = np.zeros((1, N_TURN_POINTS))
         tables.append(
             TurnTable(
                 table_holds,
@@ -620,10 +628,10 @@ def state_after_turn(turn: Turn, length: float) -> Array:
 
 
 def _sample_turns(group: Sequence[Turn]) -> tuple[np.ndarray, Array, Array]:
-    """Sample K turns uniformly in time: points and headings [K, POINTS], and durations [K]."""
-    share = np.linspace(0.0, 1.0, POINTS + 1)[1:]
-    points = np.zeros((len(group), POINTS), dtype=complex)
-    headings = np.zeros((len(group), POINTS))
+    """Sample K turns uniformly in time: points and headings [K, P], and durations [K]."""
+    share = np.linspace(0.0, 1.0, N_TURN_POINTS + 1)[1:]
+    points = np.zeros((len(group), N_TURN_POINTS), dtype=complex)
+    headings = np.zeros((len(group), N_TURN_POINTS))
     for k, turn in enumerate(group):
         track, headings[k] = turn.track_at(share * turn.duration)
         points[k] = track @ (1.0, 1j)
@@ -646,7 +654,7 @@ def _hold_times(share: Array, rudder: float, nomoto: NomotoModel) -> Array:
     return share**1.3 * max_hold_time
 
 
-LEG = 12
+N_LEG_POINTS = 12
 """Number of points of a leg, without its start."""
 _OVERSAMPLING = 8
 """Factor by which the final route has more points per turn than the route in the search."""
@@ -754,13 +762,13 @@ class RouteGeometry:
         points: complex positions [S] in m.
         time: duration in s.
         heading: heading of the last leg in rad.
-        d_time: derivatives [nz] of the duration.
-        d_heading: derivatives [nz] of the last heading.
-        d_points: derivatives [S] of the points by the variable of their own part.
+        time_gradient: derivatives [nz] of the duration.
+        heading_gradient: derivatives [nz] of the last heading.
+        own_point_derivatives: derivatives [S] of the points by the variable of their own part.
         part_index: number of that variable in z, [S].
         first_point_after: first point after the part of each variable, [nz].
-        d_shift: translation of later points by each variable, complex [nz].
-        d_rotation: rotation of later points by each variable [nz] in rad.
+        shift_derivatives: translation of later points by each variable, complex [nz].
+        rotation_derivatives: rotation of later points by each variable [nz] in rad.
         rotation_pivot: centre of that rotation, complex [nz] in m.
         units: unit of each variable [nz].
     """
@@ -768,13 +776,13 @@ class RouteGeometry:
     points: np.ndarray
     time: float
     heading: float
-    d_time: Array
-    d_heading: Array
-    d_points: np.ndarray
+    time_gradient: Array
+    heading_gradient: Array
+    own_point_derivatives: np.ndarray
     part_index: NDArray[np.intp]
     first_point_after: NDArray[np.intp]
-    d_shift: np.ndarray
-    d_rotation: Array
+    shift_derivatives: np.ndarray
+    rotation_derivatives: Array
     rotation_pivot: np.ndarray
     units: Array
 
@@ -783,12 +791,12 @@ class RouteGeometry:
         offsets = self.points[point_numbers][:, None] - self.rotation_pivot
         rows = np.where(
             point_numbers[:, None] >= self.first_point_after,
-            self.d_shift + 1j * self.d_rotation * offsets,
+            self.shift_derivatives + 1j * self.rotation_derivatives * offsets,
             0.0,
         )
         own_parts = self.part_index[point_numbers]
         movable = np.flatnonzero(own_parts > 0)
-        rows[movable, own_parts[movable]] = self.d_points[point_numbers[movable]]
+        rows[movable, own_parts[movable]] = self.own_point_derivatives[point_numbers[movable]]
         result: np.ndarray = rows * self.units
         return result
 
@@ -868,13 +876,13 @@ class Route:
         point_ranges: list[tuple[int, int, Sequence[int]]] = []
         first_point = 0
         for k, on_leg in enumerate(sketch.passed_on_legs):
-            point_ranges.append((first_point, first_point + LEG, on_leg))
-            first_point += LEG
+            point_ranges.append((first_point, first_point + N_LEG_POINTS, on_leg))
+            first_point += N_LEG_POINTS
             if k < len(sketch.turns):
                 point_ranges.append(
-                    (first_point, first_point + POINTS, sketch.turns[k].passed_buoys)
+                    (first_point, first_point + N_TURN_POINTS, sketch.turns[k].passed_buoys)
                 )
-                first_point += POINTS
+                first_point += N_TURN_POINTS
         for range_start, range_stop, passed_buoys in point_ranges:
             for buoy in passed_buoys:
                 search_start = min(max(range_start, previous_index), range_stop)
@@ -893,7 +901,7 @@ class Route:
         signs = np.array(self.turn_signs, dtype=float)
         first_heading = float(z[0])
         first_length = float(z[1])
-        shares = np.linspace(0.0, 1.0, LEG + 1)[1:]
+        shares = np.linspace(0.0, 1.0, N_LEG_POINTS + 1)[1:]
         turn_parts, turn_derivatives = self.turns.turns_at(self.table_numbers, z[2::2])
         leg_parts, leg_derivatives = self.turns.legs_after(
             self.table_numbers, z[3::2, None] * shares
@@ -923,47 +931,47 @@ class Route:
                 track_points.ravel(),
             )
         )
-        d_points = np.concatenate(
+        own_point_derivatives = np.concatenate(
             (
                 leg_directions[:-1, None] * turn_derivatives.points,
                 shares * exit_directions[:, None] * leg_derivatives.points,
             ),
             axis=1,
         )
-        d_shift = np.zeros(n_variables, complex)
-        d_rotation = np.zeros(n_variables)
+        shift_derivatives = np.zeros(n_variables, complex)
+        rotation_derivatives = np.zeros(n_variables)
         # each variable moves all later parts of the route as a rigid body
         rotation_pivot = np.full(n_variables, self.start)
-        d_rotation[0] = 1.0
-        d_shift[1] = leg_directions[0]
+        rotation_derivatives[0] = 1.0
+        shift_derivatives[1] = leg_directions[0]
         rotation_pivot[1] = first_corner
-        d_rotation[2::2] = signs * turn_derivatives.headings
-        d_rotation[3::2] = signs * leg_derivatives.headings
-        d_shift[2::2] = leg_directions[:-1] * turn_derivatives.points[:, -1]
-        d_shift[3::2] = exit_directions * leg_derivatives.points[:, -1]
+        rotation_derivatives[2::2] = signs * turn_derivatives.headings
+        rotation_derivatives[3::2] = signs * leg_derivatives.headings
+        shift_derivatives[2::2] = leg_directions[:-1] * turn_derivatives.points[:, -1]
+        shift_derivatives[3::2] = exit_directions * leg_derivatives.points[:, -1]
         rotation_pivot[2::2] = turn_ends
         rotation_pivot[3::2] = leg_ends
-        lengths = np.array([1, LEG, *(POINTS, LEG) * n_turns])
-        d_time = np.zeros(n_variables)
-        d_time[1::2] = 1.0 / speed
-        d_time[2::2] = turn_derivatives.times
+        lengths = np.array([1, N_LEG_POINTS, *(N_TURN_POINTS, N_LEG_POINTS) * n_turns])
+        time_gradient = np.zeros(n_variables)
+        time_gradient[1::2] = 1.0 / speed
+        time_gradient[2::2] = turn_derivatives.times
         return RouteGeometry(
             points,
             float(z[1::2].sum()) / speed + float(turn_parts.times.sum()),
             float(headings[-1]),
-            d_time * self.units,
-            d_rotation * self.units,
-            np.concatenate(([0.0], leg_directions[0] * shares, d_points.ravel())),
+            time_gradient * self.units,
+            rotation_derivatives * self.units,
+            np.concatenate(([0.0], leg_directions[0] * shares, own_point_derivatives.ravel())),
             np.repeat(np.arange(n_variables), lengths),
             np.concatenate(([0], np.cumsum(lengths)[1:])),
-            d_shift,
-            d_rotation,
+            shift_derivatives,
+            rotation_derivatives,
             rotation_pivot,
             self.units,
         )
 
     def to_segments(self, z: Array) -> list[tuple[np.ndarray, Array, float]]:
-        """Return each part of a route: complex points [K] in m, headings [K], rudder angle."""
+        """Return each part of a route: complex points [K] in m, headings [K], rudder angle in rad."""
         z = z * self.units
         heading_offset = float(z[0])
         position = self.start
@@ -985,15 +993,15 @@ class Route:
             track, heading, duration = table(hold_time)
             share = min(hold_time / duration, 1.0) if duration > 0 else 1.0
             switch_index = min(
-                max(round(share * _OVERSAMPLING * POINTS), 1), _OVERSAMPLING * POINTS
+                max(round(share * _OVERSAMPLING * N_TURN_POINTS), 1), _OVERSAMPLING * N_TURN_POINTS
             )
             track = np.concatenate(([0.0], track if turn_sign > 0 else track.conj()))
             heading = np.concatenate(([0.0], turn_sign * heading))
-            uniform_grid = np.linspace(0.0, 1.0, POINTS + 1)
+            uniform_grid = np.linspace(0.0, 1.0, N_TURN_POINTS + 1)
             track_spline = CubicSpline(
                 uniform_grid, np.stack((track.real, track.imag, heading.real), axis=-1)
             )
-            fine_track = track_spline(np.linspace(0.0, 1.0, _OVERSAMPLING * POINTS + 1))
+            fine_track = track_spline(np.linspace(0.0, 1.0, _OVERSAMPLING * N_TURN_POINTS + 1))
             points = position + direction * (fine_track[:, 0] + 1j * fine_track[:, 1])
             heading = fine_track[:, 2]
             segments.append(

@@ -29,7 +29,7 @@ from residnet.physics.symmetry import get_dof
 
 _MAX_RESPONSE_STEP = 0.4
 """Largest time step in s of simulated rudder responses."""
-_STEPS_PER_LENGTH = 400
+_STEPS_PER_DOUBLING = 400
 """Number of steps after which the time step doubles."""
 _STEADY_TOLERANCE = 0.1
 """Largest relative change of a steady yaw rate over the second half of the simulation."""
@@ -45,8 +45,12 @@ _MAX_ZIGZAG_STEPS = 12000
 """Largest number of steps of a zigzag."""
 _ZERO_STATES = ("x", "y", "z", "theta", "psi", "v", "w", "p", "q", "r")
 """States that are zero on a straight course."""
-_RUN_UP_STEPS = (0.1, 6000)
-"""Time step in s and number of steps of the acceleration to the speed of a straight course."""
+_RUN_UP_TIME_STEP = 0.1
+"""Time step in s of the acceleration to the speed of a straight course."""
+_MAX_RUN_UP_STEPS = 6000
+"""Largest number of steps of this acceleration."""
+_MIN_RUN_UP_STEPS = 100
+"""Number of steps after which the acceleration ends as soon as the speed is constant."""
 
 
 class SteeredVessel(ABC):
@@ -200,7 +204,7 @@ class SteeredVessel(ABC):
         with torch.no_grad():
             while times[-1] < duration - 0.5 * dt:
                 model = self.model(dt)
-                for _ in range(min(_STEPS_PER_LENGTH, round((duration - times[-1]) / dt))):
+                for _ in range(min(_STEPS_PER_DOUBLING, round((duration - times[-1]) / dt))):
                     x, s = model.step(x, w, s)
                     times.append(times[-1] + dt)
                     rates.append(rate_sign * float(x[0, r]))
@@ -310,12 +314,12 @@ class SteeredPlant(SteeredVessel):
         unit_speed = torch.ones(1, dtype=torch.float64)
         column = self.state_column("u")
         (x, w) = self.straight_course(unit_speed)
-        model = self.model(_RUN_UP_STEPS[0])
+        model = self.model(_RUN_UP_TIME_STEP)
         with torch.no_grad():
-            for k in range(_RUN_UP_STEPS[1]):
+            for k in range(_MAX_RUN_UP_STEPS):
                 previous_speed = float(x[0, column])
                 x, _ = model.step(x, w, torch.tensor([[1.0, 1.0, 0.0]]).double())
-                if k > 100 and abs(float(x[0, column]) - previous_speed) < 1e-7 * max(
+                if k > _MIN_RUN_UP_STEPS and abs(float(x[0, column]) - previous_speed) < 1e-7 * max(
                     abs(previous_speed), 1e-3
                 ):
                     break

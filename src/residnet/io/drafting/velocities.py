@@ -81,8 +81,8 @@ class MeaningChoice(NamedTuple):
     """Chosen meaning.
 
     Attributes:
-        meaning: most likely one.
-        runner_up: the next one.
+        meaning: most likely meaning.
+        runner_up: second most likely meaning.
         margin: difference of the BIC between both; infinite if it was not needed.
         text: reasons, one line.
     """
@@ -217,7 +217,7 @@ def _compute_unexplained_share(
 def _compare_by_evidence(
     logs: Sequence[MeasuredVelocities], names: Sequence[str], meanings: set[Meaning]
 ) -> dict[Meaning, float]:
-    """Return the BIC of each meaning beyond the best one, summed over the liveliest logs."""
+    """Return the BIC of each meaning beyond the best one, summed over the logs with most yaw."""
     liveliness = [float(np.nanstd(np.gradient(log.heading, log.t))) for log in logs]
     order = np.argsort(liveliness)[::-1][:_MAX_COMPARED_LOGS]
     totals = dict.fromkeys(meanings, 0.0)

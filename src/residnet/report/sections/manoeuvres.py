@@ -1,4 +1,8 @@
-"""Manoeuvres of a vessel or a model: flights, their indices, and the manoeuvring booklet."""
+"""Manoeuvres: their indices, figures of their runs, and the manoeuvring booklet.
+
+A craft is a vessel or a learned model that performs the manoeuvres. A flight is one run of a
+manoeuvre.
+"""
 
 from __future__ import annotations
 
