@@ -971,7 +971,7 @@ class Route:
         )
 
     def to_segments(self, z: Array) -> list[tuple[np.ndarray, Array, float]]:
-        """Return each part of a route: complex points [K] in m, headings [K], rudder angle in rad."""
+        """Return each part of a route: complex points [K] in m, headings [K], rudder angle, rad."""
         z = z * self.units
         heading_offset = float(z[0])
         position = self.start
