@@ -121,7 +121,7 @@ def windy(
         belief_precision=torch.from_numpy(random.uniform(0, 50, size=count)),
         independent_errors=7.0,
         robust=0.05,
-        log=torch.tensor([0, 0, 1, 3, 3]),
+        log_index=torch.tensor([0, 0, 1, 3, 3]),
     )
     return model, problem
 
@@ -342,7 +342,7 @@ def test_one_step_goes_where_a_refit_without_the_logs_goes() -> None:
             WindowStore.from_logs(kept, torch.float64),
             config,
             SCALES,
-            begin=whole,
+            initial_theta=whole,
         )
         assert isinstance(other.baseline, ParametricBaseline)
         wanted = other.baseline.theta.detach()

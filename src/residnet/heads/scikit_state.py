@@ -183,7 +183,7 @@ def _restore_step(
     """Restore one step of a pipeline and return its number of output columns.
 
     Raises:
-        StateError: with the name of the step, if the state does not match it.
+        StateError: if the state does not match the step; the message names the step.
     """
     if not isinstance(state, dict):
         raise StateError(f"{name} has no state")

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -31,6 +31,10 @@ _MAX_ROUNDS = 4
 """Largest number of rounds of grid search and Gauss-Newton; it ends earlier without a gain."""
 _SEARCH_STRIDE = 10
 """Stride of the samples in the grid search."""
+_MIN_ROUND_GAIN = 0.1
+"""Decrease of the negative log-posterior below which a round is the last one."""
+_CONVERGED_STEP = 1e-4
+"""Largest change of a current in m/s at which Gauss-Newton has converged."""
 
 
 def estimate_currents(
@@ -100,22 +104,33 @@ def _estimate(problem: _CurrentProblem, config: CurrentConfig) -> tuple[Tensor, 
     """Return currents [L, 2], their least-squares standard errors [L, 2], and coefficients."""
     best = _minimise(problem, torch.zeros(len(problem.logs), 2, dtype=torch.float64), config)
     for _ in range(_MAX_ROUNDS):
-        _, current, fit = best
-        candidate = _minimise(problem, problem.search_grid(current, fit, config.spread), config)
-        if candidate[0] > best[0] - 0.1:
+        grid_currents = problem.search_grid(best.current, best.fit, config.spread)
+        candidate = _minimise(problem, grid_currents, config)
+        if candidate.cost > best.cost - _MIN_ROUND_GAIN:
             break
         best = candidate
-    _, current, fit = best
-    covariance = problem.gauss_newton_step(current, fit)[1]
-    return current, covariance.diagonal().sqrt().reshape(-1, 2), fit.theta
+    covariance = problem.gauss_newton_step(best.current, best.fit)[1]
+    return best.current, covariance.diagonal().sqrt().reshape(-1, 2), best.fit.theta
 
 
-def _minimise(
-    problem: _CurrentProblem, current: Tensor, config: CurrentConfig
-) -> tuple[float, Tensor, _RegressionFit]:
-    """Return the best point of a Gauss-Newton search from currents [L, 2], with its cost."""
+class _SearchPoint(NamedTuple):
+    """A point of the search.
+
+    Attributes:
+        cost: negative log-posterior.
+        current: currents to north and east [L, 2] in m/s.
+        fit: regression at these currents.
+    """
+
+    cost: float
+    current: Tensor
+    fit: _RegressionFit
+
+
+def _minimise(problem: _CurrentProblem, current: Tensor, config: CurrentConfig) -> _SearchPoint:
+    """Return the best point of a Gauss-Newton search from currents [L, 2]."""
     cost, fit = problem.solve(current)
-    best = (cost, current, fit)
+    best = _SearchPoint(cost, current, fit)
     for _ in range(config.iterations):
         step, _ = problem.gauss_newton_step(current, fit)
         # regressors with magnitudes make the cost rugged far from the true current: full steps
@@ -123,9 +138,9 @@ def _minimise(
         step = step * (config.spread / step.norm(dim=1, keepdim=True)).clamp(max=1.0)
         current = current + step
         cost, fit = problem.solve(current)
-        if cost < best[0]:
-            best = (cost, current, fit)
-        if float(step.abs().max()) < 1e-4:
+        if cost < best.cost:
+            best = _SearchPoint(cost, current, fit)
+        if float(step.abs().max()) < _CONVERGED_STEP:
             break
     return best
 
@@ -189,7 +204,7 @@ class _RegressionFit:
         error: residuals [N, 3].
         variance: variances of the residuals [3].
         phi: regressors [N, J].
-        group: log of each sample [N].
+        group: index of the log of each sample [N].
     """
 
     theta: Tensor
@@ -197,6 +212,24 @@ class _RegressionFit:
     variance: Tensor
     phi: Tensor
     group: Tensor
+
+
+class _SampleColumns(NamedTuple):
+    """Trainable samples of all logs.
+
+    Attributes:
+        psi: headings [N] in rad.
+        states: smoothed states [N, nx].
+        inputs: prepared inputs [N, k].
+        nu_dot: accelerations [N, 3].
+        log_index: index of the log of each sample [N].
+    """
+
+    psi: Tensor
+    states: Tensor
+    inputs: Tensor
+    nu_dot: Tensor
+    log_index: Tensor
 
 
 @dataclass(frozen=True)
@@ -218,8 +251,8 @@ class _CurrentProblem:
     theta: Tensor | None = None
 
     @cached_property
-    def _samples(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Heading [N], states [N, nx], prepared inputs [N, k], accelerations [N, 3], log [N]."""
+    def _samples(self) -> _SampleColumns:
+        """Trainable samples of all logs."""
         parts: list[list[np.ndarray]] = [[], [], [], [], []]
         for number, log in enumerate(self.logs):
             rows = log.trainable
@@ -228,7 +261,7 @@ class _CurrentProblem:
                 part.append(values[rows])
             parts[4].append(np.full(int(rows.sum()), number))
         psi, x, w, nu_dot, group = (torch.from_numpy(np.concatenate(part)) for part in parts)
-        return psi, x, self.signals.prepare(w), nu_dot, group
+        return _SampleColumns(psi, x, self.signals.prepare(w), nu_dot, group)
 
     def regression(self, current: Tensor) -> tuple[Tensor, Tensor]:
         """Return regressors [N, J] and accelerations [N, 3] through the water.
@@ -255,7 +288,7 @@ class _CurrentProblem:
 
     def solve(self, current: Tensor) -> tuple[float, _RegressionFit]:
         """Return the negative log-posterior and the least-squares fit at currents [L, 2]."""
-        group = self._samples[4]
+        group = self._samples.log_index
         phi, target = self.regression(current[group])
         theta = torch.zeros_like(self.baseline.theta) if self.theta is None else self.theta
         for axis in range(3) if self.theta is None else ():
@@ -322,7 +355,7 @@ class _CurrentProblem:
             for log in self.logs
         ]
         thinned = replace(self, logs=thinned_logs)
-        group = thinned._samples[4]
+        group = thinned._samples.log_index
         n_logs = len(self.logs)
 
         def cost_of_logs(trial: Tensor) -> Tensor:

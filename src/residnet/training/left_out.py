@@ -102,7 +102,7 @@ def estimate_leave_one_out(
     cost, states = simulate(model, problem)
     refitted_theta = baseline.theta.detach().clone()
     parameters = baseline.get_free()
-    fold_of_window = fold[problem.log]
+    fold_of_window = fold[problem.log_index]
     n_folds = int(fold.max()) + 1
     n_windows = torch.bincount(fold_of_window, minlength=n_folds).to(parameters.dtype)
     equations_by_fold = [
@@ -171,7 +171,7 @@ def _select_windows(problem: Problem, is_selected: Tensor) -> Problem:
         inputs=problem.inputs[is_selected],
         measured=problem.measured[is_selected],
         weight=problem.weight[is_selected],
-        log=problem.log[is_selected],
+        log_index=problem.log_index[is_selected],
         initial=None,
     )
 

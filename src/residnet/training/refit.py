@@ -73,7 +73,12 @@ class RefitResult:
 
 
 class InitialStates(NamedTuple):
-    """Measured initial velocities of free runs [B, n], and their noise [n], SI."""
+    """Measured initial velocities of free runs.
+
+    Attributes:
+        measured: measured velocities [B, n] in SI units.
+        noise: standard deviation of their noise [n] in SI units.
+    """
 
     measured: Tensor
     noise: Tensor
@@ -89,14 +94,16 @@ class Problem:
         measured: measured velocities after each step [B, T, n].
         weight: 1 / scale of each velocity; 0 for invalid samples [B, T, n].
         free: indices of the free parameters in theta [P].
-        precision, prior_mean: precision [P, P] and mean [P] of the least-squares prior.
+        precision: precision of the prior from the least-squares fit [P, P].
+        prior_mean: mean of this prior [P].
         regularisation: part of `precision` that does not depend on the data [P, P].
         symmetry: precision of the prior of port-starboard symmetry [P, P].
-        belief_mean, belief_precision: mean and precision of the prior of the baseline [P].
+        belief_mean: mean of the prior of the baseline, see `ParametricBaseline.prior` [P].
+        belief_precision: precision of this prior [P].
         fixed: whether a parameter is fixed at zero [P].
         independent_errors: effective sample size per channel.
         robust: error above which the loss of a window is linear, in scales.
-        log: index of each window's log [B].
+        log_index: index of each window's log [B].
         initial: prior of the initial states; None if they are the measured states.
     """
 
@@ -114,7 +121,7 @@ class Problem:
     fixed: Tensor
     independent_errors: float
     robust: float
-    log: Tensor
+    log_index: Tensor
     initial: InitialStates | None = None
 
     def with_fixed(self, parameters: Sequence[int]) -> Problem:
@@ -151,6 +158,12 @@ class Problem:
         return inverse
 
     def prior_cost(self, theta: Tensor, per_nat: Tensor) -> Tensor:
+        """Return the cost of the priors.
+
+        Args:
+            theta: free parameters [P].
+            per_nat: change of the cost per nat, see `cost_per_nat`.
+        """
         from_prior = theta - self.prior_mean
         from_belief = theta - self.belief_mean
         quadratic = from_prior @ self.precision @ from_prior + theta @ self.symmetry @ theta
@@ -205,7 +218,7 @@ def build_problem(
         noise = torch.tensor([[estimate_noise_std(channel) for channel in log] for log in logs])
         noise = noise.to(store.y.dtype).median(0).values.clamp(min=_MIN_NOISE)
         initial = InitialStates(all_but_pose(store.y[starts]), noise)
-    covered = (starts[:, None] + torch.arange(1, steps + 1)).unique().numel()
+    n_covered = (starts[:, None] + torch.arange(1, steps + 1)).unique().numel()
     free = baseline.free_indices()
     return Problem(
         x0=store.y[starts],
@@ -221,10 +234,10 @@ def build_problem(
         belief_precision=belief_precision,
         fixed=torch.zeros(free.numel(), dtype=torch.bool),
         # the mean error is over all channels, of which some may be zero at all times
-        independent_errors=max(covered * model.dt / config.correlation, 1.0)
+        independent_errors=max(n_covered * model.dt / config.correlation, 1.0)
         * float(model.active_mask.mean()),
         robust=config.robust,
-        log=store.log_index[starts],
+        log_index=store.log_index[starts],
         initial=initial,
     )
 
@@ -295,8 +308,8 @@ def normal_equations(
     gradient = torch.zeros(count, dtype=states.dtype)
     # d sqrt(m + c^2) = dm / (2 sqrt(m + c^2)): this is the weight of each window
     rms = torch.sqrt(problem.mean_square(states) + problem.robust**2)
-    window = (0.5 / rms / (model.dof * steps * batch)).sqrt()[:, None, None]
-    root_weight = (window * problem.weight).transpose(0, 1)
+    root_window_weight = (0.5 / rms / (model.dof * steps * batch)).sqrt()[:, None, None]
+    root_weight = (root_window_weight * problem.weight).transpose(0, 1)
     error = (all_but_pose(states[:, 1:]) - problem.measured).transpose(0, 1) * root_weight
     for part, s in sensitivities(model, states[:, :-1], problem.inputs):
         rows = (s[:, :, 1:] * root_weight[part].unsqueeze(-1)).flatten(0, 2)
@@ -409,8 +422,8 @@ def _fit_growing_horizon(
 
     total = problem.inputs.shape[1]
     horizon = 0
-    first = 0
-    iterated = 0
+    first_horizon = 0
+    n_iterations = 0
     while horizon < total:
         # double the horizon, then halve the increase until the free runs are finite
         next_horizon = min(2 * horizon, total) if horizon else total
@@ -421,11 +434,11 @@ def _fit_growing_horizon(
                 "the least-squares baseline diverges within the refit's horizon; shorten `horizon`"
                 " or raise the baseline's ridge"
             )
-        first = first or next_horizon
+        first_horizon = first_horizon or next_horizon
         horizon = next_horizon
         if horizon < total:
-            iterated += _gauss_newton(model, problem.truncate(horizon), iterations).n_steps
-    return first, iterated
+            n_iterations += _gauss_newton(model, problem.truncate(horizon), iterations).n_steps
+    return first_horizon, n_iterations
 
 
 def refit(
@@ -434,7 +447,7 @@ def refit(
     store: WindowStore,
     config: RefitConfig,
     scales: Tensor,
-    begin: Tensor | None = None,
+    initial_theta: Tensor | None = None,
 ) -> RefitResult:
     """Fit the parameters of `model.baseline` to free runs by output error (float64).
 
@@ -444,8 +457,8 @@ def refit(
         store: training windows, float64.
         config: settings of the refit.
         scales: scales of the velocities, SI [n].
-        begin: initial theta of the search, for example from a similar refit; None for the
-            least-squares solution, which is always the prior.
+        initial_theta: parameters at which the search begins, for example from a similar refit; None
+            for the least-squares solution, which is always the prior.
 
     Raises:
         FitError: if the free runs diverge at the first step, or the continuation over growing
@@ -453,20 +466,20 @@ def refit(
     """
     baseline = require_parametric_baseline(model)
     problem = build_problem(model, samples, store, config, scales)
-    if begin is not None:
+    if initial_theta is not None:
         with torch.no_grad():
-            baseline.theta.copy_(begin)
+            baseline.theta.copy_(initial_theta)
     cost, _ = simulate(model, problem)
-    iterated = 0
+    n_iterations = 0
     first_horizon = problem.inputs.shape[1]
     if not torch.isfinite(cost):
-        first_horizon, iterated = _fit_growing_horizon(model, problem, config.iterations)
+        first_horizon, n_iterations = _fit_growing_horizon(model, problem, config.iterations)
         cost, _ = simulate(model, problem)
     cost_before = cost
     undamped: list[int] = []
     for _ in range(_SIGN_ROUNDS):
         result = _gauss_newton(model, problem, config.iterations)
-        iterated += result.n_steps
+        n_iterations += result.n_steps
         # alternate with steps of the initial states while these lower the cost
         for _ in range(config.iterations if problem.initial else 0):
             candidate = estimate_initial_states(model, problem)
@@ -474,7 +487,7 @@ def refit(
                 break
             problem = candidate
             result = _gauss_newton(model, problem, config.iterations)
-            iterated += result.n_steps
+            n_iterations += result.n_steps
         cost = result.minimizer.cost
         if destabilising := baseline.destabilising_terms():
             problem = problem.with_fixed(destabilising)
@@ -492,7 +505,7 @@ def refit(
         notes={
             "cost_before": float(cost_before),
             "cost_after": float(cost),
-            "iterations": iterated,
+            "iterations": n_iterations,
             "windows": len(problem.x0),
             "horizon": config.horizon,
             "begun_over": first_horizon * model.dt,
