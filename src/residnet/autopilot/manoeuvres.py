@@ -132,11 +132,11 @@ SEGMENTS: tuple[Waypoint, ...] = (
 class FourCorner(Manoeuvre):
     """A sequence of poses, smoothed by a reference filter and followed by a PID controller.
 
-    The twelve segments of the document excite surge, sway and yaw, alone and combined. The vessel
+    The twelve segments of the source excite surge, sway and yaw, alone and combined. The vessel
     must have commands for all three forces. Source: Jervan 2020, section 4.1, Table 4.1.
 
     Attributes:
-        poses: poses (north, east, heading); by default the twelve of the document.
+        poses: poses (north, east, heading); by default the twelve of the source.
         interval: time for each pose.
         frequency: natural frequencies of the reference filter in x, y and psi, in rad/s.
         damping: damping ratios of the reference filter in x, y and psi.

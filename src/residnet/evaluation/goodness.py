@@ -440,7 +440,7 @@ def independent_confidence_interval(values: np.ndarray) -> tuple[float, float]:
     Student's t times the standard error of independent samples.
 
     The resampling of the listing only moves the centre of the interval at random; here the centre
-    is the mean. For correlated values the interval is far too narrow (E8 in
+    is the mean. For correlated values the interval is far too narrow (see E8 in
     docs/documents/corrections.md).
     """
     n = len(values)

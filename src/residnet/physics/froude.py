@@ -15,7 +15,7 @@ SPEED_REGIMES: tuple[SpeedRegime, ...] = ("displacement", "semi_displacement", "
 REGIME_BOUNDARIES = (0.4, 1.0)
 """Froude numbers at the boundaries of the speed regimes (Halvorsen 2019, appendix D).
 
-In the document, planing begins between 1.0 and 1.2.
+In this source, planing begins between 1.0 and 1.2.
 """
 
 

@@ -165,7 +165,7 @@ class SideslipNomotoConfig(SecondOrderSteeringConfig):
 
     M nu_dot + N(u) nu = b delta with nu = (v, r) (Gouletas 2020, eq. (5.1)) has the transfer
     functions (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2 s)), (5.4), in
-    which the document prints u for v (G12 in docs/documents/corrections.md).
+    which the source prints u for v (see G12 in docs/documents/corrections.md).
 
     Attributes:
         K_v: steady sway velocity per rudder angle in m/s per rad.

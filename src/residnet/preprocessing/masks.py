@@ -157,7 +157,7 @@ class OutlierMask(MaskRule):
 
     Mean and standard deviation are taken over the `samples` nearest *other* samples. In a window of
     n samples that contains the sample itself, no distance can exceed (n - 1) / sqrt(n) standard
-    deviations: 2.85 for the 10 samples of the document, so that its limit of 3 would never be
+    deviations: 2.85 for the 10 samples of the source, so that its limit of 3 would never be
     exceeded. The standard deviation has a robust estimate over the complete channel as its lower
     bound, because ten samples alone would mark 2 % of normal noise as outliers.
 

@@ -40,7 +40,7 @@ class EvolutionConfig(Config):
             of a tree without expansion (`sum`, section 5.1.1), or every summand after expansion
             (`expand`, section 5.1.3).
         equal_terms: treatment of a tree with repeated terms: add them (`merge`), or discard the
-            individual (`reject`) as the document does, where the Gram matrix is singular (section
+            individual (`reject`) as Halvorsen 2019 does, where the Gram matrix is singular (section
             5.1.2).
         max_terms: maximum number of terms of an individual; individuals with more are discarded.
         max_degree: maximum number of factors of a term; individuals with more are discarded.

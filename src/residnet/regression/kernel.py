@@ -411,7 +411,7 @@ class SingleStateFreeRun:
     """Errors of free runs in which one state is integrated and all other inputs are measured.
 
     This is the first approach of Moreno-Salinas et al. 2019, section 4. It tunes every output
-    alone; the coupled free run may still diverge, which is why the document abandons the approach.
+    alone; the coupled free run may still diverge, which is why the authors abandon the approach.
     Uninterrupted segments are padded to equal length and integrated as a batch.
 
     Args:

@@ -17,7 +17,7 @@ class RbfConfig(Config):
 
     Attributes:
         kind: name of the kernel.
-        sigma: candidate values, in squared standard deviations of a feature (M5 in
+        sigma: candidate values, in squared standard deviations of a feature (see M5 in
             docs/documents/corrections.md).
         exact: number of samples up to which every sample is a centre (kernel ridge regression).
         landmarks: number of centres for more than `exact` samples (Nystroem method), drawn by

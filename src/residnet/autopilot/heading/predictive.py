@@ -98,7 +98,7 @@ class NetworkPredictor(Predictor):
     Inputs are velocities, heel and, with a rate limit, the rudder angle. In calm water position and
     heading do not affect the motion, so that the network predicts the change of the heading only.
     With linear layers, as in the listing of the source, the map is affine: exact for Nomoto's
-    model, but only a tangent for the 4-DOF vessel (G21 in
+    model, but only a tangent for the 4-DOF vessel (see G21 in
     docs/documents/corrections.md).
 
     Args:
@@ -337,12 +337,12 @@ class PredictiveConfig(_PredictiveLawConfig):
 
     Attributes:
         horizon: horizon of the prediction, in s; the heading does not settle with the
-            document's 0.01 s (see docs/documents/corrections.md).
+            0.01 s of the source (see docs/documents/corrections.md).
         candidates: number of rudder angles that are compared, evenly spaced between the limits.
         weight: weight in eq. (6.4) of the angle with the smallest heading error, from 0 to 1.
-        hidden: widths of the hidden layers; the document has 20 units for Nomoto's model and 30 for
+        hidden: widths of the hidden layers; the source has 20 units for Nomoto's model and 30 for
             the 4-DOF vessel.
-        linear: whether activations are omitted, as in the document's listing (see G21 in
+        linear: whether activations are omitted, as in the listing of the source (see G21 in
             docs/documents/corrections.md).
         training: settings of the training.
     """

@@ -209,7 +209,8 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
 class FoilRuddersConfig(SternRuddersConfig):
     """Rudders modelled as foils, with a correction for the slipstream of the propellers.
 
-    Gouletas 2020, eqs. (5.20)-(5.25), without its misprints (G8, G11). The drag at zero angle is
+    Gouletas 2020, eqs. (5.20)-(5.25), without its misprints (see G8 and G11 in
+    docs/documents/corrections.md). The drag at zero angle is
     part of the calm-water resistance of the hull.
 
     Attributes:

@@ -86,7 +86,7 @@ class CourseTaskConfig(PackageTask, ComputingTask):
             then run first in the folder of this run. It defines vessel, rudder, policy and peers.
         policy: name of the policy in that run.
         peers: names of tuned peers and of predictive autopilots in that run.
-        others: further controllers, for example the document's law with another horizon.
+        others: further controllers, for example the law of Gouletas 2020 with another horizon.
         course: start, buoys and settings of the planning.
         protocols: conditions for passing a buoy: `enter` its circle of acceptance, or pass on its
             side and outside its circle (`sides`).
