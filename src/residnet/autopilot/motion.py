@@ -241,7 +241,15 @@ the command increase with it.
 
 
 class PoseDerivatives(NamedTuple):
-    """A desired pose in earth axes (north, east [m], heading [rad]) with derivatives, [..., 3]."""
+    """A desired pose in earth axes with its time derivatives, [..., 3] each.
+
+    Attributes:
+        pose: north and east in m, heading in rad.
+        rate: first derivative.
+        acceleration: second derivative.
+        jerk: third derivative.
+        snap: fourth derivative.
+    """
 
     pose: Tensor
     rate: Tensor

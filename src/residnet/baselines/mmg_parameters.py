@@ -75,7 +75,13 @@ class MMGRudder(Config):
 
 
 class ParameterPrior(NamedTuple):
-    """Prior of a parameter: mean, standard deviation and description."""
+    """Normal prior of a parameter.
+
+    Attributes:
+        mean: mean.
+        sd: standard deviation.
+        meaning: description of the parameter.
+    """
 
     mean: float
     sd: float

@@ -234,7 +234,16 @@ _NEWTON_STEPS = 8
 
 @dataclass(frozen=True)
 class _CalibrationRuns:
-    """Errors [W, G, c] of W runs at G horizons, and their intensity measures [W, G, 2 n]."""
+    """Errors of W runs at G horizons.
+
+    Attributes:
+        names: log of each run.
+        weights: weight of each run [W].
+        steps: horizons in time steps [G].
+        errors: errors [W, G, c] by channel; NaN where unscored.
+        intensities: standardised intensity measures of the motion [W, G, 2 n].
+        intensity: statistics of these measures.
+    """
 
     names: Sequence[str]
     weights: np.ndarray

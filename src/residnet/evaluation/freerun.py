@@ -74,9 +74,11 @@ class Candidate:
 class Prediction:
     """Prediction of one model for one window.
 
-    States [L, 3 + n] hold the velocities of the model and the integrated pose. `has_diverged` flags
-    a diverged free run. `spread` [L - 1, c] is the standard deviation between ensemble members by
-    channel from the first step on; None without an ensemble.
+    Attributes:
+        states: velocities of the model and the integrated pose [L, 3 + n].
+        has_diverged: whether the free run has diverged.
+        spread: standard deviation between ensemble members by channel, from the first step on
+            [L - 1, c]; None without an ensemble.
     """
 
     states: np.ndarray

@@ -40,7 +40,11 @@ pairs.
 class RepeatedPair:
     """A window and the segment of another log that repeats it.
 
-    `mismatch` is the difference of the commands as a fraction of their range.
+    Attributes:
+        window: the window.
+        repeat_log: index of the log of the segment.
+        repeat_start: first sample of the segment.
+        mismatch: difference of the commands as a fraction of their range.
     """
 
     window: Window
@@ -299,7 +303,15 @@ class SerialDependence:
 
 @dataclass(frozen=True)
 class BlockBootstrapInterval:
-    """A mean with a 95 % interval, the blocks' length in samples, and their number."""
+    """A mean with its 95 % interval.
+
+    Attributes:
+        mean: mean.
+        lower: lower limit.
+        upper: upper limit.
+        block_length: length of the blocks in samples.
+        n_blocks: number of blocks.
+    """
 
     mean: float
     lower: float

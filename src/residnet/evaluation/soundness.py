@@ -352,7 +352,15 @@ def check_damping(
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Straight running: state x [3 + n], inputs w [m], and whether it is in the training range."""
+    """Straight running at one speed.
+
+    Attributes:
+        label: `rest` or `cruise`; empty for other speeds.
+        speed: speed in m/s.
+        x: state [3 + n].
+        w: inputs [m].
+        is_inside_training_range: whether state and inputs are in the range of the training data.
+    """
 
     label: str
     speed: float

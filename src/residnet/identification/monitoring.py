@@ -204,7 +204,14 @@ PRIOR_STD = 15.0
 
 @dataclass(frozen=True)
 class ScoreSums:
-    """Scores [Q] and information [Q, Q] of a number of windows, and squares of innovations [n]."""
+    """Sums over windows.
+
+    Attributes:
+        score: scores, the gradients of the log-likelihood [Q].
+        information: Fisher information [Q, Q].
+        squared_innovations: squares of the innovations [n].
+        n_windows: number of windows.
+    """
 
     score: np.ndarray
     information: np.ndarray

@@ -28,7 +28,10 @@ SwayGain = Annotated[Parameter, AfterValidator(convert_to_unit("m/s"))]
 class SteeringStateSpace(NamedTuple):
     """State-space model z_dot = A z + b delta with z = (v, r, internal states).
 
-    A is [k, k], b is [k].
+    Attributes:
+        a: matrix A [k, k].
+        b: vector b [k].
+        internal_states: names of the internal states.
     """
 
     a: np.ndarray

@@ -168,7 +168,9 @@ def assess_pair_symmetry(
             constraint = np.vstack((identity, mirrored_rows))
             free_fit, moments, total = free_fits[k]
             fit = _fit_from_moments(constraint.T @ gram @ constraint, constraint.T @ moments, total)
-            deviance += n_effective[k] * np.log(max(fit.ssr / free_fit.ssr, 1.0))
+            deviance += n_effective[k] * np.log(
+                max(fit.sum_of_squares / free_fit.sum_of_squares, 1.0)
+            )
             degrees_of_freedom += free_fit.rank - fit.rank
         return float(deviance), degrees_of_freedom
 
@@ -219,10 +221,16 @@ def _minimize_over_ratios(compute_deviance: Callable[[float], float]) -> float:
 
 @dataclass(frozen=True)
 class _LeastSquaresFit:
-    """Coefficients [p], sum of squared residuals and rank of a least-squares fit."""
+    """A least-squares fit.
+
+    Attributes:
+        coefficients: coefficients [p].
+        sum_of_squares: sum of squared residuals.
+        rank: rank of the regressors.
+    """
 
     coefficients: np.ndarray
-    ssr: float
+    sum_of_squares: float
     rank: int
 
 

@@ -35,7 +35,13 @@ _FULL_ROOM_ANGLE = 0.6
 
 
 class TurnRoom(NamedTuple):
-    """Radius of a turn, and straight lengths needed before and after it, in m."""
+    """Room that a turn needs, in m.
+
+    Attributes:
+        radius: radius of the turn.
+        lead_in: straight length before the turn.
+        lead_out: straight length after the turn.
+    """
 
     radius: float
     lead_in: float

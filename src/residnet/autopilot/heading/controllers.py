@@ -36,7 +36,14 @@ from residnet.dynamics.store import Stored, read_spec, read_weights
 
 
 class ControlTask(NamedTuple):
-    """Vessel, Nomoto model, rudder limit [rad] and time step [s] that a controller is built for."""
+    """Task that a controller is built for.
+
+    Attributes:
+        vessel: controlled vessel.
+        nomoto: Nomoto model of the vessel.
+        limit: rudder limit in rad.
+        dt: time step of the controller in s.
+    """
 
     vessel: SteeredVessel
     nomoto: NomotoModel

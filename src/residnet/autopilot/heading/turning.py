@@ -267,9 +267,13 @@ def _solve_linear_terms(
 
 @dataclass(frozen=True)
 class NomotoModel:
-    """T r_dot + r = K (delta - c psi) at a speed: K [1/s], T [s], u [m/s] and c [-].
+    """Nomoto's model T r_dot + r = K (delta - c psi) at one speed.
 
-    c is the restoring coefficient of a dive angle; it is zero for the heading.
+    Attributes:
+        gain: K in 1/s.
+        time: time constant T in s.
+        speed: speed u in m/s.
+        restoring: c, the restoring coefficient of a dive angle; zero for the heading.
     """
 
     gain: float

@@ -38,7 +38,16 @@ CONDITIONS_FILE = "conditions.parquet"
 
 
 class AxisWords(NamedTuple):
-    """Words for the controlled axis: its name, unit, scale from SI, rate, and actuator."""
+    """Words for the controlled axis.
+
+    Attributes:
+        value: controlled quantity.
+        unit: unit in which it is displayed.
+        scale: factor from SI to this unit.
+        rate: name of the rate of the vessel.
+        rudder: name of the actuator.
+        columns: columns of the controlled quantity and of the rate.
+    """
 
     value: str
     unit: str

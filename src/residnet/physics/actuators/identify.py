@@ -14,7 +14,14 @@ from residnet.core.errors import FitError
 
 
 class IntervalEstimate(NamedTuple):
-    """Estimate with the lower and upper limit of its 95 % confidence interval, in `unit`."""
+    """Estimate with its 95 % confidence interval.
+
+    Attributes:
+        value: estimate.
+        low: lower limit.
+        high: upper limit.
+        unit: unit of all three.
+    """
 
     value: float
     low: float
@@ -23,9 +30,13 @@ class IntervalEstimate(NamedTuple):
 
 
 class ThrottleMap(NamedTuple):
-    """Map from throttle to revolutions, n = slope * throttle + offset [1/s], within +-n_max.
+    """Map from throttle to revolutions, n = slope * throttle + offset, within +-n_max.
 
-    n_max is the maximum measured value if the data do not saturate.
+    Attributes:
+        slope: revolutions in 1/s per throttle.
+        offset: revolutions at zero throttle in 1/s.
+        n_max: limit in 1/s; the largest measured value if the data do not saturate.
+        saturated: whether the data saturate.
     """
 
     slope: IntervalEstimate
@@ -41,16 +52,25 @@ class ThrottleMap(NamedTuple):
 
 
 class StepResponse(NamedTuple):
-    """Rate limit [1/s^2] and dead time [s] of a shaft."""
+    """Response of a shaft to a step of the command.
+
+    Attributes:
+        rate: rate limit in 1/s^2.
+        dead_time: dead time in s.
+    """
 
     rate: IntervalEstimate
     dead_time: IntervalEstimate
 
 
 class ThrustFit(NamedTuple):
-    """Thrust curve of one direction: coefficients, range of revolutions and RMS residual.
+    """Thrust c0 + c1 n + c2 n^2 of one direction of rotation.
 
-    The coefficients are c0 [N], c1 [N s], c2 [N s^2]; the residual is in N.
+    Attributes:
+        coefficients: c0 in N, c1 in N s, c2 in N s^2.
+        low: lowest revolutions of the data in 1/s.
+        high: highest revolutions of the data in 1/s.
+        rms: root mean square residual in N.
     """
 
     coefficients: tuple[IntervalEstimate, IntervalEstimate, IntervalEstimate]
