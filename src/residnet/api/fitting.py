@@ -171,6 +171,7 @@ class FreeRuns:
         protocol: str | None = None,
         window: int | None = None,
     ) -> Figure:
+        """Return a figure of one window: its track, or its velocities over time."""
         from residnet.report.sections.runs import plot_window
         from residnet.report.still import FIGURE_WIDTH, draw_on_axes, render_matplotlib
 

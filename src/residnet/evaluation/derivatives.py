@@ -663,6 +663,7 @@ def _build_remarks(
     source: MassSource,
     baseline: ParametricBaseline,
 ) -> list[str]:
+    """Return sentences on the validity of the derivatives."""
     remarks = []
     if not spec.low[0] <= particulars.speed <= spec.high[0]:
         remarks.append(

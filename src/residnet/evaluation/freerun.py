@@ -302,6 +302,7 @@ def _run_candidate(
     velocity_limits: np.ndarray,
     dtype: torch.dtype,
 ) -> list[Prediction]:
+    """Return the predictions of one model for all windows."""
     input_tables = {
         log_index: _input_table(candidate, logs[log_index])
         for log_index in {window.log_index for window in windows}

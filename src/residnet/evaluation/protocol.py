@@ -74,6 +74,7 @@ class WindowProtocol(Config):
     def _place_windows(
         self, log: PreparedLog, log_index: int, dt: float, interval: float
     ) -> list[Window]:
+        """Return windows of a log whose starts are `interval` seconds apart."""
         n_steps = round(self.length / dt)
         start = round(self.first / dt)
         windows = []

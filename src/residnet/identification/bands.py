@@ -130,6 +130,7 @@ class LeaveFoldOutModels:
         ]
 
     def _fit_baseline_without_folds(self, fitted_model: FittedModel) -> list[HybridDynamics]:
+        """Return a baseline fitted without each fold: one refit step, or least squares."""
         settings = self.identified.settings
         refit_config = settings.refit.get(fitted_model.name)
         full_model = copy.deepcopy(fitted_model.model).to(torch.float64)
@@ -158,6 +159,7 @@ class LeaveFoldOutModels:
     def _fit_head_without_fold(
         self, fitted_model: FittedModel, baseline: HybridDynamics, fold: int
     ) -> HybridDynamics:
+        """Return a closed-form head fitted without a fold, on the baseline of that fold."""
         model = fitted_model.spec.build()
         model.baseline.load_state_dict(copy.deepcopy(baseline.baseline.state_dict()))
         assert isinstance(model.head, ClosedFormHead)

@@ -429,6 +429,7 @@ def _simulate_manoeuvres(
     input_shares: Mapping[str, InputShare],
     goal_manoeuvres: PredictionGoal,
 ) -> list[ManoeuvreRun]:
+    """Simulate the manoeuvres whose prediction is to be improved, with the fitted model."""
     spec = fitted_model.spec
     model = fitted_model.model.double()
     actuators = GivenActuators(input_shares, spec.signals.exogenous, spec.dt)

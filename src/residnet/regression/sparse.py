@@ -647,6 +647,7 @@ class SparseRegression(Estimator):
         names: Sequence[str],
         outputs: Sequence[str],
     ) -> Solution:
+        """Select the terms of each output and return the equations as one solution."""
         equations = [
             find_equation(problem, output, config) for output, problem in enumerate(problems)
         ]

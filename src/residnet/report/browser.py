@@ -89,6 +89,14 @@ def _axis_range(limits: Sequence[float]) -> Any:
 
 
 def _build_canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource) -> Canvas:
+    """Return the Bokeh canvas of one panel of a figure.
+
+    Args:
+        figure: figure with the panel.
+        number: index of the panel.
+        x_range: Bokeh range of the x axis, shared by panels with a common axis.
+        source: data source of all curves.
+    """
     from bokeh import models
     from bokeh.models.annotations import Title
     from bokeh.plotting import figure as new_canvas

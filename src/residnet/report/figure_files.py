@@ -151,6 +151,7 @@ def figures_section(folder: Path) -> list[Section]:
 
 
 def _read_figure(path: Path) -> Figure | None:
+    """Read a stored figure; None if the file is not readable."""
     try:
         content = read_json(path)
         for style in content["looks"].values():

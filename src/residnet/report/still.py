@@ -141,6 +141,15 @@ def draw_on_axes(figure: Figure, axes: Sequence[Any], panel_numbers: Sequence[in
 def _draw_panel(
     axes: Any, figure: Figure, case: Case, number: int, handles: dict[str, Any]
 ) -> None:
+    """Draw one panel of a case.
+
+    Args:
+        axes: Matplotlib axes.
+        figure: figure with the panel.
+        case: case whose curves are drawn.
+        number: index of the panel.
+        handles: receives the legend handle of each label.
+    """
     panel = figure.panels[number]
     for name in figure.curve_names(number):
         style = figure.styles[name]

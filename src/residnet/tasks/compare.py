@@ -229,6 +229,7 @@ class _PairedRow(NamedTuple):
 def _build_paired_table(
     runs: Sequence[EvaluatedRun], comparisons: Mapping[str, Mapping[str, RunComparison]]
 ) -> Table:
+    """Return the table of paired differences of all runs from the first one, by protocol."""
     reference_name = runs[0].name
     rows = [
         _PairedRow(run, protocol, entries[run.name])

@@ -288,6 +288,7 @@ class HeadTraining(EpochTraining):
         return one_step_loss(self.model, z, baseline, nu_dot, is_counted, scale, self.process_mean)
 
     def _multi_step(self, windows: Sequence[WindowBatch], stage: int) -> Tensor:
+        """Return the loss of free runs over windows, started from their measured past."""
         initial_states = []
         memories = []
         if self.mirror is not None:

@@ -459,6 +459,7 @@ def _passes_check(
 def _no_course_message(
     request: CourseRequest, rejections: Sequence[RejectedRoute], buoy_numbers: Sequence[int]
 ) -> str:
+    """Return the message that no course was found, with the reason and advice."""
     if buoy_numbers:
         *leading_numbers, last_number = (str(number) for number in buoy_numbers)
         return (

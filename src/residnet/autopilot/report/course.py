@@ -52,6 +52,7 @@ _PANELS = (
 
 
 def _iterate_course_figures(run: RunFiles) -> Iterator[Figure]:
+    """Yield the figures of planned and steered courses."""
     tracks = run.read_required_parquet(TRACKS_FILE)
     plans = run.read_required_parquet(COURSES_FILE)
     spread_runs = run.read_parquet(SPREAD_FILE)
@@ -123,6 +124,7 @@ def _circle_radii(run: RunFiles) -> dict[str, list[float]]:
 def _protocol_case(
     run: RunFiles, protocol: str, radii: Sequence[float], tracks: Any, plan: Any
 ) -> Case:
+    """Return the track and the signals of all controllers under one passing rule."""
     course = run.resolved_config["course"]
     east, north = (np.array([buoy[name] for buoy in course["buoys"]]) for name in ("east", "north"))
     angle = np.linspace(0.0, 2.0 * np.pi, 37)

@@ -611,6 +611,7 @@ def extrapolation_table(rows: Sequence[JsonObject]) -> Table | None:
 
 
 def _conditions_text(evaluation: Mapping[str, Any]) -> list[str]:
+    """Return sentences that describe the operating conditions of the evaluation."""
     conditions = evaluation["stated"]
     depth = conditions.get("depth")
     axis_labels = axis_words(conditions)

@@ -396,6 +396,7 @@ def _worst_windows_table(
 
 
 def _repeatability_text(run: RunFiles, repeatability: Repeatability) -> str:
+    """Return a paragraph on repeated runs: how they were found, and by how much they differ."""
     tolerance = repeatability.tolerance
 
     def format_velocities(values: Mapping[str, float], *digits: int) -> str:

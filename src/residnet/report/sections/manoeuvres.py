@@ -385,6 +385,13 @@ def trial_figures(trials_by_craft: Mapping[str, Sequence[ManoeuvreRun]]) -> Iter
 def _trial_curves(
     crafts: Sequence[str], group: Sequence[ManoeuvreRun], factors: Mapping[str, float]
 ) -> list[dict[str, Curve]]:
+    """Return the track and the channels of one manoeuvre by craft, a dictionary for each panel.
+
+    Args:
+        crafts: names of the crafts.
+        group: run of each craft.
+        factors: plotted channel -> factor from SI to its displayed unit.
+    """
     manoeuvre = group[0].manoeuvre
     first_motion = group[0].true_log
     x0, y0 = (float(first_motion[name][0]) for name in ("x", "y"))
@@ -420,6 +427,7 @@ def _trial_curves(
 def _spiral_figure(
     crafts: Sequence[str], group: Sequence[ManoeuvreRun], styles: Mapping[str, GlyphStyle]
 ) -> Figure:
+    """Return the figure of yaw rate against helm of a spiral manoeuvre."""
     name = group[0].true_log.name
     manoeuvre = group[0].manoeuvre
     by_angle = isinstance(manoeuvre, Spiral) and len(manoeuvre.rudders) > 0
@@ -582,6 +590,7 @@ def booklet_figures(run: RunFiles) -> Iterator[Figure]:
 def _turning_circle_figure(
     by_page: Mapping[str, pd.DataFrame], pages: Sequence[BookletRow], content: BookletFile
 ) -> Figure:
+    """Return the figure of turning circles in hull lengths: all draws, and the fitted model."""
     length = content.length
     panel: dict[str, Curve] = {}
     styles = {
@@ -632,6 +641,15 @@ def _turning_circle_figure(
 
 
 def _zigzag_curves(rows: pd.DataFrame, level: float) -> dict[str, Curve]:
+    """Return heading changes and rudder angles of a zigzag over time in deg.
+
+    Draw 0 is the fitted model, draw -1 the measured run, and the other draws give the interval.
+
+    Args:
+        rows: samples of all draws.
+        level: coverage of the interval.
+    """
+
     def relative_heading_deg(draw_rows: pd.DataFrame) -> np.ndarray:
         heading_change: np.ndarray = (
             DEGREES_PER_RADIAN * (draw_rows["psi"] - draw_rows["psi"].iloc[0]).to_numpy()

@@ -397,6 +397,7 @@ class FerrySimulation:
         noise: Tensor,
         pid: MotionPID,
     ) -> FerryRun:
+        """Return the sampled signals and the tracking metrics of one simulation."""
         loop = self.loop
         commands = w[:, : self.plant.n_commands]
         command = self.thrusters.requested_force(commands)

@@ -849,6 +849,7 @@ def _surface_figure(
     unmodelled: Sequence[float],
     choices: Mapping[str, Sequence[tuple[int, int]]],
 ) -> Figure:
+    """Return the figure of the error over model orders, with marks at the selected orders."""
     marks = (("x", VERMILLION), ("o", PURPLE), ("s", ORANGE))
     styles = {
         "orders": GlyphStyle("each model order", GREY, width=0.8),

@@ -186,6 +186,7 @@ def _build_vessel_craft(
 def _build_model_craft(
     programme: Programme, choice: ModelChoice
 ) -> tuple[SimulatedVessel, TrialEnvironment]:
+    """Build a learned model with its actuators as a vessel that performs manoeuvres."""
     name = choice.model_folder.name
     (spec, model) = load_model(choice.model_folder)
     step = spec.dt

@@ -225,6 +225,7 @@ def _format_value(value: SettingValue) -> str:
 
 
 def _result_figure(config: BreedingTaskConfig, rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Return the figure of the numbers of successful runs and of their mean errors."""
     columns = list(config.columns.values)
     styles: dict[str, GlyphStyle] = {}
     counts: dict[str, Any] = {}
