@@ -393,7 +393,7 @@ def evaluate_limit_cycles(
     heading_swing, rudder_swing = trajectories.peak_to_peak(settling_time)
     steadiness_limits = SteadinessLimits()
     tolerances = (
-        _SWING_TOLERANCE * steadiness_limits.limits_for(trajectories.axis)[0],
+        _SWING_TOLERANCE * steadiness_limits.limits_for(trajectories.axis).swing,
         _SWING_TOLERANCE * steadiness_limits.rudder_swing,
     )
     # NaN fails the comparison and counts as a limit cycle

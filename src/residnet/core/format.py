@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from typing import NamedTuple
 
 DEGREES_PER_RADIAN = 180.0 / math.pi
 """Degrees per radian."""
@@ -27,9 +28,21 @@ _PLAIN_EXPONENTS = (-4, 6)
 """Range of powers of ten in which a number is written without an exponent."""
 
 
-def display_unit(unit: str) -> tuple[str, float]:
-    """Return the display unit of an SI unit and the factor from SI."""
-    return DISPLAY_UNITS.get(unit, (unit, 1.0))
+class DisplayUnit(NamedTuple):
+    """Unit in which a quantity is displayed.
+
+    Attributes:
+        name: name of the unit.
+        factor: factor from SI to this unit.
+    """
+
+    name: str
+    factor: float
+
+
+def display_unit(unit: str) -> DisplayUnit:
+    """Return the display unit of an SI unit."""
+    return DisplayUnit(*DISPLAY_UNITS.get(unit, (unit, 1.0)))
 
 
 def channel_title(channel: str) -> str:

@@ -397,7 +397,7 @@ def _format_errors_with_intervals(errors: PoseErrors, distance_travelled: float 
     texts = []
     for error_name, error in errors.by_name.items():
         interval = errors.intervals[error_name]
-        unit_factor = display_unit(POSE_ERROR_UNITS[error_name])[1]
+        unit_factor = display_unit(POSE_ERROR_UNITS[error_name]).factor
         details = [format_interval(interval, unit_factor, 2)] if interval else []
         if error_name == "position" and distance_travelled > 0.0:
             details.append(

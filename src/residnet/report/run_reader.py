@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from residnet.core.config import load_mapping
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import make_file_stem, read_table
-from residnet.core.format import DISPLAY_UNITS, display_unit
+from residnet.core.format import DISPLAY_UNITS, DisplayUnit, display_unit
 from residnet.core.frames import wrap_angle_array
 from residnet.core.layout import SIX_DOF_LAYOUT, SURGE_SWAY_YAW, DegreesOfFreedom
 from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY, PLANT
@@ -58,6 +58,20 @@ JsonObject = Mapping[str, Any]
 RecordT = TypeVar("RecordT", bound=StoredFile)
 _SPLIT_PRIORITY = ("test", "external", "validation", "train")
 """Splits in the order in which a report prefers them: data that no fit has seen come first."""
+
+
+class PoseErrorUnit(NamedTuple):
+    """Label and unit of an error at the end of free runs.
+
+    Attributes:
+        label: name of the error in a report.
+        unit: unit in which it is displayed.
+        factor: factor from SI to this unit.
+    """
+
+    label: str
+    unit: str
+    factor: float
 
 
 @dataclass(frozen=True)
@@ -455,11 +469,10 @@ class RunFiles:
         """The pose errors that are scored at the end of free runs (`POSE_ERROR_UNITS`)."""
         return list(self.rows[0].final_pose_errors)
 
-    def pose_error_unit(self, pose_error: str) -> tuple[str, str, float]:
-        """Return name, unit and the factor to it from SI of an error at the end of free runs."""
-        return self.position_label if pose_error == "position" else pose_error, *display_unit(
-            POSE_ERROR_UNITS[pose_error]
-        )
+    def pose_error_unit(self, pose_error: str) -> PoseErrorUnit:
+        """Return label and display unit of an error at the end of free runs."""
+        label = self.position_label if pose_error == "position" else pose_error
+        return PoseErrorUnit(label, *display_unit(POSE_ERROR_UNITS[pose_error]))
 
     def find_row(
         self, model: str | None, split: str, protocol: str, manoeuvre: str = "all"
@@ -490,8 +503,8 @@ class RunFiles:
             return f"{model} (predictor)"
         return f"{model} (selected)" if model == self.selected else model
 
-    def display_unit(self, channel: str) -> tuple[str, float]:
-        """Return the display unit of a channel and the factor from SI.
+    def display_unit(self, channel: str) -> DisplayUnit:
+        """Return the display unit of a channel.
 
         This is the unit in the channel map of the log, with degrees instead of radians.
         """
@@ -502,7 +515,7 @@ class RunFiles:
             return (
                 display_unit(unit_name)
                 if unit_name in DISPLAY_UNITS
-                else (unit_name, 1.0 / to_si(unit_name))
+                else DisplayUnit(unit_name, 1.0 / to_si(unit_name))
             )
         return display_unit(self.si_unit(channel))
 

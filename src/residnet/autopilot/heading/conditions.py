@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, final
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, final
 
 import numpy as np
 import torch
@@ -723,6 +723,20 @@ def settled_time(duration: float) -> float:
     return _SETTLED_TIME_FACTOR * duration
 
 
+class AxisLimits(NamedTuple):
+    """Limits of the controlled axis, in rad or in m of depth.
+
+    Attributes:
+        swing: largest peak-to-peak range in the steady state.
+        overshoot: largest overshoot of the nominal vessel without delay and bias.
+        overshoot_p95: largest 95th percentile of the overshoot under the conditions.
+    """
+
+    swing: float
+    overshoot: float
+    overshoot_p95: float
+
+
 class DepthLimits(Config):
     """Limits of depth oscillation and overshoot that a depth policy must meet, in m.
 
@@ -764,11 +778,11 @@ class SteadinessLimits(Config):
     overshoot_p95: Radians = Field(default=0.008377580409572781, gt=0)
     flights: int = Field(default=256, ge=2, le=1_000_000)
 
-    def limits_for(self, axis: Axis) -> tuple[float, float, float]:
-        """Return the limits of swing, overshoot and its 95th percentile, in rad or m."""
+    def limits_for(self, axis: Axis) -> AxisLimits:
+        """Return the limits for the controlled axis."""
         if axis is DEPTH:
-            return self.depth.swing, self.depth.overshoot, self.depth.overshoot_p95
-        return self.heading_swing, self.overshoot, self.overshoot_p95
+            return AxisLimits(self.depth.swing, self.depth.overshoot, self.depth.overshoot_p95)
+        return AxisLimits(self.heading_swing, self.overshoot, self.overshoot_p95)
 
 
 @final

@@ -231,7 +231,9 @@ class PolicyFit(EpochTraining):
     def _overshoot_penalty(self, overshoot: Tensor) -> Tensor:
         """Return the penalty in s for overshoot above the limit of its 95th percentile."""
         steady = self.settings.steady
-        limit = math.inf if steady is None else steady.limits_for(self.conditions.axis)[2]
+        limit = (
+            math.inf if steady is None else steady.limits_for(self.conditions.axis).overshoot_p95
+        )
         mean_excess: Tensor = (overshoot - limit).clamp(min=0.0).mean()
         cost: Tensor = self.settings.excess / self.conditions.overshoot_unit * mean_excess
         return cost
@@ -314,7 +316,7 @@ class PolicyFit(EpochTraining):
         score = float(metrics["cost"].mean())
         if self.limit_cycle_test is not None:
             is_worse = self.start_score is not None and score > self.start_score
-            limit = self.limit_cycle_test.limits.limits_for(self.conditions.axis)[2]
+            limit = self.limit_cycle_test.limits.limits_for(self.conditions.axis).overshoot_p95
             n_overshoots = count_excess_overshoots(metrics["overshoot"], limit)
             n_limit_cycles = self.limit_cycle_test.count_failures(self.validation_loop)
             self.diverged = _ALL_REJECTED if is_worse else n_limit_cycles + n_overshoots

@@ -48,8 +48,9 @@ def fit_data_section(run: RunFiles) -> Section | None:
         for split, members in logs.items()
     ]
     scale_texts = [
-        f"{name} {format_number(run.display_unit(name)[1] * value)} {run.display_unit(name)[0]}"
+        f"{name} {format_number(unit.factor * value)} {unit.name}"
         for name, value in run.metrics.scales.items()
+        for unit in [run.display_unit(name)]
     ]
     signals = run.fit_settings.signals
     thrusters = (

@@ -97,12 +97,12 @@ def _quantity_titles(run: RunFiles, nrmse_title: str = "NRMSE [-]") -> dict[str,
     """Return the column titles of tables of errors."""
     return {
         **{
-            channel: f"{channel_title(channel)} [{run.display_unit(channel)[0]}]"
+            channel: f"{channel_title(channel)} [{run.display_unit(channel).name}]"
             for channel in run.channels
         },
         "nrmse": nrmse_title,
         **{
-            pose_error: "{}, end [{}]".format(*run.pose_error_unit(pose_error))
+            pose_error: "{0.label}, end [{0.unit}]".format(run.pose_error_unit(pose_error))
             for pose_error in run.pose_errors
         },
         "diverged": "diverged",
@@ -203,7 +203,7 @@ def _quantity_cell(run: RunFiles, key: str, row: MetricsRow | None) -> Cell:
         return Cell(f"{row.diverged}/{row.windows}", mark="bad" if row.diverged else "")
     if key in run.pose_errors:
         error = row.final_pose_errors.get(key, math.nan)
-        return Cell(format_number(run.pose_error_unit(key)[2] * error, 2))
+        return Cell(format_number(run.pose_error_unit(key).factor * error, 2))
     diverged_text = describe_divergence(row)
     if key == "nrmse":
         interval = row.nrmse_mean_ci95
@@ -214,7 +214,7 @@ def _quantity_cell(run: RunFiles, key: str, row: MetricsRow | None) -> Cell:
         is_worse = False
         factor = 1.0
     else:
-        factor = run.display_unit(key)[1]
+        factor = run.display_unit(key).factor
         if key not in row.rmse:
             return Cell(DASH)
         value = row.rmse[key]
@@ -366,7 +366,7 @@ def _worst_windows_table(
         return None
     channels = [name for name in run.channels if name in windows[0].rmse]
     pose_error = run.pose_errors[0]
-    factor = run.pose_error_unit(pose_error)[2]
+    factor = run.pose_error_unit(pose_error).factor
     return build_table(
         windows,
         [
@@ -381,7 +381,7 @@ def _worst_windows_table(
                     _quantity_titles(run)[channel],
                     lambda window, channel=channel: window.rmse[channel],
                     format_number,
-                    run.display_unit(channel)[1],
+                    run.display_unit(channel).factor,
                 )
                 for channel in channels
             ),
@@ -401,8 +401,8 @@ def _repeatability_text(run: RunFiles, repeatability: Repeatability) -> str:
 
     def format_velocities(values: Mapping[str, float], *digits: int) -> str:
         return ", ".join(
-            f"{name} {format_number(run.display_unit(name)[1] * values[name], *digits)}"
-            f" {run.display_unit(name)[0]}"
+            f"{name} {format_number(run.display_unit(name).factor * values[name], *digits)}"
+            f" {run.display_unit(name).name}"
             for name in tolerance.start
         )
 

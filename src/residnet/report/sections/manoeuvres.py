@@ -269,7 +269,9 @@ def _table_by_index(
 
     def interval_text(name: str) -> str:
         (craft_indices,) = crafts.values()
-        return format_interval(craft_indices[name].interval, display_unit(content.units[name])[1])
+        return format_interval(
+            craft_indices[name].interval, display_unit(content.units[name]).factor
+        )
 
     columns: list[Column[str]] = [
         ("index", index_title),
