@@ -272,7 +272,7 @@ def _require_effect(squared_norms: Tensor, labels: Sequence[str]) -> None:
     """Refuse parameters whose column of the Jacobian is zero.
 
     Raises:
-        FitError: with the name of the first such parameter.
+        FitError: if there is such a parameter; the message names the first one.
     """
     if bool((squared_norms == 0).any()):
         label = labels[int((squared_norms == 0).nonzero()[0, 0])]

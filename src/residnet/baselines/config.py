@@ -96,7 +96,7 @@ def require_channels(names: Sequence[str], required: Sequence[str], subject: str
     """Check that channels exist, that required velocities are modelled and that roll is not.
 
     Raises:
-        ConfigError: with the first missing channel.
+        ConfigError: if a channel is missing; the message names the first one.
         UsageError: if the model includes roll.
     """
     dof = get_dof(names)

@@ -576,7 +576,7 @@ def _run_compiler(
     """Compile a C source to a library.
 
     Raises:
-        ExportError: with the first message of the compiler.
+        ExportError: if the compiler fails; the message is its first one.
     """
     with tempfile.TemporaryDirectory() as folder:
         source_path = Path(folder) / "compiled.c"

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     DemandFunction = Callable[[Tensor, Tensor], Tensor]
     """Turns drive [...] and steer [...] into commands [..., c], the first columns of the inputs."""
     BatchParameters = dict[str, Tensor]
-    """What rows of a batch are told by their manoeuvres, each [B] or [B, n]."""
+    """Parameters, or the observed motion, of the rows of a batch by name, [B] or [B, n] each."""
 
 Range = tuple[float, float]
 """Lower and upper bound of a uniform distribution."""

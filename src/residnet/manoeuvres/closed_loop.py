@@ -96,10 +96,10 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
     def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
         return super().law_parameters(helm) | {
             "steer": self.steer_share(helm),
-            "bound": self.heading,
-            "sense": self.side,
-            "first": 1.0 if self.first == "starboard" else -1.0,
-            "most": math.inf if self.reversals is None else float(self.reversals),
+            "reversal_angle": self.heading,
+            "side": self.side,
+            "first_side": 1.0 if self.first == "starboard" else -1.0,
+            "max_reversals": math.inf if self.reversals is None else float(self.reversals),
         }
 
     @classmethod
@@ -108,7 +108,7 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
         import torch
 
         psi = motion["psi"]
-        return torch.stack((parameters["first"], psi, torch.zeros_like(psi)), dim=-1)
+        return torch.stack((parameters["first_side"], psi, torch.zeros_like(psi)), dim=-1)
 
     @classmethod
     def step_law(
@@ -119,8 +119,8 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
 
         command_sign, origin, count = memory.unbind(-1)
         # positive towards the current side of the steering
-        heading_change = command_sign * parameters["sense"] * (motion["psi"] - origin)
-        has_reached = heading_change >= parameters["bound"]
+        heading_change = command_sign * parameters["side"] * (motion["psi"] - origin)
+        has_reached = heading_change >= parameters["reversal_angle"]
         command_sign = torch.where(has_reached, -command_sign, command_sign)
         steer = torch.where(time >= parameters["start"], command_sign * parameters["steer"], 0.0)
         return (
@@ -135,8 +135,8 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
     ) -> Tensor:
         """Return whether the heading has returned to the initial course after the last reversal."""
         command_sign, origin, count = memory.unbind(-1)
-        is_back = command_sign * parameters["sense"] * (motion["psi"] - origin) >= 0
-        return (count >= parameters["most"]) & is_back
+        is_back = command_sign * parameters["side"] * (motion["psi"] - origin) >= 0
+        return (count >= parameters["max_reversals"]) & is_back
 
 
 class SteeringFamily(ManoeuvreFamily, ABC):
@@ -266,7 +266,10 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
         return indices.turning_limits(length) if is_full_rudder else {}
 
     def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
-        phase_parameters = {"steer": self.steer_share(helm), "after": 1.0 if self.pull_out else 2.0}
+        phase_parameters = {
+            "steer": self.steer_share(helm),
+            "phase_after_turn": 1.0 if self.pull_out else 2.0,
+        }
         return super().law_parameters(helm) | phase_parameters | dict(self.steady)
 
     @classmethod
@@ -297,7 +300,7 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
         steadiness = reset_steady_time(steadiness, turn_completed)
         has_settled = (phase == 1) & is_steady(parameters, steadiness)
         phase = torch.where(
-            turn_completed, parameters["after"], torch.where(has_settled, 2.0, phase)
+            turn_completed, parameters["phase_after_turn"], torch.where(has_settled, 2.0, phase)
         )
         steer = torch.where(is_steering & (phase == 0), parameters["steer"], 0.0)
         return (
@@ -581,7 +584,11 @@ class VerticalZigzag(ClosedLoopManoeuvre):
 
     def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
         first_sign = -1.0 if self.dive < 0 else 1.0
-        dive_parameters = {"dive": abs(self.dive), "first": first_sign, "bound": self.depth}
+        dive_parameters = {
+            "dive": abs(self.dive),
+            "first_sign": first_sign,
+            "reversal_depth": self.depth,
+        }
         return super().law_parameters(helm) | dive_parameters
 
     @classmethod
@@ -589,7 +596,7 @@ class VerticalZigzag(ClosedLoopManoeuvre):
         """Return the sign of the first dive and the current depth, [B, 2]."""
         import torch
 
-        return torch.stack((parameters["first"], motion["z"]), dim=-1)
+        return torch.stack((parameters["first_sign"], motion["z"]), dim=-1)
 
     @classmethod
     def step_law(
@@ -600,7 +607,9 @@ class VerticalZigzag(ClosedLoopManoeuvre):
 
         dive_sign, origin = memory.unbind(-1)
         dive_sign = torch.where(
-            dive_sign * (motion["z"] - origin) >= parameters["bound"], -dive_sign, dive_sign
+            dive_sign * (motion["z"] - origin) >= parameters["reversal_depth"],
+            -dive_sign,
+            dive_sign,
         )
         dive = torch.where(time >= parameters["start"], dive_sign * parameters["dive"], 0.0)
         zero_steer = torch.zeros_like(dive)

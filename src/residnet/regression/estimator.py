@@ -248,7 +248,7 @@ def require_finite(
         first_sample: number of the first sample of `values` in the whole record.
 
     Raises:
-        FitError: with the column and the first sample that is not finite.
+        FitError: if a value is not finite; the message names its column and sample.
     """
     is_invalid = ~torch.isfinite(values)
     if bool(is_invalid.any()):

@@ -75,7 +75,8 @@ def load_task(path: Path, overrides: Sequence[str] = ()) -> Task:
         overrides: `dotted.key=value`, in order; `~dotted.key` removes a key.
 
     Raises:
-        ConfigError: one line with file or override, key, error and the nearest valid name.
+        ConfigError: if the config is not valid; the message names file or override, key, error and
+            the nearest valid name.
     """
     task: Task = load_config(resolve_config_file(path), overrides, TaskConfig)
     return task

@@ -201,22 +201,22 @@ _SHORT_SAMPLES = 4
 
 
 def assert_true(condition: bool, message: str) -> None:
-    """Raise an error if a condition is false.
+    """Check a condition.
 
     Raises:
-        AssertionError: with the message.
+        AssertionError: if the condition is false.
     """
     if not condition:
         raise AssertionError(message)
 
 
 def assert_close(actual: Tensor, expected: Tensor, tolerance: float, message: str) -> None:
-    """Raise an error if two tensors differ by more than a relative tolerance.
+    """Check that two tensors agree within a relative tolerance.
 
     The largest difference is divided by one plus the largest expected magnitude.
 
     Raises:
-        AssertionError: with the message and the largest difference.
+        AssertionError: if they differ by more, with the largest difference.
     """
     assert_true(
         actual.shape == expected.shape, f"{message} (shapes {actual.shape}, {expected.shape})"
@@ -227,10 +227,10 @@ def assert_close(actual: Tensor, expected: Tensor, tolerance: float, message: st
 
 
 def assert_finite(values: Tensor, message: str) -> None:
-    """Raise an error if a tensor has infinite or NaN elements.
+    """Check that all elements of a tensor are finite.
 
     Raises:
-        AssertionError: with the message.
+        AssertionError: if an element is infinite or NaN.
     """
     assert_true(bool(torch.isfinite(values).all()), message)
 
@@ -274,7 +274,7 @@ def check_head(config: BaseHeadConfig, signals: SignalsConfig = EXAMPLE_SIGNALS)
         signals: signals of the example models, for example `ROLLING_SIGNALS` for models with roll.
 
     Raises:
-        AssertionError: one line with the violated contract.
+        AssertionError: if a contract is violated; the message names it in one line.
     """
     subject = f"head {get_kind(type(config))}"
     # an example model with this head, fitted and stored below
@@ -525,7 +525,7 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
             samples.
 
     Raises:
-        AssertionError: one line with the violated contract.
+        AssertionError: if a contract is violated; the message names it in one line.
     """
     subject = f"baseline {get_kind(type(config))}"
     training_samples = make_example_samples() if samples is None else samples
@@ -618,7 +618,7 @@ def check_vessel(name: str, time_step: float = 0.1) -> None:
         time_step: time step of the simulation in s.
 
     Raises:
-        AssertionError: one line with the violated contract.
+        AssertionError: if a contract is violated; the message names it in one line.
     """
     subject = f"vessel {name}"
     vessel = load_vessel(name)
@@ -671,7 +671,7 @@ def check_manoeuvre(
         duration: duration in s if the manoeuvre does not define it.
 
     Raises:
-        AssertionError: one line with the violated contract.
+        AssertionError: if a contract is violated; the message names it in one line.
     """
     subject = f"manoeuvre {get_kind(type(manoeuvre))}"
     reloaded = validate_config(manoeuvre.model_dump(mode="json"), ManoeuvreConfig, "written")
@@ -755,7 +755,7 @@ def check_reader(config: Config, file: Path) -> Log:
         file: a recording in the format of the reader.
 
     Raises:
-        AssertionError: one line with the violated contract.
+        AssertionError: if a contract is violated; the message names it in one line.
     """
     subject = f"reader {get_kind(type(config))}"
     reader: LogReader = getattr(config, "build")()  # noqa: B009  readers have no common base
@@ -833,7 +833,7 @@ def check_exporter(exporter: Exporter) -> None:
         exporter: the export format.
 
     Raises:
-        AssertionError: one line with the violated contract.
+        AssertionError: if a contract is violated; the message names it in one line.
     """
     subject = f"export format {exporter.name}"
     assert_true(
@@ -899,7 +899,7 @@ def check_bad_inputs(
         seed: random seed of the cases.
 
     Raises:
-        AssertionError: one line with the violated contract.
+        AssertionError: if a contract is violated; the message names it in one line.
     """
     subject = f"exported {spec.name}"
     guard = GuardedDynamics(model.float().eval(), spec)

@@ -225,7 +225,7 @@ class ChannelMap(Conversion):
         """Check the entry; see `Conversion.require_valid_channel`.
 
         Raises:
-            ValueError: also if degrees with minutes have another unit.
+            ValueError: if the entry is not possible, or degrees with minutes have another unit.
         """
         super().require_valid_channel(name)
         if self.is_angle and canonical_unit(self.unit) != "deg":
