@@ -239,7 +239,7 @@ def compute_robust_score_sums(
         whitening_matrices: matrix [n, n] of each division.
         prior_precision: prior precision of the sizes of the changes [C, C].
     """
-    sums_by_look = []
+    sums_by_division = []
     n_innovations = 0
     for (innovation, effects), whitening_matrix in zip(
         innovations_and_effects, whitening_matrices, strict=True
@@ -252,7 +252,7 @@ def compute_robust_score_sums(
         whitened_effects = (
             effects.reshape(n_windows, n_changes, -1, block_size) @ whitening_matrix.T
         ).reshape(effects.shape)
-        sums_by_look.append(
+        sums_by_division.append(
             (
                 np.einsum("bqn,bn->bq", whitened_effects, whitened_innovations),
                 whitened_effects @ whitened_effects.swapaxes(1, 2),
@@ -260,13 +260,13 @@ def compute_robust_score_sums(
             )
         )
         n_innovations += n_values
-    scores, informations, squares = zip(*sums_by_look, strict=True)
+    scores, informations, squares = zip(*sums_by_division, strict=True)
     score = np.sum(scores, axis=0)
     information = np.sum(informations, axis=0)
     # the most plausible sizes for each window alone; the rest of the square is unexplained
     estimated_sizes = np.linalg.solve(information + prior_precision, score[..., None])[..., 0]
     unexplained_squares = np.sum(
-        [squares_of_look.sum(axis=1) for squares_of_look in squares], axis=0
+        [division_squares.sum(axis=1) for division_squares in squares], axis=0
     ) - (score * estimated_sizes).sum(axis=1)
     window_weights = 1.0 / np.maximum(unexplained_squares / n_innovations, 1.0)
     return ScoreSums(

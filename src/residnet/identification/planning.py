@@ -292,28 +292,28 @@ class TrialPlan:
 
 def plan_trials(
     fitted_model: FittedModel,
-    unidentified: RefitUncertainty,
+    refit_uncertainty: RefitUncertainty,
     refit_config: RefitConfig,
     state_scales_array: np.ndarray,
     input_shares: Mapping[str, InputShare],
     velocity_limits: np.ndarray,
     trial_limits: TrialLimits,
-    goal_manoeuvres: PredictionGoal | None = None,
+    prediction_goal: PredictionGoal | None = None,
 ) -> TrialPlan:
     """Return the trials that reduce the prediction intervals most per minute.
 
-    Predictions are the velocities over the manoeuvres of `goal_manoeuvres`. Trials are selected
+    Predictions are the velocities over the manoeuvres of `prediction_goal`. Trials are selected
     greedily, each given the previous ones.
 
     Args:
         fitted_model: model with a refitted baseline.
-        unidentified: uncertainty of the refitted parameters.
+        refit_uncertainty: uncertainty of the refitted parameters.
         refit_config: settings of the refit, whose horizon and correlation time are used.
         state_scales_array: scales of the velocities [n].
         input_shares: shares of the inputs in drive and steer.
         velocity_limits: velocities [n] above which a simulation has diverged.
         trial_limits: limits and number of the trials.
-        goal_manoeuvres: manoeuvres to predict; None for all candidates.
+        prediction_goal: manoeuvres to predict; None for all candidates.
 
     Raises:
         DataError: if no candidate is within the limits, or all parameters are determined.
@@ -347,17 +347,17 @@ def plan_trials(
     )
     # Errors of successive samples are correlated over `correlation` seconds: a sample counts as
     # dt / correlation independent ones. Information is in units of the residual variance.
-    information_per_gram = spec.dt / refit_config.correlation / max(unidentified.square, 1e-12)
+    information_per_gram = spec.dt / refit_config.correlation / max(refit_uncertainty.square, 1e-12)
     goal_weights = grams.sum(dim=0)
-    if goal_manoeuvres is not None:
+    if prediction_goal is not None:
         goal_trajectories = [
             _to_trajectory(item, spec.signals)
-            for item in _simulate_manoeuvres(fitted_model, input_shares, goal_manoeuvres)
+            for item in _simulate_manoeuvres(fitted_model, input_shares, prediction_goal)
         ]
         goal_weights = sensitivity_information(model, goal_trajectories, horizon, state_scales).sum(
             dim=0
         )
-    initial_uncertainty = compute_expected_uncertainty(unidentified.covariance, goal_weights)
+    initial_uncertainty = compute_expected_uncertainty(refit_uncertainty.covariance, goal_weights)
     if not (np.isfinite(initial_uncertainty) and initial_uncertainty > 0.0):
         raise DataError(
             f"model {fitted_model.name}: its refit leaves no uncertainty in the manoeuvres to"
@@ -369,12 +369,12 @@ def plan_trials(
         duration_minutes = (len(states) - 1) * spec.dt / 60.0
         information = information_per_gram * gram
         volume_gain_per_minute = (
-            compute_volume_gain(unidentified.covariance, information) / duration_minutes
+            compute_volume_gain(refit_uncertainty.covariance, information) / duration_minutes
         )
         uncertainty_reduction = (
             1.0
             - compute_expected_uncertainty(
-                update_covariance(unidentified.covariance, information), goal_weights
+                update_covariance(refit_uncertainty.covariance, information), goal_weights
             )
             / initial_uncertainty
         )
@@ -390,7 +390,7 @@ def plan_trials(
         )
     trials.sort(key=lambda trial: -trial.uncertainty_reduction / trial.duration_minutes)
     selected_trials: list[CandidateTrial] = []
-    current_covariance = unidentified.covariance
+    current_covariance = refit_uncertainty.covariance
     for _ in range(min(trial_limits.count, len(trials))):
         current_uncertainty = compute_expected_uncertainty(current_covariance, goal_weights)
 
@@ -418,7 +418,7 @@ def plan_trials(
         selected_trials,
         1.0
         - compute_expected_uncertainty(
-            update_covariance(unidentified.covariance, total_information), goal_weights
+            update_covariance(refit_uncertainty.covariance, total_information), goal_weights
         )
         / initial_uncertainty,
     )
@@ -427,7 +427,7 @@ def plan_trials(
 def _simulate_manoeuvres(
     fitted_model: FittedModel,
     input_shares: Mapping[str, InputShare],
-    goal_manoeuvres: PredictionGoal,
+    prediction_goal: PredictionGoal,
 ) -> list[ManoeuvreRun]:
     """Simulate the manoeuvres whose prediction is to be improved, with the fitted model."""
     spec = fitted_model.spec
@@ -437,7 +437,7 @@ def _simulate_manoeuvres(
     initial_state = actuated.make_initial_state(1)
     # trials start at the middle of the training range of the speed, where the model is reliable
     initial_state[:, SURGE] = 0.5 * (max(spec.low[0], 0.0) + spec.high[0])
-    for name, value in goal_manoeuvres.initial.items():
+    for name, value in prediction_goal.initial.items():
         initial_state[:, actuated.state_names.index(name)] = float(value)
     vessel = SimulatedVessel(
         fitted_model.name,
@@ -448,7 +448,7 @@ def _simulate_manoeuvres(
     )
     environment = TrialEnvironment(None, DisturbanceConfig(), SensorsConfig(), 0)
     return simulate_manoeuvres(
-        vessel, list(goal_manoeuvres.manoeuvres), environment, goal_manoeuvres.duration, spec.dt
+        vessel, list(prediction_goal.manoeuvres), environment, prediction_goal.duration, spec.dt
     )
 
 
