@@ -347,7 +347,9 @@ def plan_trials(
     )
     # Errors of successive samples are correlated over `correlation` seconds: a sample counts as
     # dt / correlation independent ones. Information is in units of the residual variance.
-    information_per_gram = spec.dt / refit_config.correlation / max(refit_uncertainty.square, 1e-12)
+    information_per_gram = (
+        spec.dt / refit_config.correlation / max(refit_uncertainty.mean_square_error, 1e-12)
+    )
     goal_weights = grams.sum(dim=0)
     if prediction_goal is not None:
         goal_trajectories = [

@@ -118,14 +118,14 @@ class Mirror:
     """Reflection of states [..., 3 + n] and inputs [..., m] in the centre plane of the vessel.
 
     Attributes:
-        state: sign of each state [3 + n].
-        index: input column that replaces each input [m].
-        sign: sign of this column [m].
+        state_signs: sign of each state [3 + n].
+        input_columns: column that replaces each input [m].
+        input_signs: sign of this column [m].
     """
 
-    state: Tensor
-    index: Tensor
-    sign: Tensor
+    state_signs: Tensor
+    input_columns: Tensor
+    input_signs: Tensor
 
     @classmethod
     def from_signals(cls, signals: Signals) -> Mirror | None:
@@ -134,19 +134,21 @@ class Mirror:
         if reflection is None:
             return None
         n = signals.n_dof
-        index, sign = (part[n : n + signals.n_inputs] for part in reflection)
-        index = [place - n for place in index]
+        # inputs follow the velocities among the channels
+        columns, signs = (part[n : n + signals.n_inputs] for part in reflection)
+        columns = [channel - n for channel in columns]
         if signals.has_wind:
             # the direction of an earth-fixed wind changes its sign as a heading does
-            index = [*index, signals.speed_column, signals.direction_column]
-            sign = [*sign, 1.0, -1.0]
+            columns = [*columns, signals.speed_column, signals.direction_column]
+            signs = [*signs, 1.0, -1.0]
+            # in the order of the input columns
             order = [*range(signals.n_inputs), signals.speed_column, signals.direction_column]
-            index = [index[order.index(place)] for place in range(len(order))]
-            sign = [sign[order.index(place)] for place in range(len(order))]
+            columns = [columns[order.index(column)] for column in range(len(order))]
+            signs = [signs[order.index(column)] for column in range(len(order))]
         return cls(
             torch.tensor([1.0, -1.0, -1.0, *map(float, get_axis_parities(signals.names))]),
-            torch.tensor(index, dtype=torch.long),
-            torch.tensor(sign),
+            torch.tensor(columns, dtype=torch.long),
+            torch.tensor(signs),
         )
 
     def mirror_alternate(self, windows: WindowBatch) -> WindowBatch:
@@ -156,16 +158,16 @@ class Mirror:
         def mirror_rows(values: Tensor, mirrored: Tensor) -> Tensor:
             return torch.where(rows[:, None, None], mirrored, values)
 
-        state = self.state.to(windows.y)
-        sign = self.sign.to(windows.w)
+        state_signs = self.state_signs.to(windows.y)
+        input_signs = self.input_signs.to(windows.w)
         return windows._replace(
             **{
-                name: mirror_rows(values, values * state)
+                name: mirror_rows(values, values * state_signs)
                 for name in ("y", "smoothed", "past_y")
                 if (values := getattr(windows, name)) is not None
             },
             **{
-                name: mirror_rows(values, values[..., self.index] * sign)
+                name: mirror_rows(values, values[..., self.input_columns] * input_signs)
                 for name in ("w", "past_w")
                 if (values := getattr(windows, name)) is not None
             },
@@ -193,7 +195,7 @@ class HeadTraining(EpochTraining):
         self.validate = validate
         self.stages = config.windows(model.dt)
         self.rank = 0
-        self.world = 1
+        self.world_size = 1
         self.mirror = Mirror.from_signals(model.signals) if config.mirror else None
 
     def data(self, store: WindowStore) -> WindowsDataModule:
@@ -245,7 +247,7 @@ class HeadTraining(EpochTraining):
         super().on_fit_start()
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             self.rank = self.global_rank
-            self.world = torch.distributed.get_world_size()
+            self.world_size = torch.distributed.get_world_size()
         self.scales = self.scales.to(self.device)
 
     def on_train_epoch_start(self) -> None:
@@ -264,13 +266,14 @@ class HeadTraining(EpochTraining):
 
     def process_mean(self, value: Tensor) -> Tensor:
         """Return the mean of a value over all processes of the training."""
-        if self.world == 1:
+        if self.world_size == 1:
             return value
         total = value.detach().clone()
         torch.distributed.all_reduce(total)
-        return total / self.world
+        return total / self.world_size
 
     def _one_step(self, windows: Sequence[WindowBatch]) -> Tensor:
+        """Return the loss of one-step accelerations along windows."""
         precomputed = torch.cat([batch.precomputed for batch in windows])
         trainable = torch.cat([batch.trainable for batch in windows])
         n_elapsed = torch.cat([batch.n_elapsed for batch in windows])
@@ -297,7 +300,8 @@ class HeadTraining(EpochTraining):
             memories.append(self.model.warmup(part.past_y, part.past_w))
             x0 = part.smoothed[:, 0]
             if number == 1:
-                # as a free run from a segment start, which has no smoothed state, only this mean
+                # windows at the start of a segment begin like a free run there, for which no
+                # smoothed state is known, only this mean
                 mean = all_but_pose(part.past_y).mean(1)
                 x0 = torch.cat((pose(x0), mean), dim=1)
             initial_states.append(x0)
@@ -354,7 +358,7 @@ class HeadTraining(EpochTraining):
             windows.batch_size - windows.n_segment_start_windows,
             windows.n_segment_start_windows,
         ]
-        return torch.cat([part[self.rank :: self.world] for part in noise.split(sizes)])
+        return torch.cat([part[self.rank :: self.world_size] for part in noise.split(sizes)])
 
     def _free_run(self) -> FreeRun:
         """Return the compiled free run of the model."""

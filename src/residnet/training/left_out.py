@@ -33,11 +33,11 @@ class RefitUncertainty(NamedTuple):
 
     Attributes:
         covariance: covariance of the free parameters [P, P].
-        square: mean square error of a channel of the free runs, in units of the scales.
+        mean_square_error: mean square error of a channel of the free runs, in units of the scales.
     """
 
     covariance: Tensor
-    square: float
+    mean_square_error: float
 
 
 def estimate_refit_covariance(
