@@ -220,6 +220,7 @@ class PolicyFit(EpochTraining):
         nominal_rows = slice(n_quiet // 2, n_quiet // 2 + n_quiet // 4)
         excess = torch.cat((excess[: nominal_rows.start], excess[nominal_rows.stop :]))
         largest_excess = excess.topk(math.ceil(n_quiet / 4)).values.mean()
+        # `calm` is the penalty per deg^2 of variance
         cost: Tensor = math.degrees(math.degrees(settings.calm)) * largest_excess
         if nominal_rows.stop > nominal_rows.start:
             cost = (

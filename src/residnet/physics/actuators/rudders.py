@@ -155,7 +155,8 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
 
     Commands are cmd_delta [rad] and cmd_thrust [N]; delta [rad] is a state if the rudder has
     dynamics. Y = -L, K = z L, N = -x L, X = T - D, where delta > 0 turns to starboard (Gouletas
-    2020, eqs. (5.26)-(5.29), where two signs are wrong: G9, G10 in docs/documents/corrections.md).
+    2020, eqs. (5.26)-(5.29), where two signs are wrong, see G9 and G10 in
+    docs/documents/corrections.md).
 
     Attributes:
         x: longitudinal position of the centre of pressure of the rudders in m, negative aft of the
@@ -210,8 +211,8 @@ class FoilRuddersConfig(SternRuddersConfig):
     """Rudders modelled as foils, with a correction for the slipstream of the propellers.
 
     Gouletas 2020, eqs. (5.20)-(5.25), without its misprints (see G8 and G11 in
-    docs/documents/corrections.md). The drag at zero angle is
-    part of the calm-water resistance of the hull.
+    docs/documents/corrections.md). The drag at zero angle is part of the calm-water resistance of
+    the hull.
 
     Attributes:
         rudders: number of rudders with equal lift.
