@@ -31,6 +31,7 @@ FallbackCommand = Literal["hold", "amidships"]
 COURSE_MEASUREMENTS = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
 """Measurements of a course policy: north, east, heading, surge and sway velocity, yaw rate."""
 PARITY_STEPS = 1000
+"""Number of steps over which an exported controller is compared with the original."""
 PARITY_TOLERANCE = 1e-4
 """Largest difference between exported and original commands as a fraction of the rudder limit.
 

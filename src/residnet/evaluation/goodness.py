@@ -28,12 +28,14 @@ from residnet.evaluation.records import (
 from residnet.preprocessing.prepare import PreparedLog
 
 _COMMAND_TOLERANCE = 0.05
-_START_TOLERANCE = 0.25
-_SEARCH_INTERVAL = 0.5
-"""Largest differences of repeated runs: of commands relative to their range, and of the initial
-velocities in scales; and the interval in s of the tried starts. Smaller values would leave few
-pairs.
+"""Largest difference of the commands of repeated runs, relative to their range.
+
+A smaller value, and one of the next two constants, would leave few pairs.
 """
+_START_TOLERANCE = 0.25
+"""Largest difference of the initial velocities of repeated runs, in scales."""
+_SEARCH_INTERVAL = 0.5
+"""Interval in s of the starts that are tried."""
 
 
 @dataclass(frozen=True)

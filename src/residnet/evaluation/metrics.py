@@ -47,12 +47,15 @@ CONFIDENCE_LEVEL = 0.95
 _N_RESAMPLES = 10_000
 """Number of bootstrap resamples; the 2.5 % tail then contains 250."""
 MIN_LOGS_AS_BLOCKS = 5
-TARGET_BLOCKS = 8
-_MIN_BLOCKS = 5
-"""Logs from which each log is a block; target and smallest number of blocks for fewer logs.
+"""Number of logs from which each log is a block.
 
-Chosen by hand: fewer blocks estimate the variance poorly, and smaller ones are correlated.
+Chosen by hand like the next two constants: fewer blocks estimate the variance poorly, and smaller
+ones are correlated.
 """
+TARGET_BLOCKS = 8
+"""Number of blocks at which the division of fewer logs aims."""
+_MIN_BLOCKS = 5
+"""Smallest number of blocks for an interval."""
 
 
 @dataclass(frozen=True)
@@ -242,9 +245,11 @@ def paired_difference(
 SCHEMA: Final = "residnet.metrics/1"
 LIMITS_SCHEMA: Final = "residnet.limits/1"
 _N_WORST_WINDOWS = 3
+"""Number of reported worst windows of a model."""
 _N_SPEED_CLASSES = 3
+"""Number of classes of speed, and of wind speed."""
 _MIN_CLASS_WINDOWS = 3
-"""Number of reported worst windows, of speed classes, and of windows required per class."""
+"""Smallest number of windows of a reported class."""
 _WIND_CHANNEL = "wind_speed"
 _HORIZONS = (10.0, 30.0, 100.0)
 """Horizons in s of the reported pose errors."""
@@ -533,9 +538,8 @@ class ProtocolEvaluation:
         for quantity, values in values_by_quantity.items():
             if not np.isfinite(values).all():
                 continue
-            # `searchsorted` keeps windows with equal values in one class
             # quantiles of the windows instead of equal ranges, so that each class has enough
-            # windows
+            # windows; `searchsorted` keeps windows with equal values in one class
             class_limits = np.quantile(values, np.arange(1, _N_SPEED_CLASSES) / _N_SPEED_CLASSES)
             class_indices = np.searchsorted(class_limits, values, side="left")
             class_masks = [

@@ -55,22 +55,31 @@ _MAX_ASYMMETRY = 0.1
 _LONG_RUN_DURATION = 300.0
 """Shortest run in s with constant inputs; a disturbance that counts doubles within it."""
 _MEMORY_SETTLING_TIME = 10.0
+"""Time in s in constant states after which the memory of a head counts as settled."""
 _STEADY_TOLERANCE = 1e-4
+"""Change of the velocities, relative to their limits, below which a free run counts as steady."""
 _SPEED_FRACTIONS = (0.0, 0.25, 0.5, 0.67, 1.0, 1.5)
-_CRUISE_FRACTION = 0.67
 """Speeds of straight running, relative to the largest training speed."""
+_CRUISE_FRACTION = 0.67
+"""Speed among these that is called cruise."""
 _MAX_CORNERS = 64
 """Largest number of corners of the input ranges: all corners of up to six inputs."""
 _CONSTANT_INPUT_TOLERANCE = 0.02
+"""Tolerance of a constant input relative to its range."""
 _MIN_CONSTANT_DURATION = 5.0
-"""Tolerance of a constant input relative to its range, and shortest duration in s."""
+"""Shortest duration in s of a run with constant inputs."""
 _MIN_MODEL_GROWTH = 20.0
+"""Growth of a disturbance of the model in a steady run from which the run contradicts it."""
 _MAX_MEASURED_GROWTH = 3.0
+"""Growth of the measured deviation below which a run is steady."""
 _MIN_MEASURED_DECAY = 3.0
+"""Decay of the initial deviation above which a run shows that the vessel is stable."""
 _MAX_STEADY_RUNS = 20
+"""Number of steady runs that are checked."""
 _SETTLING_SHARE = 0.25
-"""Number of steady runs that are checked, and the initial share of each for the settling."""
+"""Initial share of a steady run in which the motion settles."""
 _DISTURBANCE_SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
+"""Signs of the initial disturbances of sway and yaw."""
 
 
 @dataclass(frozen=True)

@@ -97,11 +97,12 @@ _MIN_WINDOWS = 5
 MIN_LOGS_FOR_INTERVAL = 3
 """Smallest number of logs for an interval, and therefore for a rating."""
 _MAX_DISTANCE_SHARE = 0.10
+"""Largest position error of a good model, as a share of the distance travelled."""
 _MAX_ANGLE_ERROR = math.radians(10.0)
-"""Largest errors of a good model: share of the distance travelled, and heading error in rad.
+"""Largest heading error of a good model in rad.
 
-They apply to the upper limit of the prediction interval; twice the noise floor is allowed in any
-case. The values are a convention of residnet, and the verdict states them.
+Both limits apply to the upper limit of the prediction interval; twice the noise floor is allowed in
+any case. The values are a convention of residnet, and the verdict states them.
 """
 _POSE_ERROR_SUFFIXES = {"depth": " of depth", "attitude": " of attitude"}
 """Suffixes of pose errors other than horizontal position and heading."""

@@ -42,8 +42,9 @@ from residnet.evaluation.assessment import Assessment
 
 NumberArray = npt.NDArray[Any]
 SINGLE_TOLERANCE = 1e-5
+"""Largest difference in single precision, relative to the range of a channel."""
 DOUBLE_TOLERANCE = 1e-12
-"""Largest difference in each precision, relative to the range of a channel."""
+"""Largest difference in double precision, relative to the range of a channel."""
 Attempt = TypeVar("Attempt")
 
 

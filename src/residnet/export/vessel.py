@@ -40,10 +40,10 @@ PAST_STEPS = 50
 _SWEEP_SHARES = (0.8, 0.4, 0.2)
 """Shares of the training range over which all inputs are swept together, tried in this order."""
 _N_TRACKS = 16
-_STEPS_PER_INPUT = 20
-"""Number of tracks with jumping inputs, and steps between jumps; eight tracks were found too few
-to find growing rounding errors.
+"""Number of tracks with jumping inputs; eight were found too few to find growing rounding errors.
 """
+_STEPS_PER_INPUT = 20
+"""Number of steps between jumps of the inputs."""
 _FRAME_TEXT = (
     "NED; body axes x forward, y starboard, z down; psi unwrapped, clockwise from north; wind_dir"
     " is where the wind comes from"

@@ -645,8 +645,9 @@ _MAX_HEADING_INNOVATION = 2.0 * np.pi
 _MAX_DIVERGED_SHARE = 0.5
 """Largest share of clean windows with a diverged free run."""
 _CURRENT_STD = 0.5
+"""Prior standard deviation of a current in m/s."""
 _PUSH_STD = 0.05
-"""Prior standard deviations of a current in m/s and of a push by the wind in m/s^2."""
+"""Prior standard deviation of the acceleration by the wind in m/s^2."""
 
 
 class MonitorConfig(Config):

@@ -21,8 +21,9 @@ from residnet.training.config import TrainingConfig
 _BATCH_PER_NETWORK = 32
 """Windows in a batch for each network of an ensemble."""
 _BATCHES_PER_EPOCH = 15
+"""Batches in each of twenty epochs of an ensemble, for short logs."""
 _BATCHES_PER_EPOCH_LONG = 40
-"""Batches in each of twenty epochs of an ensemble, for short logs and for long ones."""
+"""Batches in each of twenty epochs of an ensemble, for long logs."""
 
 
 def resolve_training(
@@ -91,9 +92,11 @@ def _schedule_coarse_ensemble(
 _VISITS_PER_SAMPLE = 100
 """How often the teacher-forced stage visits each training sample, within the limits below."""
 _MIN_BATCHES = 400
+"""Smallest number of batches of the teacher-forced stage; with fewer the optimiser has not
+converged.
+"""
 _MAX_BATCHES = 1_600
-"""Limits of the number of batches of the teacher-forced stage: with fewer the optimiser has not
-converged, and more take longer than a minute."""
+"""Largest number of batches of the teacher-forced stage; more take longer than a minute."""
 _ONE_STEP_EPOCHS = 10
 """Number of validations in the teacher-forced stage."""
 _WINDOW_SAMPLES = 32
@@ -101,6 +104,7 @@ _WINDOW_SAMPLES = 32
 _MAX_WASHOUT_SAMPLES = 32
 """Largest number of samples that fill the memory at the start of a teacher-forced window."""
 _ONE_STEP_BATCH = 64
+"""Windows in a batch of the teacher-forced stage."""
 _FREE_RUN_STAGES = (
     # samples of a rollout, epochs, batch, learning rate at the beginning, final share of it
     (40, 2, 64, 1e-3, 0.9),

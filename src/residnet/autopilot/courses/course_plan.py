@@ -156,6 +156,7 @@ _SIMPLIFY_MISS_TOLERANCE = 0.1
 _REPAIR_STEP = 0.1
 """Trust radius of z for the final correction of a converged course."""
 _MIN_TURN_ANGLE = math.radians(1.5)
+"""Angle in rad below which a turn of an outline is removed."""
 _MIN_LEG_LENGTH = 0.3
 """Length in turning radii below which a leg between turns to the same side may be removed."""
 

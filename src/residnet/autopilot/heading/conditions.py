@@ -54,8 +54,9 @@ class DepthStepConfig(Config):
 
 
 _DEPTH_UNIT = 0.1
-_DEGREE = math.pi / 180.0
 """Depth in m that is weighted like one degree of heading; the ratio of the default bands."""
+_DEGREE = math.pi / 180.0
+"""One degree in rad."""
 
 
 class ConditionsConfig(Config):

@@ -14,9 +14,11 @@ from residnet.core.errors import FitError
 
 Array = NDArray[np.float64]
 _N_TIMES = 20
+"""Number of values of T in the coarse grid search."""
 _N_DELAYS = 8
+"""Number of delays in the coarse grid search."""
 _N_RATES = 10
-"""Numbers of values of T, delay and rudder rate in the coarse grid search."""
+"""Number of rudder rates in the coarse grid search."""
 _MAX_COARSE_SAMPLES = 4000
 """Largest number of samples of a manoeuvre in the coarse search."""
 _RUDDER_RATE_RANGE = (math.radians(1.0), math.radians(40.0))
