@@ -17,6 +17,7 @@ import numpy as np
 from residnet.core.format import (
     DASH,
     DEGREES_PER_RADIAN,
+    DisplayUnit,
     display_unit,
     format_count,
     format_fixed,
@@ -346,11 +347,13 @@ def trial_figures(trials_by_craft: Mapping[str, Sequence[ManoeuvreRun]]) -> Iter
     channels += [name for name in present if name.startswith("cmd_")]
     channels = channels[:_MAX_PANELS]
     units = {name: display_unit(log.units[name]) for log in logs for name in log.channels}
-    units |= {name: ("rpm", 60.0) for log in logs for name in log.units if log.units[name] == "1/s"}
+    rpm = DisplayUnit("rpm", 60.0)
+    units |= {name: rpm for log in logs for name in log.units if log.units[name] == "1/s"}
     panels = [Panel("north [m]", "east [m]", kind="map", height=380)]
     panels += [
         Panel(
-            f"{_CHANNEL_TITLES.get(name, name)} [{units[name][0]}]".replace("\n ", "\n"), height=145
+            f"{_CHANNEL_TITLES.get(name, name)} [{units[name].name}]".replace("\n ", "\n"),
+            height=145,
         )
         for name in channels
     ]
@@ -363,7 +366,7 @@ def trial_figures(trials_by_craft: Mapping[str, Sequence[ManoeuvreRun]]) -> Iter
             Case(
                 motion.name.replace("_", " "),
                 _trial_curves(
-                    list(trials_by_craft), group, {name: units[name][1] for name in channels}
+                    list(trials_by_craft), group, {name: units[name].factor for name in channels}
                 ),
                 f"{group[0].manoeuvre.kind.replace('_', ' ')}, {length:.0f} s",
                 group in static_groups,
