@@ -329,8 +329,8 @@ class HeadTraining(EpochTraining):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Run the model from measured states x0 [B, 3 + n], see `Rollout`.
 
-        The encoder of a head reads the measured states only, hence the compiled rollout from the
-        second state on is without it.
+        The encoder of a head reads measured states only; the compiled rollout begins at the second
+        state, without the encoder.
         """
         head = self.model.head
         if not isinstance(head, GRUEnsembleHead) or not head.has_encoder:
