@@ -296,6 +296,8 @@ READERS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
     "mat": (written_logs.mat5, ""),
     "hdf5": (written_logs.hdf5, "h5py"),
     "nmea": (written_recorders.nmea, "pynmea2"),
+    "nmea2000": (written_recorders.nmea2000, "nmea2000"),
+    "mavlink": (written_recorders.tlog, "pymavlink"),
     "moos": (written_recorders.moos, ""),
     "ulog": (written_recorders.ulog, "pyulog"),
     "ardupilot": (written_recorders.ardupilot, "pymavlink"),

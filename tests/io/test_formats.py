@@ -168,6 +168,7 @@ def test_a_missing_package_is_named_with_its_extra(
         (written_recorders.nmea, "NMEA 0183"),
         (written_recorders.ulog, "PX4 ULog"),
         (written_recorders.ardupilot, "ArduPilot log"),
+        (written_recorders.nmea2000, "NMEA 2000"),
     ],
 )
 def test_formats_by_content(write: Writer, name: str, tmp_path: Path) -> None:

@@ -78,6 +78,90 @@ def test_no_other_frame_is_tried_where_the_format_fixes_it(
     assert "standard_messages" not in residnet.draft_config(path).config["data"]["reader"]
 
 
+@pytest.mark.parametrize(
+    "notation", ["candump3", "candump2", "can_frame_ascii_raw", "n2k_ascii", "basic_string"]
+)
+def test_frames_of_nmea_2000_in_each_notation(notation: str, tmp_path: Path) -> None:
+    pytest.importorskip("nmea2000")
+    log = trial(20.0)
+    path = written_recorders.nmea2000(log, tmp_path, notation)
+    found = detect_recording_format(path)
+    assert found is not None
+    assert found.name == "NMEA 2000"
+    origin = {"latitude": f"{ORIGIN[0]} deg", "longitude": f"{ORIGIN[1]} deg"}
+    position = {"kind": "geodetic", "topic": "positionRapidUpdate", "origin": origin}
+    got = read(path, kind="nmea2000", position=position)
+    assert set(got.channels) == {"x", "y", "psi", "u", "v", "r", "delta", "n_port", "n_stbd"}
+    assert got.meta["start_utc"].startswith("2025-04-11T09:15:45")
+    np.testing.assert_allclose(got.t, log.t, atol=2e-3)
+    # 1e-7 deg are 11 mm, 1e-4 rad and 1 cm/s are the digits of directions and speeds; frames of
+    # one printed time follow each other by 0.25 ms, 1e-4 rad of a turn
+    tolerances = {"x": 0.012, "y": 0.012, "psi": 4e-4, "u": 0.011, "v": 0.011, "r": 1e-4}
+    for name, tolerance in tolerances.items():
+        np.testing.assert_allclose(got[name][1:], log[name][1:], atol=tolerance, err_msg=name)
+    expected = 0.1 * np.sin(0.3 * log.t)
+    np.testing.assert_allclose(got["delta"][1:], expected[1:], atol=2e-4)
+    for side in ("port", "stbd"):
+        steady = np.isfinite(got[f"n_{side}"])
+        assert steady.mean() > 0.9
+        assert np.median(np.abs(got[f"n_{side}"] - np.abs(log[f"cmd_{side}"]))[steady]) < 1e-2
+
+
+def test_magnetic_headings_of_nmea_2000(tmp_path: Path) -> None:
+    pytest.importorskip("nmea2000")
+    log = trial(10.0)
+    path = written_recorders.nmea2000(log, tmp_path, variation_deg=-12.4)
+    got = read(path, kind="nmea2000")
+    for name, tolerance in {"psi": 4e-4, "u": 0.011, "v": 0.011}.items():
+        np.testing.assert_allclose(got[name][1:], log[name][1:], atol=tolerance, err_msg=name)
+    assert "magnetic_heading" in codes(got)
+    # without the variation the user has to set it
+    lines = [line for line in path.read_text().splitlines() if "09F11A" not in line]
+    path.write_text("\n".join(lines) + "\n")
+    (finding,) = [
+        finding
+        for finding in read(path, kind="nmea2000").meta["findings"]
+        if finding["code"] == "magnetic_heading" and "heading is" in finding["text"]
+    ]
+    assert finding["level"] == "will mislead"
+
+
+def test_damaged_files_of_nmea_2000(tmp_path: Path) -> None:
+    pytest.importorskip("nmea2000")
+    path = written_recorders.nmea2000(trial(5.0), tmp_path)
+    lines = path.read_text().splitlines()
+    lines[3] = lines[3][:40]
+    lines[9] = "(1744362945.2) can0 09F802"
+    lines.insert(7, "(1744362945.100000) can0 09FEFE03#0011")
+    path.write_text("\n".join(lines))
+    assert {"bad_lines", "unknown_groups"} <= codes(read(path, kind="nmea2000"))
+    path.write_text("\n".join(line.partition(" ")[2] for line in lines))
+    with pytest.raises(DataError, match="no line has a time: record with `candump -L`"):
+        read(path, kind="nmea2000")
+
+
+def test_telemetry_of_a_ground_station(tmp_path: Path) -> None:
+    pytest.importorskip("pymavlink")
+    log = trial(20.0)
+    path = written_recorders.tlog(log, tmp_path)
+    found = detect_recording_format(path)
+    assert found is not None
+    assert found.name == "MAVLink telemetry log"
+    origin = {"latitude": f"{ORIGIN[0]} deg", "longitude": f"{ORIGIN[1]} deg"}
+    position = {"kind": "geodetic", "topic": "GLOBAL_POSITION_INT", "origin": origin}
+    position |= {"latitude": "lat", "longitude": "lon"}
+    servo = {"topic": "SERVO_OUTPUT_RAW", "field": "servo1_raw", "unit": "us", "hold": True}
+    got = read(path, kind="mavlink", position=position, channels={"servo_1": servo})
+    assert {"x", "y", "psi", "u", "v", "r", "servo_1"} <= set(got.channels)
+    assert got.meta["start_utc"].startswith("2025-04-11T09:15:45")
+    # the autopilot's clock is even although messages arrive late
+    np.testing.assert_allclose(got.t, log.t, atol=2e-3)
+    for name, digits in {"x": 0.012, "y": 0.012, "psi": 1e-6, "r": 1e-6}.items():
+        np.testing.assert_allclose(got[name], log[name], atol=digits, err_msg=name)
+    for name in ("u", "v"):
+        np.testing.assert_allclose(got[name], log[name], atol=0.01, err_msg=name)
+
+
 def test_past_midnight(tmp_path: Path) -> None:
     path = tmp_path / "a.nmea"
     path.write_text(

@@ -4,6 +4,7 @@ struct.
 
 from __future__ import annotations
 
+import datetime
 import struct
 from functools import reduce
 from pathlib import Path
@@ -204,3 +205,117 @@ def _degrees(angle: float, width: int) -> str:
     """As NMEA writes it: degrees and minutes in one number."""
     whole = int(angle)
     return f"{whole:0{width}d}{(angle - whole) * 60:010.7f}"
+
+
+def tlog(log: Log, folder: Path) -> Path:
+    """A telemetry log of a ground station: fix, attitude and servos of a vehicle (system 1), and
+    heartbeats of the station.
+    """
+    from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+    vehicle = mavlink.MAVLink(None, srcSystem=1)
+    station = mavlink.MAVLink(None, srcSystem=255)
+    latitude, longitude = geodetic(log)
+    north, east = _over_ground(log)
+    rows: list[bytes] = []
+    for i, t in enumerate(log.t.tolist()):
+        boot_ms = BOOT // 1000 + round(1000 * t)
+        heading = float(log["psi"][i] + np.pi) % (2.0 * np.pi) - np.pi
+        messages = [
+            (
+                vehicle,
+                mavlink.MAVLink_attitude_message(
+                    boot_ms, 0.0, 0.0, heading, 0.0, 0.0, float(log["r"][i])
+                ),
+            ),
+            (
+                vehicle,
+                mavlink.MAVLink_global_position_int_message(
+                    boot_ms,
+                    round(1e7 * latitude[i]),
+                    round(1e7 * longitude[i]),
+                    0,
+                    0,
+                    round(100.0 * north[i]),
+                    round(100.0 * east[i]),
+                    0,
+                    65535,
+                ),
+            ),
+            (
+                vehicle,
+                mavlink.MAVLink_servo_output_raw_message(
+                    1000 * boot_ms % 2**32,
+                    0,
+                    *(round(1500 + 100 * log[name][i]) for name in ("cmd_port", "cmd_stbd")),
+                    *[0] * 6,
+                ),
+            ),
+            (station, mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)),
+        ]
+        # messages arrive 20 to 60 ms late
+        arrival = round((EPOCH + t) * 1e6) + 20_000 + 1_000 * (i * 17 % 41)
+        for sender, message in messages:
+            rows.append(struct.pack(">Q", arrival) + message.pack(sender))
+    path = folder / "trial.tlog"
+    path.write_bytes(b"".join(rows))
+    return path
+
+
+def nmea2000(
+    log: Log, folder: Path, notation: str = "candump3", variation_deg: float = 0.0
+) -> Path:
+    """NMEA 2000 frames as text: fix, heading, rate of turn, course and speed, rudder, two engines.
+
+    Args:
+        log: trial with cmd_port and cmd_stbd, which are written as the revolutions of two engines.
+        folder: folder of the file.
+        notation: notation of the package nmea2000.
+        variation_deg: magnetic variation; with one, heading and course are magnetic.
+    """
+    from nmea2000 import NMEA2000Field, NMEA2000Message, create_encoder
+
+    encoder = create_encoder(notation)
+    latitude, longitude = geodetic(log)
+    north, east = _over_ground(log)
+    reference = "Magnetic" if variation_deg else "True"
+    variation = np.radians(variation_deg)
+    start = datetime.datetime.fromtimestamp(EPOCH, tz=datetime.UTC).replace(tzinfo=None)
+    lines: list[str] = []
+    for i, t in enumerate(log.t.tolist()):
+        moment = start + datetime.timedelta(seconds=t)
+        course = float(np.arctan2(east[i], north[i]) - variation) % (2.0 * np.pi)
+        speed = float(np.hypot(north[i], east[i]))
+        heading = float(log["psi"][i] - variation) % (2.0 * np.pi)
+        groups = [
+            (129025, "positionRapidUpdate", {"latitude": latitude[i], "longitude": longitude[i]}),
+            (127250, "vesselHeading", {"heading": heading, "reference": reference}),
+            (127251, "rateOfTurn", {"rate": log["r"][i]}),
+            (129026, "cogSogRapidUpdate", {"cogReference": reference, "cog": course, "sog": speed}),
+            (127245, "rudder", {"instance": 0, "position": 0.1 * np.sin(0.3 * t)}),
+        ]
+        for side, number in (("port", 0), ("stbd", 1)):
+            revolutions = {"instance": number, "speed": 60.0 * abs(log[f"cmd_{side}"][i])}
+            groups.append((127488, "engineParametersRapidUpdate", revolutions))
+        if i % 10 == 0:
+            clock = {"date": moment.date(), "time": moment.time()}
+            groups.append((129029, "gnssPositionData", clock))
+            if variation_deg:
+                groups.append((127258, "magneticVariation", {"variation": variation}))
+        for group, name, values in groups:
+            fields = [NMEA2000Field(key, value=value) for key, value in values.items()]
+            message = NMEA2000Message(
+                PGN=group, id=name, fields=fields, source=3, destination=255, priority=2
+            )
+            message.timestamp = moment
+            encoded = encoder.encode(message)
+            frames = [encoded] if isinstance(encoded, str) else list(encoded)
+            if notation == "n2k_ascii":
+                # the package writes no times in this notation
+                frames = [f"A{moment:%H%M%S.%f}"[:11] + frame[11:] for frame in frames]
+            elif notation == "candump2":
+                frames = [f" ({moment.isoformat(sep=' ')})  {frame}" for frame in frames]
+            lines += frames
+    path = folder / "trial.log"
+    path.write_text("\n".join(lines) + "\n")
+    return path

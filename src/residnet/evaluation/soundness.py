@@ -190,11 +190,11 @@ def find_steady_runs(logs: Sequence[PreparedLog], dt: float) -> list[SteadyRun]:
         [inputs.min(0) for inputs in usable_inputs], 0
     )
     tolerance = _CONSTANT_INPUT_TOLERANCE * np.maximum(input_ranges, 1e-12)
+    # logs with steps of several seconds (AIS) would have segments without any sample
+    min_length = max(round(_MIN_CONSTANT_DURATION / dt), 2)
     runs = []
     for log in logs:
-        for run_start, run_end in _constant_input_runs(
-            log, tolerance, round(_MIN_CONSTANT_DURATION / dt)
-        ):
+        for run_start, run_end in _constant_input_runs(log, tolerance, min_length):
             settled_slice = slice(run_start + int(_SETTLING_SHARE * (run_end - run_start)), run_end)
             settled_states = log.smoothed[settled_slice]
             lateral_velocities = log.smoothed[settled_slice, LATERAL]

@@ -65,7 +65,11 @@ from residnet.io.readers.compose import extract_heading, extract_position
 from residnet.io.readers.detect import AutoConfig, detect_log_kind, suggest_conversion
 from residnet.io.readers.joined_files import group_trip_files
 from residnet.io.readers.manoeuvre_kinds import UNKNOWN, resolve_manoeuvre
-from residnet.io.readers.messages import extend_with_standard_messages, is_ned_format
+from residnet.io.readers.messages import (
+    KNOWN_COMMANDS,
+    extend_with_standard_messages,
+    is_ned_format,
+)
 from residnet.io.readers.quantities import (
     QUATERNION,
     AngleHeading,
@@ -173,6 +177,11 @@ def draft_recordings(
         *_find_actuator_fields(aligned, sources.used_fields, plan, draft_notes),
     ):
         if name in known_channels or name in channels:
+            continue
+        if (known := _known_command(aligned[0], topic, field)) is not None:
+            text = f"the format defines {field} in {known[1]}"
+            draft_notes.add_note((*CHANNELS_KEY, name), text)
+            channels[name] = {"topic": topic, "field": field, "unit": known[1], "hold": True}
             continue
         values = _concatenate_field(aligned, topic, field)
         scaling = guess_scaling(name, field, values) or infer_unit(name, field, values)
@@ -729,18 +738,33 @@ def _find_actuator_fields(
     fields_by_channel: dict[str, list[tuple[str, str]]] = {}
     for topic, series in recordings[0].series.items():
         for field in series.fields:
-            channel = match_input_channel(parse_name(f"{topic} {field}"))
+            known = _known_command(recordings[0], topic, field)
+            channel = known[0] if known else match_input_channel(parse_name(f"{topic} {field}"))
             if channel is None or channel in MOTION_CHANNELS or (topic, field) in used_fields:
                 continue
             values = _concatenate_field(recordings, topic, field)
             finite_values = values[np.isfinite(values)]
             if finite_values.size >= _MIN_INPUT_ROWS and float(np.ptp(finite_values)) > 0.0:
                 fields_by_channel.setdefault(channel, []).append((topic, field))
-    for channel, candidate_fields in fields_by_channel.items():
-        if channel in ("delta", "cmd_delta") and len({f for _, f in candidate_fields}) == 1:
+    followed_publisher = ""
+    # rudders first: the publisher that steers the vessel commands its propellers, too
+    for channel in sorted(fields_by_channel, key=lambda name: "delta" not in name):
+        candidate_fields = fields_by_channel[channel]
+        has_publishers = len({f for _, f in candidate_fields}) == 1 and len(candidate_fields) > 1
+        if has_publishers and channel in ("delta", "cmd_delta"):
             candidate_fields.sort(
                 key=_rank_publishers(channel, recordings[0], candidate_fields, plan, draft_notes)
             )
+            followed_publisher = _publisher(candidate_fields[0][0])
+        elif has_publishers and followed_publisher:
+            candidate_fields.sort(key=lambda entry: _publisher(entry[0]) != followed_publisher)
+            if _publisher(candidate_fields[0][0]) == followed_publisher:
+                text = (
+                    f"{candidate_fields[0][1]} is written by"
+                    f" {' and '.join(_publisher(topic) for topic, _ in candidate_fields)};"
+                    f" {followed_publisher} is taken, as for the rudder"
+                )
+                draft_notes.add_guess((*CHANNELS_KEY, channel), text)
         field_patterns = [(topic, re.sub(r"\d+", "#", field)) for topic, field in candidate_fields]
         numbered_fields = [
             topic_field
@@ -749,6 +773,18 @@ def _find_actuator_fields(
         ]
         for number, topic_field in enumerate(numbered_fields, 1):
             yield f"{channel}_{number}" if len(numbered_fields) > 1 else channel, topic_field
+
+
+def _known_command(recording: Recording, topic: str, field: str) -> tuple[str, str] | None:
+    """Return channel and unit of a command that the format of the recording defines, or None."""
+    series = recording.series.get(topic)
+    message_type = series.message_type.rsplit("/", 1)[-1] if series is not None else ""
+    return KNOWN_COMMANDS.get((message_type, field))
+
+
+def _publisher(topic: str) -> str:
+    """Return the first part of a topic's name: the source of MOOS, the namespace of ROS."""
+    return topic.strip("/").split("/", 1)[0]
 
 
 def _rank_publishers(

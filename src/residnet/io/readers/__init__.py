@@ -28,6 +28,8 @@ else:
                 "mat": "residnet.io.readers.formats.matlab_hdf5:MatConfig",
                 "hdf5": "residnet.io.readers.formats.matlab_hdf5:Hdf5Config",
                 "nmea": "residnet.io.readers.formats.nmea:NmeaConfig",
+                "nmea2000": "residnet.io.readers.formats.nmea2000:Nmea2000Config",
+                "mavlink": "residnet.io.readers.formats.mavlink:MavlinkConfig",
                 "moos": "residnet.io.readers.formats.moos:MoosConfig",
                 "ulog": "residnet.io.readers.formats.ulog:UlogConfig",
                 "ardupilot": "residnet.io.readers.formats.ardupilot:ArduPilotConfig",

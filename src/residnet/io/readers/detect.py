@@ -12,8 +12,10 @@ from residnet.io.readers.base import require_file
 from residnet.io.readers.compose import RecordingConfig
 from residnet.io.readers.formats.ardupilot import ArduPilotConfig
 from residnet.io.readers.formats.matlab_hdf5 import Hdf5Config, MatConfig
+from residnet.io.readers.formats.mavlink import MavlinkConfig
 from residnet.io.readers.formats.moos import MoosConfig
 from residnet.io.readers.formats.nmea import NmeaConfig
+from residnet.io.readers.formats.nmea2000 import Nmea2000Config
 from residnet.io.readers.formats.rosbag import RosbagConfig
 from residnet.io.readers.formats.topic_folder import TopicFolderConfig
 from residnet.io.readers.formats.ulog import UlogConfig
@@ -27,8 +29,10 @@ _RECORDING_CONFIGS: tuple[type[RecordingConfig], ...] = (
     TopicFolderConfig,
     UlogConfig,
     ArduPilotConfig,
+    MavlinkConfig,
     MoosConfig,
     NmeaConfig,
+    Nmea2000Config,
     MatConfig,
     Hdf5Config,
 )

@@ -1,4 +1,4 @@
-"""Automatic mapping of standard messages (ROS, PX4, ArduPilot, NMEA 0183, MOOS) to channels.
+"""Automatic mapping of standard messages (ROS, PX4, ArduPilot, MAVLink, NMEA, MOOS) to channels.
 
 Each entry of `MESSAGE_KINDS` defines a message by its types, or by its fields in sources without
 types, and its channels. If several messages have one channel, the first entry is used; of several
@@ -218,21 +218,62 @@ def _plan_canonical_fields(s: Series) -> ChannelPlan:
     return ChannelPlan(channels, position_source, heading)
 
 
-def _plan_revolutions(s: Series) -> ChannelPlan:
-    """Map the shaft speeds of NMEA RPM sentences, with one channel for each engine."""
-    if not s.has_field("speed"):
-        return ChannelPlan()
+def _map_instances(
+    s: Series, unit: str, field: str, channel: str, sides: dict[str, str], **settings: Any
+) -> dict[str, FieldMap]:
+    """Map a field with one channel for each device on board; devices are the senders of the rows.
+
+    Args:
+        s: series.
+        unit: unit of the field.
+        field: field; without a value there is no channel.
+        channel: name of the channel if there is one device; otherwise its prefix.
+        sides: device -> suffix of the channel; other devices have their number.
+        settings: further settings of the channel.
+    """
+    if not s.has_field(field) or not np.isfinite(s[field]).any():
+        return {}
     senders = [] if s.sender is None else sorted(set(s.sender.tolist()))
     if len(senders) < 2:
-        return ChannelPlan(_map_fields(s, "rpm", {"n": "speed"}))
-    # NMEA 0183: odd engine numbers are starboard, even ones port
-    channel_of_engine = {"1": "n_stbd", "2": "n_port"}
+        return _map_fields(s, unit, {channel: field}, **settings)
     channels: dict[str, FieldMap] = {}
     for sender in senders:
-        channels |= _map_fields(
-            s, "rpm", {channel_of_engine.get(sender, f"n_{sender}"): "speed"}, sender=sender
-        )
-    return ChannelPlan(channels)
+        if np.isfinite(s[field][s.sender == sender]).any():
+            name = f"{channel}_{sides.get(sender, sender)}"
+            channels |= _map_fields(s, unit, {name: field}, sender=sender, **settings)
+    return channels
+
+
+def _plan_revolutions(s: Series) -> ChannelPlan:
+    """Map the shaft speeds of NMEA RPM sentences, with one channel for each engine."""
+    # NMEA 0183: odd engine numbers are starboard, even ones port
+    return ChannelPlan(_map_instances(s, "rpm", "speed", "n", {"1": "stbd", "2": "port"}))
+
+
+_NMEA_2000_SIDES = {"0": "port", "1": "stbd"}
+"""Instance of an engine or a rudder -> side of a vessel with two (look-up ENGINE_INSTANCE)."""
+
+
+def _plan_nmea_2000_rudder(s: Series) -> ChannelPlan:
+    """Map the angles of rudders, and the ordered angles if the network has them."""
+    channels = _map_instances(s, "rad", "position", "delta", _NMEA_2000_SIDES)
+    ordered = _map_instances(s, "rad", "angleOrder", "cmd_delta", _NMEA_2000_SIDES, hold=True)
+    return ChannelPlan(channels | ordered)
+
+
+def _plan_nmea_2000_attitude(s: Series) -> ChannelPlan:
+    """Map roll and pitch; the yaw angle is the heading of networks without vesselHeading."""
+    fields = {"phi": "roll", "theta": "pitch"}
+    measured = {name: path for name, path in fields.items() if np.isfinite(s[path]).any()}
+    has_yaw = bool(np.isfinite(s["yaw"]).any())
+    heading = AngleHeading(topic=s.name, field="yaw") if has_yaw else None
+    return ChannelPlan(_map_fields(s, "rad", measured), None, heading)
+
+
+def _plan_nmea_2000_course(s: Series) -> ChannelPlan:
+    """Map course and speed over ground."""
+    source = CourseSpeedVelocity(topic=s.name, course="cogTrue", course_unit="rad", speed="sog")
+    return ChannelPlan({}, None, None, source)
 
 
 def _earth_fixed_velocity(s: Series, north: str, east: str) -> EarthFixedVelocity | None:
@@ -246,6 +287,24 @@ def _plan_px4_gps(s: Series) -> ChannelPlan:
     position_source = GeodeticPosition(topic=s.name, latitude=latitude, longitude=longitude)
     return ChannelPlan(
         {}, position_source, None, _earth_fixed_velocity(s, "vel_n_m_s", "vel_e_m_s")
+    )
+
+
+def _plan_mavlink_attitude(s: Series) -> ChannelPlan:
+    """Map the Euler angles and the body rates."""
+    angles = _map_fields(s, "rad", {"phi": "roll", "theta": "pitch"})
+    rates = _map_fields(s, "rad/s", {"r": "yawspeed", "p": "rollspeed", "q": "pitchspeed"})
+    return ChannelPlan(angles | rates, None, AngleHeading(topic=s.name, field="yaw"))
+
+
+def _plan_mavlink_position(s: Series) -> ChannelPlan:
+    """Map the fix, the heading and the earth-fixed velocity of the autopilot's filter."""
+    has_heading = bool(np.isfinite(s["hdg"]).any())
+    return ChannelPlan(
+        {},
+        GeodeticPosition(topic=s.name, latitude="lat", longitude="lon"),
+        AngleHeading(topic=s.name, field="hdg", unit="deg") if has_heading else None,
+        _earth_fixed_velocity(s, "vx", "vy"),
     )
 
 
@@ -302,6 +361,15 @@ def _make_field_plan(
         )
 
     return make_plan
+
+
+KNOWN_COMMANDS: dict[tuple[str, str], tuple[str, str]] = {
+    ("Variables", "DESIRED_THRUST"): ("cmd_throttle", "%"),
+    ("Variables", "DESIRED_THRUST_L"): ("cmd_throttle_port", "%"),
+    ("Variables", "DESIRED_THRUST_R"): ("cmd_throttle_stbd", "%"),
+}
+"""Message type without package and field of a command whose unit the format defines -> channel,
+unit. MOOS-IvP: thrust from -100 to 100 per cent (documentation of pMarinePID and uSimMarine)."""
 
 
 MESSAGE_KINDS = (
@@ -373,7 +441,9 @@ MESSAGE_KINDS = (
     ),
     MessageKind("Px4Gps", ("vehicle_gps_position", "sensor_gps"), _plan_px4_gps),
     MessageKind(
-        "ArduPilotFilter", ("XKF1", "NKF1"), _make_local_position_plan("PN", "PE", "PD", "VN", "VE")
+        "ArduPilotFilter",
+        ("XKF1", "NKF1", "EKF1"),
+        _make_local_position_plan("PN", "PE", "PD", "VN", "VE"),
     ),
     MessageKind(
         "ArduPilotAttitude",
@@ -385,6 +455,18 @@ MESSAGE_KINDS = (
         "ArduPilotGps",
         ("GPS",),
         _make_field_plan({}, fix_fields=("Lat", "Lng"), course_speed_fields=("GCrs", "Spd", "m/s")),
+    ),
+    MessageKind(
+        "MavlinkLocalPosition",
+        ("LOCAL_POSITION_NED",),
+        _make_local_position_plan("x", "y", "z", "vx", "vy"),
+    ),
+    MessageKind("MavlinkAttitude", ("ATTITUDE",), _plan_mavlink_attitude),
+    MessageKind("MavlinkPosition", ("GLOBAL_POSITION_INT",), _plan_mavlink_position),
+    MessageKind(
+        "MavlinkGps",
+        ("GPS_RAW_INT",),
+        _make_field_plan({}, fix_fields=("lat", "lon"), course_speed_fields=("cog", "vel", "m/s")),
     ),
     MessageKind(
         "NmeaFix",
@@ -407,6 +489,33 @@ MESSAGE_KINDS = (
         lambda s: ChannelPlan(_map_fields(s, "deg", {"delta": next(iter(s.fields))})),
     ),
     MessageKind("NmeaRevolutions", ("RPM",), _plan_revolutions),
+    MessageKind(
+        "Nmea2000Fix", ("positionRapidUpdate",), _make_field_plan({}, fix_fields=_FIX_FIELDS)
+    ),
+    MessageKind(
+        "Nmea2000SlowFix", ("gnssPositionData",), _make_field_plan({}, fix_fields=_FIX_FIELDS)
+    ),
+    MessageKind(
+        "Nmea2000Heading",
+        ("vesselHeading",),
+        lambda s: ChannelPlan({}, None, AngleHeading(topic=s.name, field="headingTrue")),
+    ),
+    MessageKind("Nmea2000RateOfTurn", ("rateOfTurn",), _make_field_plan({"r": "rate"}, "rad/s")),
+    MessageKind("Nmea2000Attitude", ("attitude",), _plan_nmea_2000_attitude),
+    MessageKind("Nmea2000Course", ("cogSogRapidUpdate",), _plan_nmea_2000_course),
+    MessageKind("Nmea2000Rudder", ("rudder",), _plan_nmea_2000_rudder),
+    MessageKind(
+        "Nmea2000Engine",
+        ("engineParametersRapidUpdate",),
+        lambda s: ChannelPlan(_map_instances(s, "rpm", "speed", "n", _NMEA_2000_SIDES)),
+    ),
+    MessageKind(
+        "Nmea2000ElectricDrive",
+        ("electricDriveStatusRapidUpdate",),
+        lambda s: ChannelPlan(
+            _map_instances(s, "rpm", "rotationalShaftSpeed", "n", _NMEA_2000_SIDES)
+        ),
+    ),
     MessageKind(
         "Joints", ("JointState",), _plan_joints, _ROS_CONVERSION, ("position.0", "effort.0")
     ),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import ClassVar, Literal, final
 
@@ -18,6 +18,7 @@ from residnet.io.readers.recording import ALL_FIELDS, FieldFilter, Recording, Se
 _VALUE_LINE = re.compile(
     rb"^\s*(?P<time>[-+\d.eE]+)\s+(?P<name>\S+)\s+(?P<source>\S+)\s+(?P<value>\S+)"
 )
+_MESSAGE_TYPE = "moos/Variables"
 _START_LINE = re.compile(rb"^%%\s*LOGSTART\s+(?P<start>\d+(?:\.\d+)?)")
 
 
@@ -26,9 +27,9 @@ class MoosConfig(RecordingConfig):
     """Reader of alog files from pLogger of MOOS-IvP.
 
     A series has the variables that one source (`uNav`) publishes at the same times, and the name of
-    the source. A variable with other times is a series with the name of the variable. NAV_X is
-    east, NAV_Y is north, and NAV_HEADING is in deg clockwise from north. Variables of text are
-    ignored.
+    the source. A variable with other times is a series with the name of the variable, or
+    `source/variable` if several sources publish it. NAV_X is east, NAV_Y is north, and NAV_HEADING
+    is in deg clockwise from north. Variables of text are ignored.
     """
 
     kind: Literal["moos"] = "moos"
@@ -71,6 +72,7 @@ class MoosConfig(RecordingConfig):
                 f"{path}: has no line with time, variable, source and number, a MOOS alog was"
                 " expected; leave the file out"
             )
+        n_sources = Counter(name for _, name in times)
         series: dict[str, Series] = {}
         for (source, name), clock in times.items():
             stamp = np.array(clock)
@@ -78,9 +80,11 @@ class MoosConfig(RecordingConfig):
             same_source = series.get(source)
             if same_source is None or np.array_equal(same_source.clock, stamp):
                 fields = {**(same_source.fields if same_source else {}), name: samples}
-                series[source] = Series(source, "moos/Variables", fields, stamp)
+                series[source] = Series(source, _MESSAGE_TYPE, fields, stamp)
             else:
-                series[name] = Series(name, "moos/Variables", {name: samples}, stamp)
+                # variables of several publishers must not replace each other
+                topic = name if n_sources[name] == 1 else f"{source}/{name}"
+                series[topic] = Series(topic, _MESSAGE_TYPE, {name: samples}, stamp)
         selected = {
             name: source_series for name, source_series in series.items() if field_filter(name)
         }
