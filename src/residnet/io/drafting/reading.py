@@ -32,10 +32,12 @@ from residnet.io.drafting.channels import (
     Motion,
     RawTable,
     ScaleFit,
+    choose_quaternion_order,
     draft_channel_map,
     estimate_motion,
     estimate_rudder_gain,
     find_depth_channels,
+    find_quaternions,
     fit_to_motion,
     forward_alignment,
 )
@@ -48,6 +50,7 @@ from residnet.io.drafting.questions import UNMAPPED_FIELDS, DraftNotes, Key
 from residnet.io.drafting.tables import (
     draft_manoeuvre_setting,
     draft_tables,
+    draft_vertical_motion,
     match_channels,
     preview_table,
 )
@@ -296,20 +299,32 @@ def _find_named_table(
             and bool((np.diff(tables[0].columns[name]) > 0.0).all())
         )
     ]
-    names = match_channels(fields, draft_notes)
-    names |= find_depth_channels(fields, names)
-    if "psi" not in names or not ({"x", "y"} <= {*names} or {"latitude", "longitude"} <= {*names}):
+    attitudes = find_quaternions(fields)
+    compound_fields = {field for attitude in attitudes for field in attitude.values()}
+    simple_fields = [name for name in fields if name not in compound_fields]
+    names = match_channels(simple_fields, draft_notes)
+    names |= find_depth_channels(simple_fields, names)
+    if "psi" not in names:
+        names |= choose_quaternion_order(attitudes, [table.columns for table in tables])
+    has_attitude = "psi" in names or {*QUATERNION} <= {*names}
+    has_position = {"x", "y"} <= {*names} or {"latitude", "longitude"} <= {*names}
+    if not (has_attitude and has_position):
         return None
     logs = [
         RawTable(table.t, {name: table.columns[field] for name, field in names.items()})
         for table in tables
     ]
     entries = draft_channel_map(names, logs, draft_notes)
-    unused_fields = [name for name in fields if name not in names.values()]
+    entries |= draft_vertical_motion(
+        simple_fields, [table.columns for table in tables], logs, entries, draft_notes
+    )
+    used_columns = {entry["column"] for entry in entries.values()} | {*names.values()}
+    unused_fields = [name for name in fields if name not in used_columns]
     if unused_fields:
         draft_notes.add_note(CHANNELS_KEY, f"{UNMAPPED_FIELDS}: {', '.join(unused_fields[:20])}")
     settings = _convert_entries(entries, sources, base_topic)
-    setting_names = {"x": "position", "y": "position", "psi": "heading"}
+    setting_names = dict.fromkeys(("x", "y"), "position")
+    setting_names |= dict.fromkeys(("psi", *QUATERNION), "heading")
     if "velocity" in settings:
         setting_names |= {"u": "velocity", "v": "velocity"}
     for name, setting_name in setting_names.items():
@@ -335,12 +350,15 @@ def _choose_named_fields(
     """
     candidates = []
     for series in recording.series.values():
-        channels = {match_state_channel(parse_name(name)) for name in series.fields}
+        channels = {
+            match_state_channel(parse_name(name)) for name in _name_vector_parts(series.fields)
+        }
+        has_attitude = "psi" in channels or bool(find_quaternions([*series.fields]))
         has_position = {"x", "y"} <= channels or {"latitude", "longitude"} <= channels
         if (
             not series.message_type
             and len(series) >= _MIN_MOTION_ROWS
-            and "psi" in channels
+            and has_attitude
             and has_position
         ):
             candidates.append(series)
@@ -355,7 +373,8 @@ def _choose_named_fields(
         return {}, ""
     if candidates:
         topic = candidates[0].name
-        return {field: (topic, field) for field in candidates[0].fields}, topic
+        fields = _name_vector_parts(candidates[0].fields)
+        return {name: (topic, field) for name, field in fields.items()}, topic
     sources = _find_named_topics(recording) if needs_pose else {}
     return sources, _find_base_topic(recording, sources) if sources else ""
 
@@ -389,10 +408,17 @@ def _convert_entries(
         velocity = {"kind": "earth_fixed", "topic": topic, "unit": north["unit"]}
         velocity |= {"north": north_field, "east": sources[east["column"]][1]}
         settings["velocity"] = velocity
-    heading = entries.pop("psi")
-    topic, heading_field = sources[heading["column"]]
-    settings["heading"] = {"kind": "angle", "topic": topic, "field": heading_field}
-    settings["heading"] |= {"unit": heading["unit"], "frame": heading.get("frame", "ned")}
+    if "psi" in entries:
+        heading = entries.pop("psi")
+        topic, heading_field = sources[heading["column"]]
+        settings["heading"] = {"kind": "angle", "topic": topic, "field": heading_field}
+        settings["heading"] |= {"unit": heading["unit"], "frame": heading.get("frame", "ned")}
+    else:
+        quaternion = {name: entries.pop(name) for name in QUATERNION}
+        topic, _ = sources[quaternion["qw"]["column"]]
+        parts = [sources[entry["column"]][1] for entry in quaternion.values()]
+        settings["heading"] = {"kind": "quaternion", "topic": topic, "field": parts}
+        settings["heading"] |= {"frame": quaternion["qw"].get("frame", "ned"), "roll": True}
     settings["channels"] = {}
     for name, entry in entries.items():
         topic, field = sources[entry.pop("column")]
@@ -413,32 +439,91 @@ def _find_named_topics(recording: Recording) -> dict[str, tuple[str, str]]:
         for topic, series in recording.series.items()
         if not series.message_type and len(series) > 1
     }
-    counts = Counter(field for series in series_by_topic.values() for field in series.fields)
+    names_by_topic = {
+        topic: _name_vector_parts(series.fields) for topic, series in series_by_topic.items()
+    }
+    counts = Counter(name for names in names_by_topic.values() for name in names)
     sources = {
-        field if counts[field] == 1 and field != "data" else f"{topic} {field}": (topic, field)
-        for topic, series in series_by_topic.items()
-        for field in series.fields
+        name if counts[name] == 1 and name != "data" else f"{topic} {name}": (topic, field)
+        for topic, names in names_by_topic.items()
+        for name, field in names.items()
     }
     channels = match_channels([*sources], DraftNotes())
     position = next(
         (pair for pair in (("x", "y"), ("latitude", "longitude")) if {*pair} <= channels.keys()),
         None,
     )
-    if position is None or "psi" not in channels:
+    attitude = _attitude_fields(channels, sources)
+    if position is None or not attitude:
         return {}
     first_topic, second_topic = (sources[channels[name]][0] for name in position)
-    has_rows = all(
-        len(series_by_topic[sources[channels[name]][0]]) >= _MIN_MOTION_ROWS
-        for name in (*position, "psi")
-    )
+    topics = {sources[name][0] for name in (*(channels[axis] for axis in position), *attitude)}
+    has_rows = all(len(series_by_topic[topic]) >= _MIN_MOTION_ROWS for topic in topics)
     return sources if first_topic == second_topic and has_rows else {}
+
+
+_VECTOR_PART_PATTERN = re.compile(r"(?P<stem>.*[^\W\d])(?:\.|\[)(?P<index>\d)\]?")
+_VECTOR_STATES = {
+    ("eta", 3): ("x", "y", "psi"),
+    ("eta", 6): ("x", "y", "z", "phi", "theta", "psi"),
+    ("nu", 3): ("u", "v", "r"),
+    ("nu", 6): ("u", "v", "w", "p", "q", "r"),
+    ("tau", 3): ("tau_x", "tau_y", "tau_n"),
+}
+"""Name and length of a vector in Fossen's notation (2021, table 2.1) -> names of its parts."""
+_SPATIAL_VECTOR_PATTERN = re.compile(
+    r"(?:^|[\W_])(?:pos|position|linear|angular|vel|velocity|lin_?vel|ang_?vel|omega|gyro|force)s?"
+    r"(?:$|[\W_])",
+    re.IGNORECASE,
+)
+
+
+def _name_vector_parts(fields: Iterable[str]) -> dict[str, str]:
+    """Name the columns of matrices of positions, velocities and forces by their axes.
+
+    Args:
+        fields: fields; those of a matrix end in `.0`, `.1`, ... or `[0]`, `[1]`, ...
+
+    Returns:
+        Name -> field, in the order of the fields.
+    """
+    names = {field: field for field in fields}
+    parts_by_stem: dict[str, dict[int, str]] = {}
+    for field in names:
+        if match := _VECTOR_PART_PATTERN.fullmatch(field):
+            parts_by_stem.setdefault(match["stem"], {})[int(match["index"])] = field
+    for stem, parts in parts_by_stem.items():
+        length = len(parts)
+        if sorted(parts) != list(range(length)):
+            continue
+        parent, separator, last_name = stem.rpartition(".")
+        labels = _VECTOR_STATES.get((last_name.lower(), length), ())
+        if labels:
+            labels = tuple(f"{parent}{separator}{label}" for label in labels)
+        elif length in (2, 3) and _SPATIAL_VECTOR_PATTERN.search(stem):
+            labels = tuple(f"{stem}_{axis}" for axis in "xyz"[:length])
+        names |= {parts[index]: label for index, label in enumerate(labels)}
+    return {name: field for field, name in names.items()}
+
+
+def _attitude_fields(
+    channels: Mapping[str, str], sources: Mapping[str, tuple[str, str]]
+) -> list[str]:
+    """Return the name of the heading, or the names of a quaternion's parts in one topic."""
+    if "psi" in channels:
+        return [channels["psi"]]
+    for parts in find_quaternions([*sources]):
+        if len({sources[name][0] for name in parts.values()}) == 1:
+            return [*parts.values()]
+    return []
 
 
 def _find_base_topic(recording: Recording, sources: Mapping[str, tuple[str, str]]) -> str:
     """Return the topic of position or heading with more rows."""
     channels = match_channels([*sources], DraftNotes())
     position = "x" if "x" in channels else "latitude"
-    topics = [sources[channels[name]][0] for name in (position, "psi")]
+    names = [channels[position], *_attitude_fields(channels, sources)[:1]]
+    topics = [sources[name][0] for name in names]
     return max(topics, key=lambda topic: len(recording.series[topic]))
 
 

@@ -176,7 +176,13 @@ def draft_tables(
     channels = draft_channel_map(
         column_by_channel, logs, draft_notes, [*main_preview.column_names, *cells]
     )
-    channels |= _draft_vertical_motion(simple_columns, previews, logs, channels, draft_notes)
+    channels |= draft_vertical_motion(
+        simple_columns,
+        [preview.numeric_columns for preview in previews],
+        logs,
+        channels,
+        draft_notes,
+    )
     column_by_channel |= {
         name: entry["column"] for name, entry in channels.items() if name in _VERTICAL_CHANNELS
     }
@@ -320,9 +326,9 @@ _VERTICAL_CHANNELS = ("z", "w", "q", "p")
 """Channels whose columns complete those of a planar motion to six degrees of freedom."""
 
 
-def _draft_vertical_motion(
+def draft_vertical_motion(
     columns: Sequence[str],
-    previews: Sequence[TablePreview],
+    tables: Sequence[Mapping[str, np.ndarray]],
     logs: Sequence[RawTable],
     channels: Mapping[str, Mapping[str, Any]],
     draft_notes: DraftNotes,
@@ -334,8 +340,8 @@ def _draft_vertical_motion(
 
     Args:
         columns: names of the columns of numbers.
-        previews: first rows of the tables.
-        logs: tables with the mapped columns, in the order of the previews.
+        tables: column -> values of each table.
+        logs: the mapped columns of these tables.
         channels: channel -> entry of the planar motion.
         draft_notes: receives guesses and notes.
 
@@ -352,21 +358,21 @@ def _draft_vertical_motion(
     if (
         "z" not in candidates
         or not {*QUATERNION} <= channels.keys()
-        or len(previews) != len(logs)
-        or any(set(candidates.values()) - preview.numeric_columns.keys() for preview in previews)
+        or len(tables) != len(logs)
+        or any(set(candidates.values()) - table.keys() for table in tables)
     ):
         return {}
     is_east_north_up = channels["qw"].get("frame") == "enu"
     vertical_sign = -1 if is_east_north_up else 1
     rates: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in ("w", "q", "p")}
     is_submerged = False
-    for preview, log in zip(previews, logs, strict=True):
+    for table, log in zip(tables, logs, strict=True):
         if not {*QUATERNION, "u", "v"} <= log.columns.keys():
             return {}
         parts = normalize_quaternion(*(log.columns[name] for name in QUATERNION))
         roll, pitch = quaternion_tilt(*parts)
         pitch = vertical_sign * pitch
-        values = {name: preview.numeric_columns[column] for name, column in candidates.items()}
+        values = {name: table[column] for name, column in candidates.items()}
         if any(column.size != log.t.size for column in values.values()) or log.t.size < 10:
             continue
         u = log.columns["u"]
@@ -392,7 +398,7 @@ def _draft_vertical_motion(
         return {}
     entries: dict[str, dict[str, Any]] = {}
     for name, column in candidates.items():
-        values_of_logs = np.concatenate([preview.numeric_columns[column] for preview in previews])
+        values_of_logs = np.concatenate([table[column] for table in tables])
         scaling = infer_unit(name, column, values_of_logs)
         sign = vertical_sign
         if name != "z":

@@ -455,14 +455,14 @@ def extract_heading(recording: Recording, config: HeadingConfig) -> TopicChannel
         offset = config.offset
     else:
         quaternion = normalize_quaternion(
-            *(_read_field(recording, series, f"{config.field}.{axis}") for axis in "xyzw")
+            *(_read_field(recording, series, part) for part in config.parts)
         )
         x, y, z, w = quaternion
         n_empty = int(np.isnan(w).sum())
         if n_empty == w.size:
             raise DataError(
-                f"{recording.path}: topic {series.name}: '{config.field}' has no orientation, all"
-                " quaternions are empty; use another source of the heading"
+                f"{recording.path}: topic {series.name}: '{config.fields[0]}' has no orientation,"
+                " all quaternions are empty; use another source of the heading"
             )
         if n_flips := int((sum(part[1:] * part[:-1] for part in quaternion) < 0.0).sum()):
             message = (

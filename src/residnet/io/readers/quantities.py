@@ -372,16 +372,28 @@ class QuaternionHeading(TopicSource):
 
     Attributes:
         field: path of the quaternion with the parts x, y, z, w, for example
-            `pose.pose.orientation`.
+            `pose.pose.orientation`; or the four fields of the parts in this order.
         frame: `ned` (yaw clockwise from north) or `enu` (REP 103: counter-clockwise from east).
         roll: whether roll and pitch become the channels phi and theta.
     """
 
     kind: Literal["quaternion"] = "quaternion"
-    field: str
+    field: str | tuple[str, str, str, str]
     frame: Literal["ned", "enu"]
     roll: bool = False
     field_keys: ClassVar[tuple[str, ...]] = ("field",)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Paths of the fields."""
+        return (self.field,) if isinstance(self.field, str) else self.field
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Paths of the parts x, y, z, w."""
+        if isinstance(self.field, str):
+            return tuple(f"{self.field}.{axis}" for axis in "xyzw")
+        return self.field
 
 
 @final

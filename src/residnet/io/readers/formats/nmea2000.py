@@ -403,7 +403,8 @@ def _date_ns(message: Any) -> int | None:
         return None
     days = int(np.datetime64(day.isoformat(), "D").astype(np.int64))
     seconds = (clock.hour * 60 + clock.minute) * 60 + clock.second
-    return days * _DAY_NS + seconds * 10**9
+    ns: int = days * _DAY_NS + seconds * 10**9
+    return ns
 
 
 def _add_true_direction(
