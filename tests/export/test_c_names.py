@@ -10,6 +10,8 @@ import shutil
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -22,8 +24,14 @@ from residnet.engine import c_code
 from residnet.engine.c_code import find_compiler
 from residnet.evaluation.assessment import Assessment, CardFinding, name_splits
 from residnet.export import c, get_exporter
-from residnet.export.c import STRICT_FLAGS, measure_footprint, to_c_identifier
+from residnet.export.c import (
+    STRICT_FLAGS,
+    measure_c_export,
+    measure_footprint,
+    to_c_identifier,
+)
 from residnet.export.vessel import ExportedVessel
+from residnet.tasks.fit import execute
 
 pytestmark = pytest.mark.usefixtures("short_parity")
 
@@ -184,6 +192,33 @@ def tools(folder: Path, wanted: Sequence[str]) -> str:
             assert found is not None
             (folder / name).symlink_to(found)
     return str(folder)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "words"),
+    [
+        (0.98, r"2 % higher than the ensemble's \(within one"),
+        (0.5, r"100 % higher .* \(beyond one"),
+    ],
+)
+def test_the_single_model_is_proposed_with_its_size(
+    ratio: float, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    models = {"hull": built("ridge"), "ensemble": built("lstm")}
+    row = SimpleNamespace(model="ensemble", ratio=ratio, standard_error=0.05)
+    selection = SimpleNamespace(models=[row])
+    monkeypatch.setattr(execute, "load_model", lambda path: models[path.name])
+    monkeypatch.setattr(execute, "RunFiles", lambda path: SimpleNamespace(selection=selection))
+    run: Any = SimpleNamespace(path=tmp_path / "my_boat", models=tmp_path / "my_boat" / "models")
+    text = execute.describe_single_model(run, "ensemble", "hull")
+    sizes = {name: measure_c_export(ExportedVessel(*model)) for name, model in models.items()}
+    assert f"{sizes['hull']['code_bytes']:,} bytes of code" in text
+    assert sizes["hull"]["code_bytes"] < sizes["ensemble"]["code_bytes"]
+    # float state of six numbers, and the memory of the model
+    n_memory = models["hull"][1].n_state
+    assert sizes["hull"]["memory_bytes"] == 4 * (6 + n_memory)
+    assert re.search(words, text)
+    assert text.endswith("my_boat --format c --model selected")
 
 
 @pytest.mark.parametrize("known", [["cc", "size"], ["cc"], []])

@@ -214,12 +214,14 @@ class Exporter(ABC):
         about: one line for `residnet list formats`.
         default_name_from_run: whether the default file name is the name of the run, because it
             becomes part of symbols that must be unique in a program.
+        is_for_microcontrollers: whether code size and memory decide if a model can be used.
     """
 
     name: ClassVar[str]
     suffix: ClassVar[str]
     about: ClassVar[str]
     default_name_from_run: ClassVar[bool] = False
+    is_for_microcontrollers: ClassVar[bool] = False
 
     @abstractmethod
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:

@@ -339,13 +339,37 @@ def deepest_stack(stack: Mapping[str, int], bodies: Mapping[str, str]) -> int:
     return max(map(depth, stack), default=0)
 
 
+def measure_c_export(exported: Exportable) -> dict[str, Any]:
+    """Return stack, code and memory of the C export of a model without writing it.
+
+    Args:
+        exported: the model; its export is not checked.
+    """
+    card = exported.build_card() | {"format": "c"}
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "model.c"
+        c_files = generate_c_source(exported, card, "model.h", "model")
+        path.write_text(c_files.source)
+        path.with_suffix(".h").write_text(c_files.header)
+        return measure_footprint(path) | {"memory_bytes": measure_memory(exported)}
+
+
+def measure_memory(exported: Exportable) -> int:
+    """Return the bytes that a program keeps between two steps: state and memory in float."""
+    return _FLOAT_BYTES * sum(n_entries for name, n_entries in exported.arguments if name != "w")
+
+
+_FLOAT_BYTES = 4
+
+
 def report_footprint(what: str, size: Mapping[str, Any]) -> list[str]:
     """Report stack and size to the user before a file is written; return the warnings."""
     stack = size["largest_stack_bytes"]
     code = size["code_bytes"]
     log_message(
         f"  {what}: {stack:,} bytes of stack ({size['stack_from']}), {code:,} bytes of code and"
-        f" constants ({size['code_from']}) on {size['machine']}"
+        f" constants ({size['code_from']}), {size['memory_bytes']:,} bytes of memory between steps"
+        f" on {size['machine']}"
     )
     warnings = []
     if stack > STACK_LIMIT:
@@ -578,6 +602,7 @@ class CExporter(Exporter):
     suffix: ClassVar[str] = ".c"
     about: ClassVar[str] = "The model as one C99 file and header, without any runtime."
     default_name_from_run: ClassVar[bool] = True
+    is_for_microcontrollers: ClassVar[bool] = True
 
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
         """Write source, header and card, checked in single and in double precision.
@@ -624,6 +649,7 @@ class CExporter(Exporter):
             if dtype == torch.float64:
                 card |= {"dtype": get_dtype_name(dtype)}
             size = measure_footprint(temporary_path)
+            size["memory_bytes"] = measure_memory(exported)
             size["warnings"] = report_footprint(file.name, size)
             card |= {"size": size, "parity": parity}
             write_card(file, card)

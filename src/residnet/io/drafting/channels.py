@@ -41,8 +41,10 @@ from residnet.io.header_vocabulary import (
 )
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
+    PLANAR_QUATERNION,
     QUATERNION,
     SINE_SUFFIX,
+    complete_quaternion,
     normalize_quaternion,
     project_fixes,
     quaternion_yaw,
@@ -385,7 +387,8 @@ def find_quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
 
     Returns:
         For each quaternion: channel (qx, qy, qz, qw) -> column. A quaternion with numbered parts
-        occurs twice, with the scalar part first and last.
+        occurs twice, with the scalar part first and last. Without complete ones, those of planar
+        motion with the parts qz and qw.
     """
     parts_by_stem: dict[str, dict[str, str]] = {}
     for column in columns:
@@ -403,7 +406,9 @@ def find_quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
             for number, channel in enumerate(channels):
                 group_key = f"{match['stem']} {number if part.isdigit() else 'named'}"
                 parts_by_stem.setdefault(group_key, {}).setdefault(channel, column)
-    return [parts for parts in parts_by_stem.values() if set(parts) == set(QUATERNION)]
+    complete = [parts for parts in parts_by_stem.values() if set(parts) == {*QUATERNION}]
+    planar = [parts for parts in parts_by_stem.values() if set(parts) == {*PLANAR_QUATERNION}]
+    return complete or planar
 
 
 def find_depth_channels(columns: Sequence[str], known_channels: Collection[str]) -> dict[str, str]:
@@ -429,6 +434,35 @@ def find_depth_channels(columns: Sequence[str], known_channels: Collection[str])
         if has_full_attitude
         or DegreesOfFreedom.vertical_plane_dof({*known_channels, *column_by_channel})
         else {}
+    )
+
+
+_MIN_SUBMERGED_SHARE = 0.9
+_MIN_SUBMERGED_DEPTH = 0.1
+"""Share of the samples, and median in m, below zero of a vertical position that points up."""
+
+
+def is_vertical_axis_up(
+    columns: Sequence[str],
+    known_channels: Collection[str],
+    tables: Sequence[Mapping[str, np.ndarray]],
+) -> bool:
+    """Return whether an underwater vessel's vertical position is negative, and so points up.
+
+    Args:
+        columns: names of the columns of numbers.
+        known_channels: channels that are mapped already; only a quaternion depends on the axis.
+        tables: column -> values of each table.
+    """
+    if "qw" not in known_channels:
+        return False
+    column = next((name for name in columns if match_depth_channel(parse_name(name)) == "z"), None)
+    values = np.concatenate([table.get(column or "", np.zeros(0)) for table in tables])
+    values = values[np.isfinite(values)]
+    return bool(
+        values.size
+        and float((values < 0.0).mean()) > _MIN_SUBMERGED_SHARE
+        and float(np.median(values)) < -_MIN_SUBMERGED_DEPTH
     )
 
 
@@ -463,7 +497,9 @@ def choose_quaternion_order(
         return {}
     return min(
         candidates,
-        key=lambda parts: np.nanmean(concatenate_columns((parts["qx"], parts["qy"])) ** 2),
+        key=lambda parts: np.nanmean(
+            concatenate_columns([parts.get("qx", parts["qz"]), parts.get("qy", parts["qz"])]) ** 2
+        ),
     )
 
 
@@ -542,6 +578,8 @@ def draft_channel_map(
     logs: Sequence[RawTable],
     draft_notes: DraftNotes,
     texts: Iterable[str] = (),
+    *,
+    is_up_positive: bool = False,
 ) -> dict[str, dict[str, Any]]:
     """Draft a channel map.
 
@@ -550,12 +588,13 @@ def draft_channel_map(
         logs: tables with the columns under the names of their channels.
         draft_notes: receives guesses and notes.
         texts: names of all columns, and cells, which may contain the name of a frame.
+        is_up_positive: whether the vertical axis of the frame points up, see `is_vertical_axis_up`.
 
     Returns:
         Channel -> entry.
     """
     quaternion_columns = {name: column for name, column in names.items() if name in QUATERNION}
-    candidate_frames = _choose_candidate_frames(names, texts)
+    candidate_frames = ROS_POSE_FRAMES if is_up_positive else _choose_candidate_frames(names, texts)
     channel_columns = {name: column for name, column in names.items() if name not in QUATERNION}
     # replace sines and cosines, and quaternions, by their angles while frames are determined
     angle_columns = {}
@@ -568,7 +607,7 @@ def draft_channel_map(
         channel_columns[name] = f"angle of {' and '.join(pair)} [rad]"
         angle_columns[channel_columns[name]] = pair
     if quaternion_columns:
-        derived_angles["psi"] = QUATERNION
+        derived_angles["psi"] = tuple(name for name in QUATERNION if name in quaternion_columns)
         channel_columns["psi"] = "heading of the quaternion [rad]"
     logs = [_add_derived_angles(raw, derived_angles) for raw in logs]
     channel_columns, logs, degrees_per_count = _project_fixes(channel_columns, logs, draft_notes)
@@ -591,7 +630,11 @@ def draft_channel_map(
     if not quaternion_columns:
         return entries
     psi = entries.pop("psi")
-    entries |= {name: {"column": quaternion_columns[name], "unit": "-"} for name in QUATERNION}
+    entries |= {
+        name: {"column": quaternion_columns[name], "unit": "-"}
+        for name in QUATERNION
+        if name in quaternion_columns
+    }
     entries["qw"] |= {"frame": psi["frame"]} if "frame" in psi else {}
     draft_notes.move_key((*CHANNELS_KEY, "psi"), (*CHANNELS_KEY, "qw"))
     direction = "counter-clockwise from east" if "frame" in psi else "clockwise from north"
@@ -618,9 +661,9 @@ def _add_derived_angles(table: RawTable, derived_angles: Mapping[str, tuple[str,
     for name, parts in derived_angles.items():
         if columns.keys() >= {*parts}:
             part_values = [columns[part] for part in parts]
-            is_quaternion = len(part_values) == len(QUATERNION)
+            is_quaternion = "qw" in parts
             columns[name] = (
-                quaternion_yaw(*normalize_quaternion(*part_values))
+                quaternion_yaw(*normalize_quaternion(*complete_quaternion(part_values)))
                 if is_quaternion
                 else np.arctan2(*part_values[::-1])
             )

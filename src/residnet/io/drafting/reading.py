@@ -20,7 +20,7 @@ import numpy as np
 
 from residnet.core.config import validate_config
 from residnet.core.errors import DataError, ResidnetError, UsageError
-from residnet.core.layout import DegreesOfFreedom
+from residnet.core.layout import SIX_DOF_LAYOUT, DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, STATE_NAMES
 from residnet.core.progress import report_progress
@@ -40,6 +40,7 @@ from residnet.io.drafting.channels import (
     find_quaternions,
     fit_to_motion,
     forward_alignment,
+    is_vertical_axis_up,
 )
 from residnet.io.drafting.problems import (
     UnreadableLogsError,
@@ -53,6 +54,7 @@ from residnet.io.drafting.tables import (
     draft_vertical_motion,
     match_channels,
     preview_table,
+    rename_pulsed_drives,
 )
 from residnet.io.header_vocabulary import (
     MOTION_CHANNELS,
@@ -303,10 +305,11 @@ def _find_named_table(
     compound_fields = {field for attitude in attitudes for field in attitude.values()}
     simple_fields = [name for name in fields if name not in compound_fields]
     names = match_channels(simple_fields, draft_notes)
+    names = rename_pulsed_drives(names, [table.columns for table in tables])
     names |= find_depth_channels(simple_fields, names)
     if "psi" not in names:
         names |= choose_quaternion_order(attitudes, [table.columns for table in tables])
-    has_attitude = "psi" in names or {*QUATERNION} <= {*names}
+    has_attitude = "psi" in names or "qw" in names
     has_position = {"x", "y"} <= {*names} or {"latitude", "longitude"} <= {*names}
     if not (has_attitude and has_position):
         return None
@@ -314,7 +317,8 @@ def _find_named_table(
         RawTable(table.t, {name: table.columns[field] for name, field in names.items()})
         for table in tables
     ]
-    entries = draft_channel_map(names, logs, draft_notes)
+    is_up_positive = is_vertical_axis_up(simple_fields, names, [table.columns for table in tables])
+    entries = draft_channel_map(names, logs, draft_notes, is_up_positive=is_up_positive)
     entries |= draft_vertical_motion(
         simple_fields, [table.columns for table in tables], logs, entries, draft_notes
     )
@@ -374,9 +378,18 @@ def _choose_named_fields(
     if candidates:
         topic = candidates[0].name
         fields = _name_vector_parts(candidates[0].fields)
+        combined = _find_named_topics(recording) if needs_pose else {}
+        if not _velocity_channels(combined) <= _velocity_channels(fields):
+            return combined, _find_base_topic(recording, combined)
         return {name: (topic, field) for name, field in fields.items()}, topic
     sources = _find_named_topics(recording) if needs_pose else {}
     return sources, _find_base_topic(recording, sources) if sources else ""
+
+
+def _velocity_channels(names: Iterable[str]) -> set[str | None]:
+    """Return the velocities of the planar motion among the names of fields."""
+    channels = {match_state_channel(parse_name(name)) for name in names}
+    return channels & {"u", "v", "r"}
 
 
 def _convert_entries(
@@ -414,16 +427,18 @@ def _convert_entries(
         settings["heading"] = {"kind": "angle", "topic": topic, "field": heading_field}
         settings["heading"] |= {"unit": heading["unit"], "frame": heading.get("frame", "ned")}
     else:
-        quaternion = {name: entries.pop(name) for name in QUATERNION}
+        quaternion = {name: entries.pop(name) for name in QUATERNION if name in entries}
         topic, _ = sources[quaternion["qw"]["column"]]
         parts = [sources[entry["column"]][1] for entry in quaternion.values()]
         settings["heading"] = {"kind": "quaternion", "topic": topic, "field": parts}
-        settings["heading"] |= {"frame": quaternion["qw"].get("frame", "ned"), "roll": True}
+        settings["heading"] |= {"frame": quaternion["qw"].get("frame", "ned")}
+        settings["heading"] |= {"roll": len(quaternion) == len(QUATERNION)}
     settings["channels"] = {}
     for name, entry in entries.items():
         topic, field = sources[entry.pop("column")]
         # a command of another topic applies until the next one
-        hold = {} if topic == base_topic or name in MOTION_CHANNELS else {"hold": True}
+        is_motion = name in (*MOTION_CHANNELS, *SIX_DOF_LAYOUT.state_names)
+        hold = {} if topic == base_topic or is_motion else {"hold": True}
         settings["channels"][name] = {"topic": topic, "field": field, **entry, **hold}
     return settings
 

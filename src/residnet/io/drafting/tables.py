@@ -26,6 +26,7 @@ from residnet.io.drafting.channels import (
     find_depth_channels,
     find_quaternions,
     find_sin_cos_pairs,
+    is_vertical_axis_up,
 )
 from residnet.io.drafting.problems import (
     UnreadableLogsError,
@@ -154,7 +155,9 @@ def draft_tables(
     )
     if select:
         _drop_ais_turn_rate(column_by_channel, main_preview, draft_notes)
-    column_by_channel = _rename_pulsed_drives(column_by_channel, previews)
+    column_by_channel = rename_pulsed_drives(
+        column_by_channel, [preview.numeric_columns for preview in previews]
+    )
     column_by_channel = _add_sin_cos_channels(column_by_channel, sin_cos_pairs)
     _drop_incomplete_roll(column_by_channel, previews, draft_notes)
     column_by_channel |= find_depth_channels(simple_columns, column_by_channel)
@@ -174,7 +177,15 @@ def draft_tables(
         str(text) for texts in main_preview.text_columns.values() for text in texts.unique()[:20]
     ]
     channels = draft_channel_map(
-        column_by_channel, logs, draft_notes, [*main_preview.column_names, *cells]
+        column_by_channel,
+        logs,
+        draft_notes,
+        [*main_preview.column_names, *cells],
+        is_up_positive=is_vertical_axis_up(
+            simple_columns,
+            column_by_channel,
+            [preview.numeric_columns for preview in previews],
+        ),
     )
     channels |= draft_vertical_motion(
         simple_columns,
@@ -966,19 +977,21 @@ def _add_sin_cos_channels(
     return names
 
 
-def _rename_pulsed_drives(
-    names: Mapping[str, str], sheets: Sequence[TablePreview]
+def rename_pulsed_drives(
+    names: Mapping[str, str], tables: Sequence[Mapping[str, np.ndarray]]
 ) -> dict[str, str]:
     """Rename shaft speeds and thrusts whose values are servo pulses or relative to throttle.
 
     Pulses are integers between 900 and 2,100 us; relative values of a motor or thruster are at most
     1 and no integers. Columns with a word for revolutions in their names are not renamed.
+
+    Args:
+        names: channel -> column.
+        tables: column -> values of each table.
     """
     renamed = {}
     for channel, column in names.items():
-        values = np.concatenate(
-            [preview.numeric_columns.get(column, np.zeros(0)) for preview in sheets]
-        )
+        values = np.concatenate([table.get(column, np.zeros(0)) for table in tables])
         values = values[np.isfinite(values)]
         if _DRIVE_PATTERN.match(channel) and values.size and not REVOLUTION_PATTERN.search(column):
             are_integers = bool((values == np.round(values)).all())

@@ -36,6 +36,7 @@ from residnet.io.readers.quantities import (
     TopicSource,
     UniformClock,
     VelocityConfig,
+    complete_quaternion,
     normalize_quaternion,
     project_fixes,
     quaternion_yaw,
@@ -454,9 +455,8 @@ def extract_heading(recording: Recording, config: HeadingConfig) -> TopicChannel
         yaw = _read_field(recording, series, config.field, config.unit)
         offset = config.offset
     else:
-        quaternion = normalize_quaternion(
-            *(_read_field(recording, series, part) for part in config.parts)
-        )
+        parts = [_read_field(recording, series, part) for part in config.parts]
+        quaternion = normalize_quaternion(*complete_quaternion(parts))
         x, y, z, w = quaternion
         n_empty = int(np.isnan(w).sum())
         if n_empty == w.size:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal, final
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, field_validator
 
 from residnet.core.config import Config, Radians, Seconds
 from residnet.core.errors import UsageError
@@ -31,6 +31,8 @@ EARTH_VELOCITIES = ("u", "v")
 """Channels of a table that are the velocities to the north and to the east in the frame `ned`."""
 QUATERNION = ("qx", "qy", "qz", "qw")
 """Channels with the parts of a quaternion, from which tables without a heading derive it."""
+PLANAR_QUATERNION = ("qz", "qw")
+"""Channels with the parts of a quaternion about the vertical axis, whose other parts are zero."""
 COSINE_SUFFIX = "_cos"
 SINE_SUFFIX = "_sin"
 """Suffixes of channels with the cosine and the sine of an angle."""
@@ -372,13 +374,14 @@ class QuaternionHeading(TopicSource):
 
     Attributes:
         field: path of the quaternion with the parts x, y, z, w, for example
-            `pose.pose.orientation`; or the four fields of the parts in this order.
+            `pose.pose.orientation`; or the four fields of the parts in this order; or the fields of
+            z and w, where x and y are zero.
         frame: `ned` (yaw clockwise from north) or `enu` (REP 103: counter-clockwise from east).
         roll: whether roll and pitch become the channels phi and theta.
     """
 
     kind: Literal["quaternion"] = "quaternion"
-    field: str | tuple[str, str, str, str]
+    field: str | list[str]
     frame: Literal["ned", "enu"]
     roll: bool = False
     field_keys: ClassVar[tuple[str, ...]] = ("field",)
@@ -386,14 +389,23 @@ class QuaternionHeading(TopicSource):
     @property
     def fields(self) -> tuple[str, ...]:
         """Paths of the fields."""
-        return (self.field,) if isinstance(self.field, str) else self.field
+        return (self.field,) if isinstance(self.field, str) else tuple(self.field)
+
+    @field_validator("field")
+    @classmethod
+    def _validate_parts(cls, field: str | list[str]) -> str | list[str]:
+        if not isinstance(field, str) and len(field) not in (2, 4):
+            raise ValueError(
+                f"{len(field)} fields; give those of the parts x, y, z, w, or those of z, w"
+            )
+        return field
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Paths of the parts x, y, z, w."""
+        """Paths of the parts x, y, z, w, or of z, w."""
         if isinstance(self.field, str):
             return tuple(f"{self.field}.{axis}" for axis in "xyzw")
-        return self.field
+        return tuple(self.field)
 
 
 @final
@@ -607,6 +619,12 @@ def project_fixes(
     phi, lam = (np.where(is_valid, angle, np.nan) for angle in (latitude, longitude))
     north, east = project_to_tangent_plane(phi, lam, *plane_origin)
     return north, east, plane_origin, int(is_null_fix.sum())
+
+
+def complete_quaternion(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Return the parts x, y, z, w [T] of quaternions of which x and y may be missing (zero)."""
+    missing = (np.zeros_like(parts[-1]),) * (len(QUATERNION) - len(parts))
+    return (*missing, *parts)
 
 
 def normalize_quaternion(

@@ -42,9 +42,11 @@ from residnet.io.readers.manoeuvre_kinds import resolve_manoeuvre
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
     EARTH_VELOCITIES,
+    PLANAR_QUATERNION,
     QUATERNION,
     SINE_SUFFIX,
     ChannelMap,
+    complete_quaternion,
     conversion_factor,
     normalize_quaternion,
     project_fixes,
@@ -196,10 +198,11 @@ class TableConfig(ConfiguredReader, ABC):
         for name, entry in channels.items():
             entry.require_valid_channel(name)
         quaternion_names = [name for name in QUATERNION if name in channels]
-        if quaternion_names and len(quaternion_names) < len(QUATERNION):
+        if quaternion_names and (*quaternion_names,) not in (QUATERNION, PLANAR_QUATERNION):
             missing_names = ", ".join(name for name in QUATERNION if name not in channels)
             raise ValueError(
-                f"a quaternion needs all of {', '.join(QUATERNION)}; add {missing_names}"
+                f"a quaternion needs all of {', '.join(QUATERNION)}, or qz and qw of a planar"
+                f" motion; add {missing_names}"
             )
         earth_velocities = [
             name for name in EARTH_VELOCITIES if name in channels and channels[name].frame == "ned"
@@ -684,19 +687,21 @@ def _take_rows(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
 def _add_yaw_of_quaternion(
     path: Path, channels: dict[str, np.ndarray], channel_maps: Mapping[str, ChannelMap]
 ) -> None:
-    """Replace the four channels of a quaternion by the heading psi, unless psi is mapped.
+    """Replace the channels of a quaternion by the heading psi, unless psi is mapped.
 
     With a depth z the roll and pitch angles phi and theta are added.
 
     Raises:
         DataError: if no row has a quaternion.
     """
-    if not channels.keys() >= {*QUATERNION} or "psi" in channels:
+    if not channels.keys() >= {*PLANAR_QUATERNION} or "psi" in channels:
         return
-    quaternion = normalize_quaternion(*(channels.pop(name) for name in QUATERNION))
+    part_names = [name for name in QUATERNION if name in channels]
+    parts = [channels.pop(name) for name in part_names]
+    quaternion = normalize_quaternion(*complete_quaternion(parts))
     yaw = quaternion_yaw(*quaternion)
     if not np.isfinite(yaw).any():
-        columns = [channel_maps[name].column for name in QUATERNION]
+        columns = [channel_maps[name].column for name in part_names]
         raise DataError(
             f"{path}: {', '.join(columns)} contain no quaternion, all rows are empty;"
             " remove them from the channel map"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -18,6 +19,7 @@ from residnet.evaluation.band import build_bands_file
 from residnet.evaluation.goodness import build_goodness_file
 from residnet.evaluation.soundness import build_sanity_file
 from residnet.evaluation.verdict import list_model_objections, rate_model, write_verdict
+from residnet.export import get_exporter
 from residnet.export.vessel import ExportedVessel
 from residnet.identification.excitation import assess_excitation
 from residnet.identification.fit import fit_models
@@ -210,8 +212,53 @@ def export_model(config: FitConfig, request: ExportRequest) -> Path:
     # a model without free runs on the reported split has no verdict
     sentences = write_verdict(found) if model_name in found.rows_by_model else []
     judged = (rate_model(found), sentences)
-    return request.write(
+    file = request.write(
         ExportedVessel(spec, model, rows), list_model_objections(found), model_name, judged
+    )
+    is_ensemble = model_name == metrics.selected_ensemble and model_name != metrics.selected
+    if is_ensemble and get_exporter(request.file_format).is_for_microcontrollers:
+        log_message(f"  {describe_single_model(run, model_name, metrics.selected)}")
+    return file
+
+
+def describe_single_model(run: RunFolder, ensemble: str, single: str) -> str:
+    """Compare code size and validation error of the selected single model with the ensemble.
+
+    Args:
+        run: the finished run.
+        ensemble: name of the ensemble that is exported.
+        single: name of the selected single model.
+
+    Returns:
+        A sentence with the command that exports the single model.
+    """
+    from residnet.export.c import measure_c_export
+
+    sizes = {
+        name: measure_c_export(ExportedVessel(*load_model(run.models / name)))
+        for name in (single, ensemble)
+    }
+    size = sizes[single]
+    share = sizes[ensemble]["code_bytes"] / max(size["code_bytes"], 1)
+    selection = RunFiles(run.path).selection
+    rows = {row.model: row for row in selection.models} if selection is not None else {}
+    error_text = ""
+    if ensemble in rows:
+        # errors of the rows are relative to the single model
+        increase = -math.log(rows[ensemble].ratio)
+        is_within = increase <= rows[ensemble].standard_error
+        percentage = 100.0 * math.expm1(increase)
+        error_text = (
+            f"; its validation error is {abs(percentage):.0f} %"
+            f" {'higher' if percentage > 0.0 else 'lower'} than the ensemble's"
+            f" ({'within' if is_within else 'beyond'} one standard error)"
+        )
+    return (
+        f"for microcontrollers: {single}, the selected single model, takes"
+        f" {size['code_bytes']:,} bytes of code and constants (1/{share:.0f} of the ensemble),"
+        f" {size['largest_stack_bytes']:,} bytes of stack and {size['memory_bytes']:,} bytes of"
+        f" memory between steps{error_text}; export it with: residnet export {run.path} --format c"
+        " --model selected"
     )
 
 
