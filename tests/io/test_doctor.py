@@ -30,6 +30,7 @@ from residnet.quality import (
     inspect_log,
     inspect_log_set,
     summarize_inspection,
+    values,
 )
 from residnet.quality.actuators import estimate_delay
 from residnet.quality.findings import run_checks
@@ -346,6 +347,25 @@ def test_check_rudder_sign_and_delay_of_the_response() -> None:
         late = one(inspect_log(answering(STEPS, -early)), "acausal")
         assert late.level == "will mislead"
         assert late.figures["lag"] == pytest.approx(-early, abs=0.25)
+
+
+@pytest.mark.parametrize("has_few_digits", [True, False])
+def test_few_printed_digits_are_neither_frozen_nor_interpolated(
+    monkeypatch: pytest.MonkeyPatch, *, has_few_digits: bool
+) -> None:
+    random = np.random.default_rng(3)
+    t = 0.13 * np.arange(3000)
+    psi = 0.4 + 0.2 * np.sin(0.05 * t)
+    path = np.cumsum(1.7 * np.exp(1j * psi)) * 0.13 - 60.0
+    printed = np.vectorize(lambda value: float(f"{value:.3e}"))
+    channels = {"x": path.real, "y": path.imag}
+    channels = {n: printed(v + 0.05 * random.normal(size=t.size)) for n, v in channels.items()}
+    log = Log("printed", t, {**channels, "psi": psi})
+    if not has_few_digits:
+        # without the resolution of each value the equal increments look like straight lines
+        monkeypatch.setattr(values, "printed_resolution", lambda _: None)
+    codes = {finding.code for finding in inspect_log(log, ()).findings}
+    assert bool({"frozen", "interpolated"} & codes) != has_few_digits
 
 
 def test_check_repeated_rows_accepts_chance_repeats() -> None:

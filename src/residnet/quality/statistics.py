@@ -303,6 +303,46 @@ def count_reversals(heading: np.ndarray, min_swing: float) -> int:
     return n_reversals
 
 
+_MAX_SIGNIFICANT_DIGITS = 5
+"""Most significant digits of printed values that count as few; noise is usually above the sixth."""
+
+
+def printed_resolution(values: np.ndarray) -> np.ndarray | None:
+    """Return the resolution of each value of a channel that has few significant digits.
+
+    The resolution of such a channel grows with its magnitude: with four digits, 9.999 is followed
+    by 10.00 and 99.99 by 100.0.
+
+    Args:
+        values: values [T] in the unit of the print.
+
+    Returns:
+        Resolution [T]; None if the values have more digits, or the same resolution everywhere.
+    """
+    finite = values[np.isfinite(values) & (values != 0.0)]
+    if finite.size < 2:
+        return None
+
+    def resolution_of(numbers: np.ndarray, n_digits: int) -> np.ndarray:
+        magnitude = np.floor(np.log10(np.maximum(np.abs(numbers), 1e-300)) + 1e-12)
+        resolution: np.ndarray = 10.0 ** (magnitude + 1 - n_digits)
+        return resolution
+
+    for n_digits in range(1, _MAX_SIGNIFICANT_DIGITS + 1):
+        resolution = resolution_of(finite, n_digits)
+        counts = finite / resolution
+        if (np.abs(counts - np.round(counts)) < 1e-6).all():
+            # a fixed number of decimals gives the digits of small values a coarser last one
+            is_finer_below = resolution.max() > 5.0 * resolution.min()
+            has_printed_digits = bool(
+                (np.round(counts[resolution == resolution.min()]) % 10.0 != 0.0).any()
+            )
+            if not (is_finer_below and has_printed_digits):
+                return None
+            return resolution_of(np.where(values == 0.0, np.abs(finite).min(), values), n_digits)
+    return None
+
+
 def estimate_resolution(values: np.ndarray) -> float:
     """Return the quantisation step of a channel; 0 if its values have no common step."""
     nonzero_changes = np.abs(np.diff(values))

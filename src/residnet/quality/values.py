@@ -39,6 +39,7 @@ from residnet.quality.statistics import (
     STEERING_CHANNELS,
     LogStatistics,
     estimate_resolution,
+    printed_resolution,
 )
 
 
@@ -339,7 +340,9 @@ def _find_frozen_samples(log: LogStatistics, names: tuple[str, ...]) -> np.ndarr
     """
     is_frozen_sample = np.zeros(len(log), dtype=bool)
     is_multi_channel = len(names) > 1
-    is_repeated = np.logical_and.reduce([log[name][1:] == log[name][:-1] for name in names])
+    is_repeated = np.logical_and.reduce(
+        [(log[name][1:] == log[name][:-1]) & ~_is_coarsely_printed(log[name]) for name in names]
+    )
     if not is_repeated.any():
         return is_frozen_sample
     starts, stops = find_runs(is_repeated)
@@ -513,10 +516,28 @@ def _find_straight_samples(log: LogStatistics, name: str) -> np.ndarray:
     if float(is_flat.mean()) > _MAX_STRAIGHT_SHARE:
         return is_straight_sample
     is_moving = np.abs(slope[:-1]) > 10.0 * rounding_error
+    is_moving &= ~_is_coarsely_printed(log[name])[1:]
     starts, stops = find_runs(is_flat & is_moving)
     is_long = log.t[stops] - log.t[starts] >= _MIN_STRAIGHT_DURATION
     is_long &= stops - starts >= _MIN_STRAIGHT_SAMPLES
     return mask_from_ranges(is_straight_sample.size, starts[is_long], stops[is_long] + 2)
+
+
+_MIN_STEPS_OF_PRINT = 5.0
+"""Median increment in units of the last printed digit below which equal increments are chance."""
+
+
+def _is_coarsely_printed(values: np.ndarray) -> np.ndarray:
+    """Return [T - 1] bool: increments of few units of the last printed digit.
+
+    Large values of a table with few significant digits repeat and have equal increments by chance.
+    """
+    resolution = printed_resolution(values)
+    if resolution is None:
+        return np.zeros(values.size - 1, dtype=bool)
+    increment = nan_median(np.abs(np.diff(values)))
+    is_coarse: np.ndarray = _MIN_STEPS_OF_PRINT * resolution[1:] >= increment
+    return is_coarse
 
 
 @check(

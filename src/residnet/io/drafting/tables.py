@@ -453,7 +453,10 @@ def _suggest_table_fix(
         )
     if all(_parse_unit_cell(re.sub(r"\.\d+$", "", name)) for name in numeric_columns):
         return "these are units: write each column's name in a cell above its unit, or before it"
-    return "map them in a channel map (--config)"
+    return (
+        "rename them in the line of names, for example to x [m], y [m], psi [deg], u [m/s],"
+        " r [deg/s], rudder [deg], rpm"
+    )
 
 
 def draft_manoeuvre_setting(files: Sequence[Path], draft_notes: DraftNotes) -> dict[str, str]:

@@ -378,5 +378,5 @@ def require_compatible(contradiction: Contradiction, columns: Sequence[str]) -> 
             f" {100.0 * contradiction.share:.0f} % of the distance travelled (at most"
             f" {100.0 * MAX_CONTRADICTION:.0f} % is possible); no heading offset, scale, current or"
             " frame explains it: these channels are not one motion; check units and clocks, or"
-            " leave these columns out of a channel map"
+            " delete these columns in the files"
         )
