@@ -16,7 +16,7 @@ from residnet.io.drafting.problems import (
     without_channel_map,
 )
 from residnet.io.drafting.questions import DraftNotes
-from residnet.io.drafting.tables import draft_tables, match_channels
+from residnet.io.drafting.tables import draft_tables, find_wrench_columns, match_channels
 from residnet.io.header_vocabulary import match_input_channel, match_state_channel, parse_name
 from residnet.io.readers.clock_repair import repair_clock
 from residnet.io.readers.manoeuvre_kinds import infer_manoeuvre, match_manoeuvre_name
@@ -179,3 +179,58 @@ def test_forces_by_their_units_and_speed_by_its_letter() -> None:
     }
     speed = match_channels(["X", "Y", "Heading", "V [m/s]", "Drift angle", "Rudder"], DraftNotes())
     assert "V [m/s]" not in speed.values()
+
+
+STEERING = {
+    "English": "steer steering pwm_steer helm tiller rudder_angle steering_wheel",
+    "German": "Ruder Ruderlage Lenkung Lenkwinkel Pinne Steuer Steuerrad",
+    "French": "barre safran gouvernail volante",
+    "Spanish": "timón caña pala",
+    "Portuguese": "leme cana_do_leme",
+    "Italian": "timone barra pala",
+    "Dutch": "roer helmstok stuurwiel roerhoek",
+    "Norwegian": "ror rorvinkel rorkult ratt",
+    "Swedish": "roder rodervinkel styrning",
+    "Danish": "ror rorpind",
+    "Finnish": "peräsin ruori ohjaus pinna ohjauspyörä",
+    "Polish": "ster kąt_steru rumpel płetwa_sterowa kierownica",
+    "Russian": "руль угол_руля румпель штурвал",
+    "Turkish": "dümen dümen_açısı yeke direksiyon",
+    "Japanese": "舵 舵角 操舵",
+    "Chinese": "舵角 操舵 方向舵",
+    "Korean": "타각 방향타 조타 키각 타륜",
+}
+
+
+@pytest.mark.parametrize("language", STEERING)
+def test_steering_in_each_language(language: str) -> None:
+    words = [word.replace("_", " ") for word in STEERING[language].split()]
+    assert {word: match_input_channel(parse_name(word)) for word in words} == dict.fromkeys(
+        words, "delta"
+    )
+
+
+def test_nozzles_and_currents_of_motors_are_no_rudders() -> None:
+    for word in ("Düsenwinkel", "azimut", "acimut", "asimut", "tobera", "насадка", "ノズル"):
+        assert match_input_channel(parse_name(word)) == "azimuth", word
+    assert match_input_channel(parse_name("steering motor current")) is None
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        (
+            ["force.x", "force.y", "force.z", "torque.x", "torque.z"],
+            {"force.x": "tau_x", "force.y": "tau_y", "torque.z": "tau_n"},
+        ),
+        (
+            ["wrench_force_x", "wrench_moment_z"],
+            {"wrench_force_x": "tau_x", "wrench_moment_z": "tau_n"},
+        ),
+        # one part alone may be a load cell, and a thruster acts on a part of the vessel
+        (["force_x", "speed"], {}),
+        (["thruster force x", "thruster force y"], {}),
+    ],
+)
+def test_columns_of_a_wrench(columns: list[str], expected: dict[str, str]) -> None:
+    assert find_wrench_columns(columns) == expected

@@ -115,6 +115,9 @@ def test_magnetic_headings_of_nmea_2000(tmp_path: Path) -> None:
     for name, tolerance in {"psi": 4e-4, "u": 0.011, "v": 0.011}.items():
         np.testing.assert_allclose(got[name][1:], log[name][1:], atol=tolerance, err_msg=name)
     assert "magnetic_heading" in codes(got)
+    # codes of devices and references are no quantities
+    reader = residnet.draft_config(path).config["data"]["reader"]
+    assert "channels" not in reader, reader
     # without the variation the user has to set it
     lines = [line for line in path.read_text().splitlines() if "09F11A" not in line]
     path.write_text("\n".join(lines) + "\n")

@@ -565,6 +565,9 @@ def match_input_channel(parsed_name: ParsedName) -> str | None:
         return None
     if _EARTH_VELOCITY_PATTERN.search(parsed.text):
         return None
+    if parsed.has_all("engine", "current"):
+        # the electric current of a motor
+        return None
     side_suffixes = {"port": "_port", "starboard": "_stbd", "bow": "_bow", "stern": "_stern"}
     side_suffixes["difference"] = "_diff"
     side_suffix = next(

@@ -776,7 +776,15 @@ class ChannelMapper:
         elif "psi" in self._names:
             self._psi_unit = self._infer_unit("psi")
         self._choose_wind_reference()
-        return {name: self._make_entry(name) for name in self._names}
+        entries = {name: self._make_entry(name) for name in self._names}
+        for force, velocity in (("tau_y", "v"), ("tau_n", "r")):
+            # forces have the axes of the velocities beside them
+            is_reversed = entries.get(velocity, {}).get("sign") == -1
+            if is_reversed and force in entries and "sign" not in entries[force]:
+                entries[force]["sign"] = -1
+                text = f"assumed in the axes of {velocity}, which is positive to port in the file"
+                self._draft_notes.add_guess((*CHANNELS_KEY, force), text)
+        return entries
 
     def _drop_inconsistent_velocity(self, name: str) -> None:
         """Leave out a velocity that is constant, or uncorrelated and larger than the motion."""

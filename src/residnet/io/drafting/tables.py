@@ -234,7 +234,9 @@ def _detect_or_ask_clock(
             return detect_clock(main_preview), None
         except MissingClockError as missing_clock:
             message = strip_file_name([main_preview.path], str(missing_clock))
-        error = UnreadableLogsError({sheet.path: DataError(message) for sheet in previews})
+        error = UnreadableLogsError(
+            {sheet.path: DataError(f"{sheet.path}: {message}") for sheet in previews}
+        )
     step = draft_notes.require_answer(
         key,
         f"{main_preview.path.name} and the other tables have no column of time; time between two"
@@ -782,6 +784,7 @@ def _assign_columns(
     speeds: list[str] = []
     copy_suffix = re.compile(r"\.\d+$")
     side_velocities = _match_shaft_speeds(parsed_names)
+    wrench = find_wrench_columns(columns)
 
     def sort_key(column: str) -> tuple[bool, bool, int]:
         is_magnetic = (
@@ -799,12 +802,15 @@ def _assign_columns(
     for column in sorted(columns, key=sort_key):
         channel = (
             side_velocities.get(column)
+            or wrench.get(column)
             or _match_name(column, parsed_names[column])
             or _match_force_column(column)
         )
         if channel is None:
             continue
-        channel = _match_force_column(column) or _correct_by_unit(column, channel)
+        channel = (
+            _match_force_column(column) or wrench.get(column) or _correct_by_unit(column, channel)
+        )
         if channel == "v" and not has_surge and _TOTAL_SPEED_PATTERN.match(column):
             # the capital V is the speed, next to which a sway velocity would have a surge velocity
             channel = "speed"
@@ -937,13 +943,51 @@ _FORCE_AXES = {
 """SI unit of a force or moment -> last word of a name -> channel."""
 
 
+_WRENCH_PATTERN = re.compile(
+    r"(?P<stem>(?:.*[\W_])?)(?P<quantity>force|torque|moment)s?[\W_]*(?P<axis>[xyz])(?:[\W_]*\[.*\])?",
+    re.IGNORECASE,
+)
+_WRENCH_AXES = {("force", "x"): "tau_x", ("force", "y"): "tau_y", ("moment", "z"): "tau_n"}
+_MIN_WRENCH_PARTS = 2
+"""Fewest parts by which a force and a moment are those of the vessel, not of one load cell."""
+
+
+def find_wrench_columns(columns: Sequence[str]) -> dict[str, str]:
+    """Return column -> channel of the forces and the moment on a vessel, such as `force.x`.
+
+    Columns of one stem are a wrench; those of thrusters, rudders and wind are no total forces.
+    """
+    groups: dict[str, dict[str, str]] = {}
+    for column in columns:
+        match = _WRENCH_PATTERN.fullmatch(column.strip())
+        if match is None or not parse_name(column).has_none(*_PARTIAL_FORCES):
+            continue
+        quantity = "force" if match["quantity"].lower() == "force" else "moment"
+        channel = _WRENCH_AXES.get((quantity, match["axis"].lower()))
+        if channel is not None:
+            groups.setdefault(match["stem"].lower(), {}).setdefault(channel, column)
+    complete = [group for group in groups.values() if len(group) >= _MIN_WRENCH_PARTS]
+    return {column: channel for channel, column in complete[0].items()} if complete else {}
+
+
+_PARTIAL_FORCES = (
+    "wind",
+    "thrust",
+    "propeller",
+    "rudder",
+    "planes",
+    "engine",
+    "azimuth",
+    "command",
+)
+"""Concepts of forces that act on a part of the vessel."""
+
+
 def _match_force_column(column: str) -> str | None:
     """Return the channel of a force or moment whose unit is in its header, such as `T_u [N]`."""
     unit = parse_header_unit(column, None)
     parsed_name = parse_name(column)
-    is_part = not parsed_name.has_none(
-        "wind", "thrust", "propeller", "rudder", "planes", "engine", "azimuth", "command"
-    )
+    is_part = not parsed_name.has_none(*_PARTIAL_FORCES)
     if unit is None or is_part:
         return None
     words = parsed_name.text.split()

@@ -217,6 +217,7 @@ class _Messages:
         self._messages: dict[tuple[str, int], _DeviceMessages] = {}
         self._times: list[str] = []
         self._dates: list[tuple[int, int]] = []
+        self._code_fields: set[str] = {*_INSTANCE_MESSAGES.values()}
         self._n_other_lines = 0
         self._n_untimed = 0
         self._n_undecodable = 0
@@ -249,14 +250,20 @@ class _Messages:
             self._add_message(message)
 
     def _add_message(self, message: Any) -> None:
-        """Append the numbers of a decoded message; codes of look-up tables count as numbers."""
+        """Append the numbers of a decoded message, with the codes of look-up tables.
+
+        The codes select devices and references; the recording does not contain them.
+        """
         line_index = len(self._times) - 1
         if message.id in _DATED_MESSAGES and (ns := _date_ns(message)) is not None:
             self._dates.append((line_index, ns))
         values: dict[str, float] = {}
         for entry in message.fields:
             if entry.type.name in _NUMBER_TYPES and entry.id != "sid":
-                number = entry.raw_value if entry.type.name == "LOOKUP" else entry.value
+                is_code = entry.type.name == "LOOKUP"
+                if is_code:
+                    self._code_fields.add(entry.id)
+                number = entry.raw_value if is_code else entry.value
                 is_number = isinstance(number, int | float)
                 values[entry.id] = float(number) if is_number else float("nan")
         if not values:
@@ -307,7 +314,7 @@ class _Messages:
                 sender = np.array([f"{number:g}" for number in instance.tolist()], dtype=object)
             topics[name] = RawSeries(
                 f"nmea2000/{kind}",
-                fields,
+                {key: column for key, column in fields.items() if key not in self._code_fields},
                 arrival=TimeStamps(times, is_absolute),
                 sender=sender,
                 remarks=time_remarks,
