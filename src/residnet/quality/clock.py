@@ -105,6 +105,10 @@ def check_dropped_samples(log: LogStatistics, make_finding: Check) -> Iterator[F
         yield make_finding(text, {"count": short_gaps.size, "longest": short_gaps.max()})
 
 
+_MAX_HARMLESS_GAP = 0.1
+"""Step in s over which velocities of a vessel hardly change, at any rate of the recorder."""
+
+
 @check("clock", "gaps", fix="split the log there (mask kind: gap)")
 def check_gaps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report time steps that are too long for interpolation."""
@@ -119,13 +123,17 @@ def check_gaps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
         f" after t = {log.t[longest_index]:.2f} s"
     )
     level: Level = "fatal" if lost_time > 0.5 * (log.t[-1] - log.t[0]) else "will mislead"
+    fix = None
+    if float(dt[longest_index]) <= _MAX_HARMLESS_GAP:
+        level = "note"
+        fix = "shorter than any motion of a vessel; no action is needed"
     figures = {
         "count": is_gap.sum(),
         "lost": lost_time,
         "longest": dt[longest_index],
         "t": log.t[longest_index],
     }
-    yield make_finding(text, figures, level=level, sample_mask=is_gap)
+    yield make_finding(text, figures, level=level, fix=fix, sample_mask=is_gap)
 
 
 @check(
