@@ -183,7 +183,7 @@ def test_forces_by_their_units_and_speed_by_its_letter() -> None:
 
 STEERING = {
     "English": "steer steering pwm_steer helm tiller rudder_angle steering_wheel",
-    "German": "Ruder Ruderlage Lenkung Lenkwinkel Pinne Steuer Steuerrad",
+    "German": "Ruder Ruderlage Lenkung Lenkwinkel Pinne Steuerrad",
     "French": "barre safran gouvernail volante",
     "Spanish": "timón caña pala",
     "Portuguese": "leme cana_do_leme",
