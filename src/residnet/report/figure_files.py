@@ -104,7 +104,7 @@ def _pack_curves(panel_curves: Mapping[str, Curve]) -> dict[str, Any]:
     columns: dict[str, np.ndarray] = {}
     for name, (x, y) in panel_curves.items():
         curve_parts = split_at_gaps(x, y)
-        max_points = max(20, min(600, 6_000 // max(len(curve_parts), 1)))
+        max_points = max(20, min(400, 4_000 // max(len(curve_parts), 1)))
         subsampled = join_with_gaps(
             tuple(axis[subsample_indices(len(axis), max_points)] for axis in curve_part)
             for curve_part in curve_parts

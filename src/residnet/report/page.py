@@ -31,6 +31,7 @@ from residnet.report.blocks import (
 from residnet.report.browser import InteractiveFigures, render_bokeh
 from residnet.report.figure import Figure
 from residnet.report.run_reader import RunFiles
+from residnet.report.still import draw_svg
 
 _UNIT_SPACE = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
 """Matches the space between a number and its unit."""
@@ -41,9 +42,10 @@ _MIN_BREAKABLE_LENGTH = 20
 def render_figures(sections: Sequence[Section]) -> InteractiveFigures | None:
     """Render the interactive figures of the sections; None without figures.
 
+    Figures of the first screen, whose section has no title, are drawings in the page itself.
     Rendering takes most of the time of a page. A page that is written twice renders once.
     """
-    return render_bokeh(_collect_figures(sections))
+    return render_bokeh(_collect_figures([section for section in sections if section.title]))
 
 
 def write_page(
@@ -58,7 +60,8 @@ def write_page(
     """Write `report.html` of a run folder atomically.
 
     The page is self-contained: images, styles and scripts are embedded. Without JavaScript, and in
-    print, static images replace the interactive figures. Glossary terms link to their definitions
+    print, static images replace the interactive figures. The figures of the first screen are
+    drawings that need no JavaScript. Glossary terms link to their definitions
     at the end of the page. Provenance and configuration follow if the folder holds
     `provenance.json` and `resolved.yaml`.
 
@@ -94,6 +97,7 @@ def write_page(
         "breakable": _break_long_names,
         "embedded": lambda path: base64.b64encode(path.read_bytes()).decode("ascii"),
         "pixels": _image_size_attributes,
+        "drawn": lambda figure: Markup(draw_svg(figure)),
         "deflated": lambda text: base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii"),
         "anchor": lambda title: re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-"),
         "linked": lambda text: glossary.link_words(_break_long_names(str(text))),
@@ -142,7 +146,7 @@ def exports_section(run: Path) -> Section | None:
     def result(row: ExportRow) -> Cell:
         if row.fault:
             return flag_cell("not exported", True)
-        return Cell("the file gives the model's own answers", mark="text")
+        return Cell("verified against the model", mark="text")
 
     columns: list[Column[ExportRow]] = [
         ("model", lambda row: row.model),
@@ -158,7 +162,7 @@ def _provenance_sections(run: Path, provenance: ProvenanceFile | None) -> list[S
     blocks: list[Block] = []
     if provenance is not None:
         facts = Facts(provenance_facts(provenance))
-        blocks.append(Section("How this run was made", [facts], is_folded=True))
+        blocks.append(Section("Origin of the run", [facts], is_folded=True))
         if inputs := provenance.inputs:
             title = f"SHA-256 of {len(inputs)} input file{'' if len(inputs) == 1 else 's'}"
             checksums = Facts(list(inputs.items()), is_code=True)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Mapping, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,12 +15,14 @@ from residnet.core.files import atomic_write
 from residnet.core.format import format_exponents
 from residnet.report.figure import TEXT_COLOR, Case, Figure, GlyphStyle, split_at_gaps
 
-DPI = 140
-"""Dots per inch: pictures are 980 dots wide, nearly as wide as the page."""
+DPI = 120
+"""Dots per inch: images are 840 pixels wide, nearly as wide as the page."""
 FIGURE_WIDTH = 7.0
 """Width of every image in inches: the text width of an A4 page, so that 9 pt text prints at 9
 pt.
 """
+INLINE_WIDTH = 4.6
+"""Width of a drawing of the first screen in inches: half of a page, or a phone held upright."""
 _MAP_HEIGHT = 4.2
 """Height of a row of maps in inches."""
 _DASHES: dict[str, Any] = {
@@ -85,7 +90,7 @@ def render_matplotlib(
         for k in range(n_lines)
     ]
     n_map_columns = max(len(maps), 1)
-    map_lines = [_MAP_HEIGHT if len(maps) < 3 else 3.0] if maps else []
+    map_lines = [width / FIGURE_WIDTH * (_MAP_HEIGHT if len(maps) < 3 else 3.0)] if maps else []
     with rc_context(RC_PARAMS):
         canvas = Canvas(
             figsize=(width, 0.5 + sum([*map_lines, *heights])), dpi=DPI, layout="constrained"
@@ -264,6 +269,31 @@ def _legend_above(canvas: Any, handles: dict[str, Any], width: float) -> None:
         columns -= 1
     if handles:
         canvas.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=columns)
+
+
+def draw_svg(figure: Figure) -> str:
+    """Draw the first case of a figure as an SVG element, for the first screen of a page.
+
+    The element has no fixed size: it is as wide as its container, at most `INLINE_WIDTH`. Texts
+    are text, so that a reader can search and enlarge them.
+    """
+    from matplotlib import rc_context
+
+    canvas = render_matplotlib(figure, width=INLINE_WIDTH)
+    stream = io.StringIO()
+    # a fixed salt makes the identifiers of clip paths the same in every run
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": figure.html_id}):
+        canvas.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+    text = stream.getvalue()
+    body = text[text.index(">", text.index("<svg")) + 1 :]
+    body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
+    # identifiers of groups repeat in every drawing and are not referred to
+    body = re.sub(r'<g id="[^"]*"', "<g", body).replace("xlink:href", "href")
+    width, height = (72.0 * size for size in canvas.get_size_inches())
+    return (
+        f'<svg viewBox="0 0 {width:g} {height:g}" style="max-width: {INLINE_WIDTH:g}in" role="img"'
+        f' aria-label="{escape(figure.title)}">{body.strip()}'
+    )
 
 
 def save_png(canvas: Any, path: Path, title: str, caption: str) -> None:

@@ -97,7 +97,7 @@ def fit_data_section(run: RunFiles) -> Section | None:
     currents = run.read_record(CurrentsFile, "currents.json")
     if currents is not None:
         blocks.append(Section("Currents", [_currents_table(run, currents.root)], is_folded=True))
-    return Section("What was fitted on what", blocks) if blocks else None
+    return Section("Data and settings", blocks) if blocks else None
 
 
 def _currents_table(run: RunFiles, currents: Sequence[CurrentRow]) -> Table:
@@ -329,16 +329,16 @@ def quality_section(run: RunFiles) -> Section | None:
     logs = run.inspection.logs
     findings = run.inspection.named_findings
     severe_findings = [(name, finding) for name, finding in findings if finding.level != "note"]
-    mask_note = "What the masks of this run leave out does not count."
+    mask_note = "Masked samples are not included."
     if severe_findings:
         n_misled = len({name for name, _ in severe_findings} - {"together"})
-        logs_verb = "log holds" if len(logs) == 1 else "logs hold"
+        logs_verb = "log has" if len(logs) == 1 else "logs have"
         summary = (
-            f"{n_misled} of {len(logs)} {logs_verb} something that would mislead a fit. {mask_note}"
+            f"{n_misled} of {len(logs)} {logs_verb} a fault that would mislead a fit. {mask_note}"
         )
     else:
         logs_text = "the log" if len(logs) == 1 else f"the {len(logs)} logs"
-        summary = f"Nothing in {logs_text} would mislead a fit. {mask_note}"
+        summary = f"No fault in {logs_text} would mislead a fit. {mask_note}"
     blocks: list[Block] = [Text(summary)]
     if severe_findings:
         # one row for each kind of finding, the worst first

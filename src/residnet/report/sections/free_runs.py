@@ -266,7 +266,7 @@ def limits_section(run: RunFiles) -> Section | None:
         " bold interval excludes 0. Bands are thirds of the windows; bands of fewer than three"
         " windows are left out."
     )
-    title = "How good, where it fails, what limits it"
+    title = "Accuracy and its limits"
     return Section(title, [*protocol_sections, Text(notes, is_secondary=True)])
 
 

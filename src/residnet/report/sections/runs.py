@@ -47,6 +47,10 @@ _MAX_TIME_BINS = 60
 They limit the page to a few megabytes and keep the curve smooth.
 """
 _TRACK_PANEL = Panel("north [m]", "east [m]", kind="map", height=380)
+_N_OPENING_PANELS = 3
+"""Number of motion panels on the first screen: surge, sway and yaw rate of a planar vessel."""
+_OPENING_PANEL_HEIGHT = 95
+"""Height of a motion panel on the first screen, so that track and velocities fit a laptop."""
 _MOTION_TITLES = {
     "u": "surge velocity\nu",
     "v": "sway velocity\nv",
@@ -173,18 +177,16 @@ def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | 
     return Figure(
         "free_runs",
         "Free runs",
-        f"Each run starts from a measured state and is given the inputs alone ({run.report_split}"
-        f" data)."
+        "Each free run starts from a measured state and uses only the measured inputs"
+        f" ({run.report_split} data)."
         + (
-            " North is up, and each track begins at its start."
-            " Look for a track that turns tighter, wider or later than the measured one, for lag at"
+            " North is up, and each track begins at its start. Compare the radius of turns,"
             if run.dof.has_position and run.dof.has_heading
-            else " Look for lag at"
+            else " Compare"
         )
-        + " the reversals, and for levels that stay apart once the motion has settled. Where the"
-        " ground is grey, samples are masked and u and v are not scored. Of every kind of"
-        " manoeuvre and protocol, the runs with the least, the median and the largest error of"
-        f" {run.main_model} are here; in print only the median.",
+        + " the delay at reversals and the steady levels. Grey: masked samples, where u and v are"
+        " not evaluated. For every kind of manoeuvre and protocol, the runs with the smallest,"
+        f" median and largest error of {run.main_model} can be chosen; print shows the median.",
         styles,
         panels,
         cases,
@@ -193,10 +195,9 @@ def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | 
 
 
 def track_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
-    """Draw the track of the free run with median error under the main protocol, for the first
-    screen.
+    """Draw the free run with median error under the main protocol, for the first screen.
 
-    The motion replaces the track for a vessel without a track.
+    The panels are the track, where there is one, and the first three velocities.
     """
     ranked_windows = _rank_by_error(
         run, [candidate for candidate in windows if candidate.protocol == run.main_protocol]
@@ -211,10 +212,15 @@ def track_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | Non
         for window_traces in _window_curves(window, "", display_units(run))
     ]
     has_track = run.dof.has_position and run.dof.has_heading
-    panels = [replace(_TRACK_PANEL, height=MAX_PREVIEW_HEIGHT)]
-    if not has_track:
-        panels = _motion_panels("", display_units(run), run.dof)
-        panels[-1] = replace(panels[-1], x_label="time since the start of the free run [s]")
+    panels = _motion_panels("", display_units(run), run.dof)[: _N_OPENING_PANELS + has_track]
+    panels = [
+        replace(panel, height=MAX_PREVIEW_HEIGHT)
+        if panel.kind == "map"
+        # there is no space for the full name of a velocity, only for its symbol
+        else replace(panel, height=_OPENING_PANEL_HEIGHT, y_label=panel.y_label.split("\n")[-1])
+        for panel in panels
+    ]
+    panels[-1] = replace(panels[-1], x_label="time since the start of the free run [s]")
     return Figure(
         "track",
         "Track of the median run" if has_track else "Median run",
@@ -403,10 +409,9 @@ def horizon_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | N
     return Figure(
         "horizon",
         "Error against horizon",
-        f"Root mean square over the free runs of the {run.report_split} data, on a logarithmic"
-        f" scale. A"
-        " model whose curve stays level predicts as well late as early; one whose curve climbs"
-        " drifts. The level that no model undercuts is the measurement noise.",
+        f"Root mean square errors over the free runs of the {run.report_split} data, on a"
+        " logarithmic scale. A constant curve means that the error does not grow with time. The"
+        " noise of the measurements is a lower limit of all curves.",
         {name: replace(style, is_visible=True) for name, style in model_styles(run).items()},
         [replace(panel, y_log=True) for panel in panels],
         cases,
