@@ -266,6 +266,7 @@ def left(reference: Reference, policy: Policy) -> float:
     return float(y * math.cos(LEG) - x * math.sin(LEG))
 
 
+@pytest.mark.long
 def test_without_integral_action_the_error_that_makes_the_crab_angle_stays() -> None:
     """Look-ahead x tan(crab angle) on legs; along a plan more, since the law also damps a return
     that the current undoes.

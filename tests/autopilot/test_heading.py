@@ -288,6 +288,7 @@ def test_a_flight_is_what_an_ode_solver_says() -> None:
     assert found == pytest.approx(truth.tolist(), rel=5e-3)
 
 
+@pytest.mark.long
 def test_the_turn_of_a_slow_vessel_is_waited_for() -> None:
     """Nomoto's model of second order: the area above the answer is T1 + T2 - T3."""
     turning = SteeredPlant(load_vessel("nomoto_mariner_yaw").build()).estimate_nomoto(
@@ -353,6 +354,7 @@ def test_turning_is_that_of_the_model_and_of_a_rudder_that_lags() -> None:
     assert turning.time == pytest.approx(TIME + 1.0, rel=1e-2)
 
 
+@pytest.mark.long
 def test_planes_of_a_learned_torpedo_pitch_it_as_the_vessel_does() -> None:
     vessel = SteeredPlant(load_vessel("remus_100").build(), axis=DEPTH)
     # accelerations as the parameters of the vessel have them

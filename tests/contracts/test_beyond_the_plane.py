@@ -390,7 +390,7 @@ def test_a_draft_sets_the_rates_of_a_roll_beside_means() -> None:
 @pytest.mark.parametrize(
     ("signals", "names"),
     [
-        (ROLLING_SIGNALS, ("restoring", "damping roll")),
+        pytest.param(ROLLING_SIGNALS, ("restoring", "damping roll"), marks=pytest.mark.long),
         pytest.param(
             SUBMERGED_SIGNALS, ("restoring pitch", "damping pitch"), marks=pytest.mark.long
         ),

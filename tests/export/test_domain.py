@@ -41,7 +41,9 @@ def load(name: str, file: Path, made: ExportedVessel) -> LoadedExport:
     return ScriptedModel(torch.jit.load(str(file)), torch.float32)
 
 
-@pytest.mark.parametrize("name", ["c", "casadi", "onnx", "torchscript"])
+@pytest.mark.parametrize(
+    "name", ["c", "casadi", pytest.param("onnx", marks=pytest.mark.exporters), "torchscript"]
+)
 def test_every_format_flags_the_same_samples(name: str, tmp_path: Path) -> None:
     made = exported_with_domain()
     exporter = get_exporter(name)

@@ -427,7 +427,7 @@ DEEP = {"w": (0.1, 0.2, 0.3), "q": (0.01, 0.02, 0.03), "z": (0.1, 0.3, 0.9), "th
     ("table", "signals"),
     [
         (TABLE, EXAMPLE_SIGNALS),
-        (ROLLS.model_copy(update=DEEP), SUBMERGED_SIGNALS),
+        pytest.param(ROLLS.model_copy(update=DEEP), SUBMERGED_SIGNALS, marks=pytest.mark.long),
         (None, ROLLING_SIGNALS),
     ],
 )

@@ -37,7 +37,11 @@ def trial(number: int, *channels: str) -> Log:
 
 @pytest.mark.parametrize(
     ("channels", "velocities"),
-    [(("u", "n"), ("u",)), (("psi", "delta"), ("r",)), (("u", "psi", "n", "delta"), ("u", "r"))],
+    [
+        (("u", "n"), ("u",)),
+        pytest.param(("psi", "delta"), ("r",), marks=pytest.mark.long),
+        (("u", "psi", "n", "delta"), ("u", "r")),
+    ],
 )
 def test_a_fit_is_of_what_the_logs_tell(
     channels: tuple[str, ...], velocities: tuple[str, ...]

@@ -21,7 +21,7 @@ _SEED = 11
 _COUNT = 3
 
 
-@pytest.fixture(scope="module", params=["boat", "twin"])
+@pytest.fixture(scope="module", params=["boat", pytest.param("twin", marks=pytest.mark.long)])
 def fleets(request: pytest.FixtureRequest) -> list[Fleet]:
     return drawn(request.param, _SEED, _COUNT)
 

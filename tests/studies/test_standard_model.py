@@ -146,6 +146,7 @@ def test_preparation_is_the_documents() -> None:
     )
 
 
+@pytest.mark.long
 def test_a_short_trial_runs(tmp_path: Path) -> None:
     programme = "{drives: [0.35, 0.5], steers: [0.3], zigzag: 60, hold: 20, courses: [0]}"
     over = [f"trials.calm.programme={programme}", "trials.calm.preparation.validate_every=2"]

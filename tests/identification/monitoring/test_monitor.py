@@ -81,7 +81,9 @@ def watch(known: tuple[ModelSpec, HybridDynamics]) -> ChangeDetector:
     [
         SystemChange("mass", "", "", 0.15, inertia_share=1.0),
         SystemChange("gain n_stbd", "", "", -0.1, gain_input=1),
-        SystemChange("damping yaw", "", "", -0.2, damping="r"),
+        pytest.param(
+            SystemChange("damping yaw", "", "", -0.2, damping="r"), marks=pytest.mark.long
+        ),
         SystemChange("gyro scale", "", "", 0.05, sensor="gyro_scale"),
     ],
     ids=lambda change: change.name,
