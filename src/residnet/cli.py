@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from residnet.runs.task import FinishedRun
 
 
-SILENCE_SECONDS = 5.0
+SILENCE_SECONDS = 4.0
 """Seconds without output after which the current work is printed."""
 LineSink = Callable[[str], None]
 """Function that receives lines of text."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,9 @@ from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.tasks.autopilot.config import AutopilotConfig, minimum_turn_time
 from residnet.autopilot.tasks.design import draft_autopilot_config
 from residnet.core.config import load_config, load_mapping
-from residnet.core.errors import UsageError
+from residnet.core.errors import ConfigError, UsageError
 from residnet.core.progress import on_progress
+from residnet.tasks.registry import load_task
 
 GAIN = 0.31
 TIME = 7.4
@@ -72,6 +74,9 @@ def test_logs_give_the_vessel_and_the_conditions(tmp_path: Path) -> None:
     density = math.degrees(stated.noise_r) * math.sqrt(0.02 * config.pace)
     assert density == pytest.approx(NOISE * math.sqrt(0.1), rel=0.1)
     assert stated.effect[0] >= 0.8
+    # calm logs: the default motion
+    assert math.degrees(stated.waves) == pytest.approx(0.5)
+    assert config.conditions.beyond["calm"].waves == 0.0
     assert math.degrees(config.rudder) == pytest.approx(20.0, rel=1e-3)
 
 
@@ -95,6 +100,25 @@ def test_gain_and_time_are_enough(tmp_path: Path) -> None:
     ):
         with pytest.raises(UsageError, match=said):
             draft_autopilot_config([given], tmp_path / f"{out}.yaml", rudder=rudder)
+
+
+def test_the_classical_law_is_exported_without_training(tmp_path: Path) -> None:
+    lines: list[str] = []
+    file = draft_autopilot_config(["0.31,7.4"], tmp_path / "law.yaml", classical=True)
+    overrides = ["conditions.evolution.generations=3", "conditions.flights=50", "test.plants=5"]
+    task = load_task(file, overrides)
+    with on_progress(lambda progress: lines.append(f"{progress.stage} {progress.done}")):
+        result = task.run(source=file, output_folder=tmp_path / "run")
+    assert {"tuning ptos 1", "tuning pd 3"} <= set(lines)
+    assert any("hold for the linear model" in sentence for sentence in result.outcome.verdict)
+    rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"]
+    costs = {(row["model"], row["protocol"]): row["cost"]["mean"] for row in rows if "cost" in row}
+    # the exported law is the tuned one
+    for protocol in ("conditions", "beyond_calm"):
+        law_cost = costs["classical", protocol]
+        assert law_cost == pytest.approx(costs["ptos", protocol], rel=1e-3)
+    with pytest.raises(ConfigError, match="tuned law alone"):
+        load_config(file, ["policies.classical.units=16"], AutopilotConfig)
 
 
 CONFIG: dict[str, Any] = {

@@ -22,8 +22,8 @@ HULLS = [name for name in find_vessel_files() if not name.startswith("nomoto")]
 # the forces of a real hull: the published series of the Mariner has Y_0 and N_0, and the screw of
 # the REMUS turns one way
 SYMMETRIC = [name for name in find_vessel_files() if name not in ("mariner", "remus_100")]
-ODD = {"y", "psi", "phi", "v", "r", "p", "delta", "nozzle", "tau_y", "tau_n", "force_y", "force_k",
-       "force_n", "current_east", "force_east", "wind_dir", "_yaw_lag"}  # fmt: skip
+ODD = {"y", "psi", "phi", "v", "r", "p", "delta", "fin", "nozzle", "tau_y", "tau_n", "force_y",
+       "force_k", "force_n", "current_east", "force_east", "wind_dir", "_yaw_lag"}  # fmt: skip
 
 
 def scene(plant: Plant, rows: int = 4) -> tuple[Tensor, Tensor]:

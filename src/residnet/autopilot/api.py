@@ -19,6 +19,7 @@ def design_autopilot(
     rudder: str | None = None,
     rate: str | None = None,
     speed: str | None = None,
+    classical: bool = False,
     folder: PathLikeArg | None = None,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
@@ -31,6 +32,7 @@ def design_autopilot(
         rudder: rudder limit of the controllers with its unit; None for the largest angle in logs.
         rate: rate of the steering gear with its unit; None to identify it from the logs.
         speed: speed that K and T refer to, with its unit; None for the mean of the logs.
+        classical: tune a classical law and train no policy.
         folder: run folder; None for a temporary one that is removed with the result.
         overwrite: replace earlier files and an earlier run.
         progress: callback that receives the progress of the training.
@@ -48,6 +50,7 @@ def design_autopilot(
     config_file = draft_autopilot_config(
         [str(source_entry) for source_entry in sources],
         config_path,
+        classical=classical,
         overwrite=overwrite,
         **steering_options,
     )

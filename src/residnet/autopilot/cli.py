@@ -32,6 +32,12 @@ def autopilot(
         str | None, typer.Option(help="Rate of the steering gear; from the logs if not given.")
     ] = None,
     speed: Annotated[str | None, typer.Option(help="Speed at which K and T hold.")] = None,
+    classical: Annotated[
+        bool,
+        typer.Option(
+            "--classical", help="Tune a classical law and train no policy; takes a minute at most."
+        ),
+    ] = False,
     draft: Annotated[bool, typer.Option("--draft", help="Write the config alone.")] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace earlier files and an earlier run.")
@@ -45,7 +51,13 @@ def autopilot(
 
     with show_progress(quiet=quiet):
         config = draft_autopilot_config(
-            source, output_file, rudder=rudder, rate=rate, speed=speed, overwrite=overwrite
+            source,
+            output_file,
+            rudder=rudder,
+            rate=rate,
+            speed=speed,
+            classical=classical,
+            overwrite=overwrite,
         )
         print(f"config: {config}")
         if draft:

@@ -102,6 +102,8 @@ CHANNEL_UNITS: dict[str, str] = {
     "cmd_stbd": "1/s",
     "cmd_delta": "rad",
     "cmd_delta_s": "rad",
+    "fin": "rad",
+    "cmd_fin": "rad",
     "cmd_n": "1/s",
     "nozzle": "rad",
     "cmd_nozzle": "rad",

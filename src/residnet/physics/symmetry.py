@@ -13,7 +13,7 @@ from residnet.physics.terms import EVEN_FUNCTIONS, Factor, parse_term
 # mirroring at the centre plane changes the sign of motions and forces to the side, and of roll and
 # yaw
 _CHANNEL_PARITY = dict.fromkeys(
-    ("v", "r", "p", "phi", "delta", "tau_y", "tau_n", "wind_v"), -1
+    ("v", "r", "p", "phi", "delta", "fin", "tau_y", "tau_n", "wind_v"), -1
 ) | dict.fromkeys(("u", "w", "q", "z", "theta", "n", "delta_s", "tau_x", "wind_u", "wind_mag"), 1)
 _CHANNEL_PARITY |= {f"{name}_dot": _CHANNEL_PARITY[name] for name in ("u", "v", "w", "p", "q", "r")}
 

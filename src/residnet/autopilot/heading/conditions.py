@@ -25,6 +25,7 @@ from residnet.autopilot.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ExportError, FitError
 from residnet.core.frames import wrap_angle
+from residnet.core.progress import report_progress
 from residnet.dynamics.time_steps import check_steps
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import FreeRun, Rollout, Source
@@ -899,6 +900,7 @@ def tune_parameters(
     settings: TuningConfig,
     seed: int,
     compiler: type[CompiledRollout] | None = None,
+    stage: str = "tuning",
 ) -> TuningResult:
     """Tune the missing parameters of a controller for the lowest mean cost.
 
@@ -912,6 +914,7 @@ def tune_parameters(
         settings: settings of the search.
         seed: seed of conditions and search.
         compiler: compiles the simulations; None for none.
+        stage: name of the progress reports, one per generation.
 
     Raises:
         FitError: if no candidate has a finite cost.
@@ -940,6 +943,13 @@ def tune_parameters(
         fixed_candidate = {name: torch.tensor([value]).double() for name, value in fixed.items()}
         return TuningResult(fixed, float(evaluation.mean_costs(fixed_candidate)[0]), 1)
     axes = config.search_ranges(task.nomoto)
+    n_generations = 0
+
+    def report_generation(*_: Any, **__: Any) -> None:
+        nonlocal n_generations
+        n_generations += 1
+        report_progress(stage, n_generations, settings.generations)
+
     bounds: Any = [(math.log(axes[name].lower), math.log(axes[name].upper)) for name in names]
     result_de = differential_evolution(
         costs,
@@ -951,6 +961,7 @@ def tune_parameters(
         tol=settings.tolerance,
         init="sobol",
         polish=False,
+        callback=report_generation,
         rng=seed,
     )
     if not result_de.fun < _DIVERGED_COST:
@@ -971,7 +982,13 @@ def tune_parameters(
     ):
         return tuned
     simpler_result = tune_parameters(
-        config.with_parameters(disabled_parameters), task, conditions, settings, seed, compiler
+        config.with_parameters(disabled_parameters),
+        task,
+        conditions,
+        settings,
+        seed,
+        compiler,
+        stage,
     )
     return min(tuned, simpler_result, key=lambda each: each.cost)
 

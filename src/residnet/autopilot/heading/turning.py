@@ -267,6 +267,17 @@ def _solve_linear_terms(
     )
 
 
+def compute_response_residual(record: ManoeuvreRecord, response: SteeringResponse) -> Array:
+    """Return measured minus simulated yaw rates [N] in rad/s, without the initial transient."""
+    if response.rate is not None:
+        limited_rudder = limit_rudder_rate(record.rudder, response.rate, record.dt)
+        record = replace(record, rudder=limited_rudder)
+    responses, yaw_rate = _unit_responses(record, response.time, response.delay)
+    gains = np.array([response.gain, response.gain * response.bias])
+    residual: Array = yaw_rate - responses @ gains
+    return residual
+
+
 @dataclass(frozen=True)
 class NomotoModel:
     """Nomoto's model T r_dot + r = K (delta - c psi) at one speed.

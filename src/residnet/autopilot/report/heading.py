@@ -82,6 +82,7 @@ _KIND_LABELS = {
     "policy": "learned",
     "network": "learned, no law inside",
     "constants": "law, constants trained",
+    "law": "classical law, exported",
     "untrained": "policy before training",
     "network_off": "policy, network switched off",
     "classical": "classical, tuned",
@@ -116,7 +117,9 @@ def _iterate_autopilot_figures(run: RunFiles) -> Iterator[Figure]:
         yield _cost_figure(conditioned, conditioned_kinds, run.title, axis_labels)
     fit_notes = {
         name: run.read_json(f"models/{name}/fit.json")
-        for name in run.resolved_config.get("policies") or {}
+        for name, policy in (run.resolved_config.get("policies") or {}).items()
+        # a tuned law has no training
+        if policy.get("training") is not None
     }
     if fit_notes:
         yield _learning_figure(fit_notes, run.title)
@@ -530,7 +533,13 @@ def cost_sentences(rows: Sequence[JsonObject]) -> list[str]:
     if not rows_by_model:
         return []
     best_row = best_classical_row(rows)
-    sentences = []
+    sentences = [
+        f"Under the stated conditions the tuned law '{name}' costs {_mean_cost(row):.3f} s a"
+        f" change; the best classical law, '{best_row['model']}', costs"
+        f" {_mean_cost(best_row):.3f} s."
+        for name, row in rows_by_model.items()
+        if row["kind"] == "law"
+    ]
     for row in sorted(rows_by_model.values(), key=_mean_cost):
         if row["kind"] not in ("policy", "network"):
             continue

@@ -176,7 +176,8 @@ class ForceActuators(ActuatorSystem, ABC):
 
 def commands_from_demand(specs: Sequence[CommandSpec], drive: Tensor, steer: Tensor) -> Tensor:
     """Return commands [..., c] for normalised drive and steer [...]."""
-    demand = {"drive": drive, "steer": steer, "dive": torch.zeros_like(steer)}
+    no_demand = torch.zeros_like(steer)
+    demand = {"drive": drive, "steer": steer, "dive": no_demand, "roll": no_demand}
     shares = [
         demand[spec.demand_axis].clamp(spec.min_share, 1.0) * spec.max_value for spec in specs
     ]

@@ -274,14 +274,15 @@ class CommandSpec(NamedTuple):
 
     Attributes:
         name: name of the command.
-        demand_axis: normalised demand of a manoeuvre that sets it, drive or steer.
+        demand_axis: normalised demand of a manoeuvre that sets it; manoeuvres demand no roll, so
+            that stabiliser fins stay amidships.
         max_value: value at a demand of 1.
         min_share: minimum demand as a share of the maximum; 0 for actuators that act in one
             direction only, otherwise -1.
     """
 
     name: str
-    demand_axis: Literal["drive", "steer", "dive"]
+    demand_axis: Literal["drive", "steer", "dive", "roll"]
     max_value: float
     min_share: float = -1.0
 

@@ -150,13 +150,73 @@ class RudderPropellerConfig(SteeredConfig):
         )
 
 
-class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
-    """Coupled stern rudders with propellers whose thrust is commanded.
+class FinPairConfig(SteeringGearConfig):
+    """Pair of stabiliser fins that act in opposite directions (Gouletas 2020, section 5.2.2.3).
 
-    Commands are cmd_delta [rad] and cmd_thrust [N]; delta [rad] is a state if the rudder has
-    dynamics. Y = -L, K = z L, N = -x L, X = T - D, where delta > 0 turns to starboard (Gouletas
-    2020, eqs. (5.26)-(5.29), where two signs are wrong, see G9 and G10 in
-    docs/documents/corrections.md).
+    A positive angle rolls the vessel to starboard. Lift and induced drag follow (5.20), (5.21) with
+    correction G8 of docs/documents/corrections.md. The angle of attack is the fin angle minus the
+    angle of the inflow that roll, sway and yaw cause,
+    alpha_e = alpha - (r_f p - sin(gamma) (v + x r)) / u, with the lever
+    r_f = y cos(gamma) + z sin(gamma). The normal forces L of both fins give the loads
+    Y = -2 L sin(gamma), K = 2 r_f L, N = x Y and X = -2 D. The drag at zero angle is part of the
+    calm-water resistance of the hull.
+
+    Attributes:
+        area: area of one fin.
+        aspect_ratio: effective aspect ratio a of lift and induced drag.
+        lift_slope: dC_L/d alpha per rad.
+        stall: angle of attack at which lift and drag saturate.
+        x: longitudinal position of the centre of pressure in m, positive forward of the body
+            origin.
+        y: distance of the centre of pressure from the centreline in m.
+        z: position of the centre of pressure below the body origin in m.
+        tilt: angle gamma of the span below the horizontal in rad.
+        density: density of the water.
+    """
+
+    area: SquareMetres = Field(gt=0)
+    aspect_ratio: float = Field(gt=0)
+    lift_slope: float = Field(gt=0)
+    stall: Radians = Field(gt=0, lt=1.5707)
+    x: Metres
+    y: Metres = Field(gt=0)
+    z: Metres
+    tilt: Radians = Field(ge=0, lt=1.5707)
+    density: Density = Field(gt=0)
+
+    def force(self, angle: Tensor, nu: Tensor) -> Tensor:
+        """Compute the loads X, Y [N], K, N [N m], stacked [..., 4].
+
+        Args:
+            angle: fin angle [...] in rad.
+            nu: velocities u, v, p, r through the water [..., 4].
+        """
+        import torch
+
+        u, v, p, r = nu.unbind(dim=-1)
+        sin_tilt = math.sin(self.tilt)
+        lever = self.y * math.cos(self.tilt) + self.z * sin_tilt
+        # the offset keeps the inflow angle and its gradient finite at rest
+        speed_squared = u * u + 1e-4
+        inflow_angle = (lever * p - sin_tilt * (v + self.x * r)) * u / speed_squared
+        angle_of_attack = (angle - inflow_angle).clamp(-self.stall, self.stall)
+        lift_coefficient = self.lift_slope * angle_of_attack
+        dynamic_force = 0.5 * self.density * self.area * speed_squared
+        lift = dynamic_force * lift_coefficient
+        drag = dynamic_force * lift_coefficient**2 / (0.9 * math.pi * self.aspect_ratio)
+        side_force = -2.0 * sin_tilt * lift
+        return torch.stack(
+            (-2.0 * drag, side_force, 2.0 * lever * lift, self.x * side_force), dim=-1
+        )
+
+
+class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
+    """Coupled stern rudders with propellers whose thrust is commanded, and optional fins.
+
+    Commands are cmd_delta [rad], with fins cmd_fin [rad], and cmd_thrust [N]; delta and fin [rad]
+    are states if they have dynamics. The rudder forces are Y = -L, K = z L, N = -x L and
+    X = T - D, where delta > 0 turns to starboard (Gouletas 2020, eqs. (5.26)-(5.29), where two
+    signs are wrong, see G9 and G10 in docs/documents/corrections.md).
 
     Attributes:
         x: longitudinal position of the centre of pressure of the rudders in m, negative aft of the
@@ -164,11 +224,13 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
         z: vertical position of the centre of pressure in m, positive below the body origin.
         thrust: maximum total thrust of the propellers. Commands are clamped between zero and this
             value, because the source has no astern thrust.
+        fins: stabiliser fins, for vessels with roll; null for none.
     """
 
     x: Metres = Field(lt=0)
     z: Metres
     thrust: Newtons = Field(gt=0)
+    fins: FinPairConfig | None = None
 
     @abstractmethod
     def lift_and_drag(
@@ -184,26 +246,34 @@ class SternRuddersConfig(SteeringGearConfig, SteeredConfig, ABC):
         """
 
     def command_specs(self) -> tuple[CommandSpec, ...]:
-        """Return the commands: rudder angle, and thrust without astern thrust."""
+        """Return the commands: rudder angle, fin angle, and thrust without astern thrust."""
+        fin_commands = (
+            [] if self.fins is None else [CommandSpec("cmd_fin", "roll", self.fins.limit)]
+        )
         return (
             CommandSpec("cmd_delta", "steer", self.limit),
+            *fin_commands,
             CommandSpec("cmd_thrust", "drive", self.thrust, 0.0),
         )
 
     def servo_specs(self) -> tuple[ServoSpec, ...]:
-        return (self.servo_spec("delta"),)
+        fin_servos = [] if self.fins is None else [self.fins.servo_spec("fin")]
+        return (self.servo_spec("delta"), *fin_servos)
 
     def servo_commands(self, command: Tensor) -> Tensor:
-        """Return the rudder command [..., 1]; thrust has no dynamics."""
-        return command[..., :1]
+        """Return the commands of rudder and fins [..., 1 or 2]; thrust has no dynamics."""
+        return command[..., :-1]
 
     @final
     def force(self, position: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         import torch
 
-        thrust = command[..., 1].clamp(0.0, self.thrust)
+        thrust = command[..., -1].clamp(0.0, self.thrust)
         lift, drag = self.lift_and_drag(position[..., 0], nu[..., 0], nu[..., 1], thrust)
-        return torch.stack((thrust - drag, -lift, self.z * lift, -self.x * lift), dim=-1)
+        force = torch.stack((thrust - drag, -lift, self.z * lift, -self.x * lift), dim=-1)
+        if self.fins is None:
+            return force
+        return force + self.fins.force(position[..., 1], nu)
 
 
 @final

@@ -63,17 +63,20 @@ class PolicyConfig(Config):
         units: number of units of the recurrent network; 0 to train the constants of a law only.
         learned: learned model to train on instead of the vessel; the policy is
             compared on the vessel.
-        training: settings of the training.
+        training: settings of the training; null for the tuned law of `start` without training,
+            which requires `units: 0`.
     """
 
     start: PartName | None
     units: int = Field(default=16, ge=0, le=10_000)
     learned: LearnedModelConfig | None = None
-    training: PolicyTraining = PolicyTraining()
+    training: PolicyTraining | None = PolicyTraining()
 
     @property
     def role(self) -> str:
-        """Role in the rows of metrics.json: policy, network, or constants."""
+        """Role in the rows of metrics.json: policy, network, constants, or law."""
+        if self.training is None:
+            return "law"
         if self.start is None:
             return "network"
         return "policy" if self.units else "constants"
@@ -82,6 +85,8 @@ class PolicyConfig(Config):
     def _require_trainable(self) -> Self:
         if self.start is None and self.units == 0:
             raise ValueError("units: a policy without a law needs a network, at least one unit")
+        if self.training is None and (self.units > 0 or self.learned is not None):
+            raise ValueError("training: null is the tuned law alone; set units: 0, remove learned")
         return self
 
 
@@ -341,7 +346,7 @@ class AutopilotConfig(PackageTask, ComputingTask):
         learned_models = [
             (self.training_vessel(name), policy.training.dt)
             for name, policy in self.policies.items()
-            if policy.learned is not None
+            if policy.learned is not None and policy.training is not None
         ]
         vessel = self.steered_vessel
         try:
@@ -451,7 +456,10 @@ class AutopilotConfig(PackageTask, ComputingTask):
         conditions = {"stated": scaled_conditions.pop("stated"), "beyond": scaled_conditions}
         policies = {
             name: item.model_copy(
-                update={"training": scale_fields(item.training, "dt", "hold", "duration")}
+                update={
+                    "training": item.training
+                    and scale_fields(item.training, "dt", "hold", "duration")
+                }
             )
             for name, item in self.policies.items()
         }

@@ -67,6 +67,7 @@ from residnet.core.progress import begin_stage, log_message, report_progress
 from residnet.dynamics.store import rebuild_module
 from residnet.engine.compiled import CompiledRollout
 from residnet.evaluation.metrics import SCHEMA
+from residnet.physics.nomoto_config import NomotoVesselConfig
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import RunModelStore
@@ -172,6 +173,7 @@ def _tune_peer(
         return peer, {"config": peer.model_dump(mode="json")}
     assert evaluation_conditions is not None
     start_time = time.time()
+    begin_stage(f"tuning {name}")
     steering = steering._replace(vessel=_build_vessel_for_conditions(config, evaluation_conditions))
     tuning = tune_parameters(
         peer,
@@ -180,6 +182,7 @@ def _tune_peer(
         evaluation_conditions.evolution,
         config.seed + 11,
         CompiledRollout,
+        f"tuning {name}",
     )
     constants = ", ".join(f"{key} {value:.4g}" for key, value in tuning.parameters.items())
     log_message(f"  tuned {name}: {constants}, cost {tuning.cost:.3f} s")
@@ -218,10 +221,9 @@ def _train_policy_or_resume(
     assert evaluation_conditions is not None
     training_vessel = config.training_vessel(name)
     nomoto = steering.nomoto
-    if policy_config.learned is not None:
-        nomoto = training_vessel.estimate_nomoto(
-            config.rudder, config.turning_time, policy_config.training.dt
-        )
+    training = policy_config.training
+    if policy_config.learned is not None and training is not None:
+        nomoto = training_vessel.estimate_nomoto(config.rudder, config.turning_time, training.dt)
         log_message(
             f"  {name} learns on {policy_config.learned.model} of {policy_config.learned.run}: K ="
             f" {nomoto.gain:.4g} 1/s, T = {nomoto.time:.4g} s"
@@ -234,7 +236,7 @@ def _train_policy_or_resume(
         "limit": steering.limit,
         "rate": training_vessel.rate,
         "dt": steering.dt,
-        "trained_at": policy_config.training.dt,
+        "trained_at": steering.dt if training is None else training.dt,
         "units": policy_config.units,
         **({"law": observed_law.model_dump()} if isinstance(observed_law, ObservedConfig) else {}),
     }
@@ -250,18 +252,23 @@ def _train_policy_or_resume(
     store = RunModelStore(folder)
     notes = store.restore_module(name, policy)
     start_times = (time.time(), time.process_time())
-    if notes is None:
+    if notes is None and training is None:
+        notes = {"seconds": 0.0, "cpu_seconds": 0.0, "constants": policy.constant_values()}
+        store.save_module(name, spec, policy, notes)
+        policy = rebuild_module(spec, policy)
+    elif notes is None:
+        assert training is not None
         begin_stage(f"training {name}")
-        compiler = partial(CompiledRollout, max_gradient_ratio=policy_config.training.outlying)
+        compiler = partial(CompiledRollout, max_gradient_ratio=training.outlying)
         notes = train_policy(
             name,
             policy,
             training_vessel,
-            policy_config.training,
+            training,
             evaluation_conditions.stated,
             config.seed,
             folder.path,
-            compiler if policy_config.training.compiled else None,
+            compiler if training.compiled else None,
         )
         seconds = time.time() - start_times[0]
         cpu = time.process_time() - start_times[1]
@@ -274,6 +281,8 @@ def _train_policy_or_resume(
     policy.set_step(steering.dt)
     for built_policy in (policy, untrained_policy):
         built_policy.set_state_columns(steering.vessel.state)
+    if training is None:
+        return policy.double(), notes, untrained_policy
     log_message(
         f"  {name}: cost {notes['best_validation']:.3f} s, {notes['start_validation']:.3f} s at the"
         f" start, after {notes['seconds']:.0f} s of training"
@@ -313,6 +322,7 @@ def _run_step_tests(
     rows: list[dict[str, Any]] = []
     corner_tables = []
     random_tables = []
+    begin_stage("step tests")
     for name, (role, policy) in controllers.items():
         run_step_test = partial(
             simulate_steps, vessel, policy, reference_change, test.dt, test.duration
@@ -446,6 +456,8 @@ def _summarize(
             " vessel"
             " at the corners of the spread."
         )
+    if (scope := _describe_linear_scope(config)) and config.policies:
+        sentences.append(scope)
     if config.floor is not None:
         sentences.append(
             f"The fastest possible change of the nominal vessel, by '{config.floor}' that knows it"
@@ -455,6 +467,17 @@ def _summarize(
         if row["protocol"] == "conditions" and row["model"] in config.policies:
             summary_metrics[f"{row['model']}_cost"] = SummaryMetric(row["cost"]["mean"], "s")
     return sentences, summary_metrics
+
+
+def _describe_linear_scope(config: AutopilotConfig) -> str:
+    """Return that costs and overshoots hold for a linear vessel only; empty for other vessels."""
+    if not isinstance(load_vessel(config.vessel), NomotoVesselConfig):
+        return ""
+    return (
+        "Costs, settling times and overshoots hold for the linear model with K and T within the"
+        " stated ranges. They are no statement on the overshoot of the vessel itself, whose"
+        " steering is nonlinear: measure it in a step of the course."
+    )
 
 
 def export_model(config: AutopilotConfig, request: ExportRequest) -> Path:
@@ -475,6 +498,8 @@ def export_model(config: AutopilotConfig, request: ExportRequest) -> Path:
     }
     learned = config.policies[name].learned
     card_fields |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
+    if scope := _describe_linear_scope(config):
+        card_fields["scope"] = scope
     card_fields |= {
         "not_for": [*list_unsuitable_conditions(name, rows), *describe_limit_cycles(name, rows)]
     }

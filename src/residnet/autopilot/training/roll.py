@@ -1,0 +1,245 @@
+"""Tuning and training of roll-reduction policies over random seas."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, final
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from residnet.autopilot.roll import (
+    GAIN_NAMES,
+    RollPolicy,
+    RollSimulation,
+    RollWeights,
+    Sea,
+)
+from residnet.core.progress import report_progress
+from residnet.preprocessing.data_module import EpochDataModule
+from residnet.training.config import OneStage
+from residnet.training.trainer import EpochTraining, run_epochs
+
+_DEFAULT_WEIGHTS: Final = RollWeights()
+_DIVERGED_COST: Final = 1e6
+"""Cost of a simulation that is not finite."""
+SEARCH_RANGES: Final[Mapping[str, tuple[float, float]]] = {
+    "heading_gain": (0.05, 3.0),
+    "yaw_rate_gain": (0.05, 20.0),
+    "filter_share": (0.005, 1.0),
+    "rudder_roll_rate_gain": (0.01, 5.0),
+    "rudder_roll_gain": (0.003, 3.0),
+    "fin_roll_rate_gain": (0.05, 20.0),
+    "fin_roll_gain": (0.01, 10.0),
+}
+"""Ranges of the search of each constant; the search is over logarithms."""
+
+
+class RollTraining(OneStage):
+    """Settings of the training of a roll policy by gradients through the closed loop.
+
+    Attributes:
+        steps: number of batches per epoch.
+        rows_per_sea: number of realisations of each sea in a batch.
+        validation_rows: number of realisations of each sea for the selection of the epoch.
+    """
+
+    epochs: int = Field(default=10, ge=1, le=100_000)
+    learning_rate: float = Field(default=3e-3, gt=0)
+    steps: int = Field(default=12, ge=1, le=100_000)
+    rows_per_sea: int = Field(default=3, ge=1, le=10_000)
+    validation_rows: int = Field(default=6, ge=1, le=10_000)
+
+
+@final
+class RollFit(EpochTraining):
+    """Training of a roll policy on random seas, with new realisations in every batch.
+
+    Args:
+        policy: trained policy, float32.
+        simulation: simulations of the vessel.
+        seas: conditions, all in every batch.
+        weights: weights of the cost.
+        settings: settings of the training.
+        seed: seed of batches and validation.
+    """
+
+    def __init__(
+        self,
+        policy: RollPolicy,
+        simulation: RollSimulation,
+        seas: Sequence[Sea],
+        weights: RollWeights,
+        settings: RollTraining,
+        seed: int,
+    ) -> None:
+        super().__init__(settings, seed)
+        self.policy = policy
+        self.simulation = simulation
+        self.seas = list(seas)
+        self.weights = weights
+        self.validation_inputs, self.validation_heights = simulation.sample_inputs(
+            seas, settings.validation_rows, seed + 1_000_003
+        )
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Return Adam over the constants of the law and the network."""
+        return torch.optim.Adam(self.policy.parameters(), lr=self.settings.learning_rate)
+
+    def on_fit_start(self) -> None:
+        """Validate the initial law, so that training never returns a worse policy."""
+        super().on_fit_start()
+        if not self.history:
+            self.validate_start()
+
+    def on_train_epoch_start(self) -> None:
+        """Set the learning rate of the epoch."""
+        self.seed_epoch()
+        for group in self.trainer.optimizers[0].param_groups:
+            group["lr"] = self.settings.rate(self.epoch)
+
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, number: int) -> Any:
+        """Return the batch unchanged, because policies are trained on the CPU."""
+        return batch
+
+    def training_step(self, batch: tuple[Tensor, Tensor], number: int) -> Tensor:
+        """Return the mean cost of a batch of inputs and wave heights."""
+        inputs, heights = batch
+        costs = self.simulation.simulate(self.policy, inputs).costs(heights, self.weights)
+        loss = costs.mean()
+        self._losses.append(float(loss.detach()))
+        return loss
+
+    def compute_validation_score(self) -> tuple[nn.Module, float]:
+        """Return the policy and its mean cost over the validation seas."""
+        with torch.no_grad():
+            runs = self.simulation.simulate(self.policy, self.validation_inputs)
+            score = float(runs.costs(self.validation_heights, self.weights).mean())
+        return self.policy, score
+
+
+@final
+class RandomSeas(EpochDataModule):
+    """Random realisations of the seas of a training, new ones in every batch."""
+
+    def __init__(self, fit: RollFit) -> None:
+        super().__init__(fit.seed, lambda: fit.epoch)
+        self.fit = fit
+
+    @property
+    def n_batches(self) -> int:
+        return int(self.fit.settings.steps)
+
+    def iterate_batches(self, epoch: int) -> Iterator[tuple[Tensor, Tensor]]:
+        for number in range(self.n_batches):
+            seed = (self.seed * 1_000 + epoch) * 1_000 + number
+            yield self.fit.simulation.sample_inputs(
+                self.fit.seas, self.fit.settings.rows_per_sea, seed
+            )
+
+
+def train_roll_policy(
+    name: str,
+    policy: RollPolicy,
+    simulation: RollSimulation,
+    seas: Sequence[Sea],
+    settings: RollTraining,
+    *,
+    weights: RollWeights = _DEFAULT_WEIGHTS,
+    seed: int = 0,
+    folder: Path | None = None,
+) -> dict[str, Any]:
+    """Train a policy in place by the trainer of all networks, and load the best epoch.
+
+    Args:
+        name: name of the policy.
+        policy: trained policy; without a network the constants of the law are trained.
+        simulation: simulations of the vessel.
+        seas: conditions of the training.
+        settings: settings of the training.
+        weights: weights of the cost.
+        seed: seed of the training.
+        folder: folder of the checkpoint; None for none.
+
+    Returns:
+        The curve by epoch, and the cost at the start and of the best epoch.
+    """
+    fit = RollFit(policy, simulation, seas, weights, settings, seed)
+    notes: dict[str, Any] = run_epochs(name, fit, RandomSeas(fit), policy, policy, folder)
+    return notes
+
+
+def tune_roll_law(
+    simulation: RollSimulation,
+    seas: Sequence[Sea],
+    limits: tuple[float, float],
+    tuned: Sequence[str] = GAIN_NAMES,
+    *,
+    weights: RollWeights = _DEFAULT_WEIGHTS,
+    generations: int = 14,
+    population: int = 4,
+    seed: int = 0,
+) -> tuple[dict[str, float], float]:
+    """Tune constants of the classical law by differential evolution; the others are zero.
+
+    Args:
+        simulation: simulations of the vessel.
+        seas: conditions; all candidates are simulated in the same realisations.
+        limits: limits of rudder and fins in rad.
+        tuned: names of the tuned constants.
+        weights: weights of the cost.
+        generations: largest number of generations.
+        population: candidates per generation and constant.
+        seed: seed of the search.
+
+    Returns:
+        The constants by name, and their mean cost.
+    """
+    from scipy.optimize import differential_evolution
+
+    inputs, heights = simulation.sample_inputs(seas, 1, seed + 11)
+    n_seas = len(inputs)
+    n_generations = 0
+
+    def mean_costs(points: np.ndarray, /) -> Any:
+        nonlocal n_generations
+        candidates = torch.from_numpy(np.exp(points.reshape(len(tuned), -1))).float()
+        n_candidates = candidates.shape[1]
+        gains = {
+            name: (
+                candidates[tuned.index(name)]
+                if name in tuned
+                else torch.full((n_candidates,), float(name == "filter_share"))
+            ).repeat_interleave(n_seas)
+            for name in GAIN_NAMES
+        }
+        policy = RollPolicy(gains, limits, 0, simulation.dt)
+        with torch.no_grad():
+            runs = simulation.simulate(policy, inputs.repeat(n_candidates, 1, 1))
+            costs = runs.costs(heights.repeat(n_candidates), weights)
+        n_generations += 1
+        report_progress("tuning the roll law", min(n_generations, generations + 1), generations + 1)
+        finite_costs = costs.nan_to_num(_DIVERGED_COST, _DIVERGED_COST)
+        return finite_costs.reshape(n_candidates, n_seas).mean(1).double().numpy()
+
+    bounds: Any = [
+        (math.log(lower), math.log(upper)) for lower, upper in (SEARCH_RANGES[n] for n in tuned)
+    ]
+    result = differential_evolution(
+        mean_costs,
+        bounds,
+        vectorized=True,
+        updating="deferred",
+        popsize=population,
+        maxiter=generations,
+        init="sobol",
+        polish=False,
+        rng=seed,
+    )
+    gains = {name: float(name == "filter_share") for name in GAIN_NAMES}
+    gains |= dict(zip(tuned, (math.exp(value) for value in result.x), strict=True))
+    return gains, float(result.fun)
