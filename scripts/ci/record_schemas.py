@@ -17,6 +17,7 @@ from pydantic import BaseModel, RootModel
 
 from residnet.core.records import StoredFile
 from residnet.core.run_records import ExportsFile, ProvenanceFile, SummaryFile
+from residnet.evaluation.derivatives import DerivativesFile
 from residnet.evaluation.records import (
     BandsFile,
     BookletFile,
@@ -51,6 +52,7 @@ RECORDS: dict[str, type[StoredFile]] = {
     "bands.json": BandsFile,
     "goodness.json": GoodnessFile,
     "booklet.json": BookletFile,
+    "derivatives.json": DerivativesFile,
     "data_quality.json": DataQualityFile,
     "doctor.json": InspectionFile,
     "compatibility.json": CompatibilityFile,

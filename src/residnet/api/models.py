@@ -24,6 +24,7 @@ from residnet.core.registry import register_kind
 from residnet.core.run_loader import accept_run, name_damaged_key
 from residnet.core.trust import trusting
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.scaling import ScaleEffects
 from residnet.dynamics.store import ModelSpec, load_model, resolve_model_name, save_model
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
@@ -53,7 +54,8 @@ from residnet.identification.recursive_refit import (
     make_refitted_model,
     refit_recursively,
 )
-from residnet.physics.similarity import Particulars
+from residnet.identification.scaling import scale_fitted_model
+from residnet.physics.similarity import FroudeScaling, Particulars
 from residnet.runs.folder import verify_checksums
 
 if TYPE_CHECKING:
@@ -146,6 +148,32 @@ class Model:
             order=order,
             scale=scale,
             density_ratio=density_ratio,
+        )
+
+    def scale(self, scale: float, *, density_ratio: float = 1.0, **effects: Any) -> Model:
+        """Return the model of a similar vessel at the same Froude number, such as the ship.
+
+        Coefficients, inputs, time step, ranges and prediction intervals are scaled by Froude's law.
+
+        Args:
+            scale: length of the target vessel divided by that of the vessel in the logs.
+            density_ratio: ratio of the densities of the water.
+            **effects: full-scale corrections with their `source`: factors `resistance`,
+                `propeller` and `rudder` of forces at full scale relative to the scaled ones.
+
+        Raises:
+            UsageError: if the model has parts with dimensional constants that cannot be scaled.
+            ConfigError: if a factor is not plausible, or has no source.
+
+        Example:
+            ship = model.scale(50, density_ratio=1.025)
+        """
+        return Model(
+            scale_fitted_model(
+                self.fitted_model,
+                FroudeScaling(scale, density_ratio),
+                validate_config(effects, ScaleEffects, "scale effects"),
+            )
         )
 
     def step(self, x: Any, w: Any, s: Any = None) -> tuple[np.ndarray, np.ndarray]:

@@ -408,6 +408,21 @@ class Quantity:
         return [unit for unit in unit_names() if si_unit(unit) == self.si]
 
 
+@dataclass(frozen=True)
+class PolynomialOf:
+    """Marker of the coefficients c_0, c_1, ... of a polynomial with dimensions.
+
+    Used in an annotation: `Annotated[tuple[float, float, float], PolynomialOf("N", "1/s")]`.
+
+    Attributes:
+        value: SI unit of the polynomial.
+        variable: SI unit of its variable.
+    """
+
+    value: str
+    variable: str
+
+
 _QUANTITY_PATTERN = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 
 

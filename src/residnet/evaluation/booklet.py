@@ -49,8 +49,10 @@ class BookletConfig(Config):
         initial: initial states by name.
         manoeuvres: standard manoeuvres.
         duration: duration of manoeuvres that define none, and time limit of the others.
-        repeat: splits whose measured zigzags are repeated in closed loop with the measured rudder
-            angles and reversals.
+        repeat: splits whose measured zigzags and turning circles are repeated in closed loop with
+            the measured rudder angles and reversals.
+        skip_failed: whether a manoeuvre that the model cannot complete is left out with a remark;
+            otherwise it is an error.
         draws: number of parameter draws.
         level: level of the prediction intervals.
         seed: seed of the draws.
@@ -64,6 +66,7 @@ class BookletConfig(Config):
     manoeuvres: tuple[ManoeuvreConfig, ...] = Field(min_length=1)
     duration: Seconds = Field(default=600.0, gt=0, le=86_400)
     repeat: tuple[str, ...] = ("validation", "test")
+    skip_failed: bool = False
     draws: int = Field(default=100, ge=20, le=100_000)
     level: float = Field(default=0.95, gt=0, lt=1)
     seed: int = Field(default=0, ge=0)
@@ -119,7 +122,13 @@ class BookletPage:
 
 
 def build_booklet(
-    model: str, length: float, scale: float, draws: int, level: float, pages: Sequence[BookletPage]
+    model: str,
+    length: float,
+    scale: float,
+    draws: int,
+    level: float,
+    pages: Sequence[BookletPage],
+    remarks: Sequence[str] = (),
 ) -> BookletFile:
     """Return the contents of booklet.json in SI units and rad, in the scale of the logs.
 
@@ -127,6 +136,7 @@ def build_booklet(
 
     Args:
         length: length of the hull in the scale of the logs, m.
+        remarks: manoeuvres that are left out, with their reasons.
     """
 
     rows = [_page_row(page, length, scale, level) for page in pages]
@@ -140,6 +150,7 @@ def build_booklet(
         level=level,
         units={name: INDEX_UNITS[name] for name in index_names},
         pages=tuple(rows),
+        remarks=tuple(remarks),
     )
 
 

@@ -23,6 +23,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from residnet.baselines.base import Baseline, ParametricBaseline
@@ -43,6 +44,7 @@ from residnet.physics.similarity import (
     estimate_added_mass,
     estimate_linear_derivatives,
     froude_factor,
+    is_drive,
 )
 
 _AXES = ("X", "Y", "N")
@@ -71,9 +73,10 @@ class DerivativeRow(Record):
             unknown.
         ci95: 95 % confidence interval in SI units; None without standard error.
         is_significant: whether the interval excludes zero; None without standard error.
-        prime_i, prime_ii, bis: value in the non-dimensional systems; None where particulars that
-            the system needs are unknown.
+        prime_i: value in the prime I system; None where a particular that it needs is unknown.
         prime_i_error: standard error in the prime I system.
+        prime_ii: value in the prime II system.
+        bis: value in the bis system.
     """
 
     name: str
@@ -91,10 +94,9 @@ class DerivativeRow(Record):
 
 
 class DerivativesFile(FileRecord):
-    """Hydrodynamic derivatives of a model.
+    """derivatives.json: hydrodynamic derivatives of a model.
 
     Attributes:
-        schema_name: format of the file.
         model: name of the model.
         quantity: `force`, or `acceleration` where the masses are unknown.
         masses: source of the masses: `identified` from forces in the logs, `estimated` from
@@ -112,7 +114,7 @@ class DerivativesFile(FileRecord):
         remarks: sentences about limits of the figures.
     """
 
-    schema_name: str
+    schema_name: Literal["residnet.derivatives/1"] = Field(alias="schema")
     model: str
     quantity: Literal["force", "acceleration"]
     masses: MassSource
@@ -310,7 +312,7 @@ def compute_derivatives(
         scaled_mass = mass_of(theta) * _mass_factors(scale, density_ratio)
         mass_matrix = scaled_mass.tolist()
     return DerivativesFile(
-        schema_name="residnet.derivatives/1",
+        schema="residnet.derivatives/1",
         model=spec.name,
         quantity="force" if is_force else "acceleration",
         masses=source,
@@ -370,17 +372,6 @@ def _complete_particulars(baseline: ParametricBaseline, particulars: Particulars
             "centre_of_gravity": force_model.x_G,
             "density": force_model.density,
         }
-    )
-
-
-_DRIVE_PREFIXES = ("n", "tau_x", "thrust", "throttle")
-
-
-def is_drive(name: str) -> bool:
-    """Return whether an input is that of a propeller or thrust, by its name."""
-    base_name = name.removeprefix("cmd_")
-    return any(
-        base_name == prefix or base_name.startswith(f"{prefix}_") for prefix in _DRIVE_PREFIXES
     )
 
 

@@ -851,6 +851,7 @@ class BookletFile(FileRecord):
         level: level of the intervals.
         units: unit of each index.
         pages: indices by manoeuvre.
+        remarks: manoeuvres that the model could not complete, with their reasons.
     """
 
     schema_name: Literal["residnet.booklet/1"] = Field(alias="schema")
@@ -861,6 +862,7 @@ class BookletFile(FileRecord):
     level: float
     units: dict[str, str]
     pages: tuple[BookletRow, ...]
+    remarks: tuple[str, ...] = ()
 
 
 # indices.json

@@ -11,14 +11,32 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+)
 
-from pydantic import Field
+from pydantic import BaseModel, Field
 
-from residnet.core.config import Config, Kilograms, Metres, MetresPerSecond
+from residnet.core.config import (
+    Config,
+    Kilograms,
+    Metres,
+    MetresPerSecond,
+    PolynomialOf,
+    Quantity,
+)
 from residnet.core.errors import UsageError
-from residnet.physics.parameters import Density
-from residnet.physics.terms import Factor
+from residnet.core.names import get_si_unit
+from residnet.physics.parameters import Density, Parameter, parse_dimension
+from residnet.physics.terms import Factor, parse_term
 
 SystemName = Literal["prime_i", "prime_ii", "bis"]
 GRAVITY = 9.81
@@ -69,6 +87,9 @@ _DIMENSION_OF_UNIT = {
     "N": Dimension(1, 1, -2),
     "N m": Dimension(1, 2, -2),
     "W": Dimension(1, 2, -3),
+    "m^2": Dimension(0, 2, 0),
+    "m^3": Dimension(0, 3, 0),
+    "kg/m^3": Dimension(1, -3, 0),
 }
 
 
@@ -191,6 +212,27 @@ class Particulars(Config):
         )
 
 
+class DerivativesConfig(Particulars):
+    """Hydrodynamic derivatives that a fit writes for one of its baselines.
+
+    Attributes:
+        model: name of the baseline.
+        order: highest order of the Taylor series.
+        scale: length of the ship divided by that of the vessel in the logs.
+        density_ratio: density of the ship's water divided by that of the logs.
+    """
+
+    model: str = "baseline"
+    order: int = Field(default=1, ge=1, le=3)
+    scale: float = Field(default=1.0, gt=0)
+    density_ratio: float = Field(default=1.0, gt=0)
+
+    def particulars(self) -> Particulars:
+        """Return the main particulars alone."""
+        names = Particulars.model_fields
+        return Particulars.model_construct(**{name: getattr(self, name) for name in names})
+
+
 def froude_factor(dimension: Dimension, scale: float, density_ratio: float = 1.0) -> float:
     """Return the factor of a quantity between similar vessels at the same Froude number.
 
@@ -204,6 +246,166 @@ def froude_factor(dimension: Dimension, scale: float, density_ratio: float = 1.0
     """
     scales = ReferenceScales(scale**3 * density_ratio, scale, math.sqrt(scale))
     return scales.factor(dimension)
+
+
+_DRIVE_PREFIXES = ("n", "tau_x", "thrust", "throttle")
+
+
+def is_drive(name: str) -> bool:
+    """Return whether an input is that of a propeller or thrust, by its name."""
+    base_name = name.removeprefix("cmd_")
+    return any(
+        base_name == prefix or base_name.startswith(f"{prefix}_") for prefix in _DRIVE_PREFIXES
+    )
+
+
+def is_rudder(name: str) -> bool:
+    """Return whether an input is the angle of a rudder, by its name."""
+    return name.removeprefix("cmd_").startswith(("delta", "rudder"))
+
+
+ConfigT = TypeVar("ConfigT", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class FroudeScaling:
+    """Conversion of quantities between similar vessels at the same Froude number.
+
+    Attributes:
+        scale: length of the target vessel divided by that of the original.
+        density_ratio: density of the water at the target divided by that at the original.
+
+    Raises:
+        UsageError: if a ratio is not a positive number.
+    """
+
+    scale: float
+    density_ratio: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, example in (("scale", "50"), ("density_ratio", "1.025")):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise UsageError(
+                    f"{name}: expected a positive number such as {example}, got {value:g}"
+                )
+
+    @property
+    def inverse(self) -> FroudeScaling:
+        """Conversion from the target back to the original."""
+        return FroudeScaling(1.0 / self.scale, 1.0 / self.density_ratio)
+
+    @property
+    def time_factor(self) -> float:
+        """Factor of times."""
+        return math.sqrt(self.scale)
+
+    def factor(self, dimension: Dimension) -> float:
+        """Return the factor of a quantity."""
+        return froude_factor(dimension, self.scale, self.density_ratio)
+
+    def unit_factor(self, unit: str) -> float:
+        """Return the factor of quantities in an SI unit; 1 if it is not mechanical, such as V."""
+        return self.factor(dimension_of_unit(unit) or DIMENSIONLESS)
+
+    def channel_factor(self, name: str) -> float:
+        """Return the factor of a channel; 1 without a known unit, such as a share of thrust."""
+        return self.unit_factor(get_si_unit(name) or "-")
+
+    def term_factor(self, term: str, names: Sequence[str]) -> float:
+        """Return the factor of a product of channels, such as u|u| delta.
+
+        Args:
+            term: the term.
+            names: names of the channels.
+        """
+        units = {name: get_si_unit(name) or "-" for name in names}
+        return self.factor(dimension_of_term(parse_term(term, names), units) or DIMENSIONLESS)
+
+    def scale_config(self, config: ConfigT) -> ConfigT:
+        """Return a config whose dimensional values are those of the target.
+
+        The units are those of the annotations, such as `Metres`, and of parameters of vessel files.
+        Numbers without a unit, such as coefficients in a mapping of terms, do not change.
+        """
+        if isinstance(config, Parameter):
+            factor = self.factor(_dimension_of_parameter(config.unit))
+            return config.model_copy(update={"value": config.value * factor})
+        return config.model_copy(
+            update={
+                name: self._scale_value(
+                    getattr(config, name), _annotate(field.annotation, field.metadata)
+                )
+                for name, field in type(config).model_fields.items()
+            }
+        )
+
+    def _scale_value(self, value: Any, annotation: Any) -> Any:
+        """Return a value of a config with this annotation at the target scale."""
+        if isinstance(value, BaseModel):
+            return self.scale_config(value)
+        members = _list_alternatives(annotation)
+        polynomial = next((m for m in members if isinstance(m, PolynomialOf)), None)
+        if polynomial is not None and isinstance(value, tuple):
+            return tuple(
+                coefficient
+                * self.unit_factor(polynomial.value)
+                / self.unit_factor(polynomial.variable) ** power
+                for power, coefficient in enumerate(value)
+            )
+        if isinstance(value, tuple | list):
+            element_types = next(
+                (get_args(member) for member in members if get_origin(member) in (tuple, list)), ()
+            )
+            is_uniform = len(element_types) != len(value) or Ellipsis in element_types
+            return type(value)(
+                self._scale_value(
+                    element,
+                    Any if not element_types else element_types[0 if is_uniform else index],
+                )
+                for index, element in enumerate(value)
+            )
+        if isinstance(value, dict):
+            value_type = next(
+                (get_args(member)[1] for member in members if get_origin(member) is dict), Any
+            )
+            return {key: self._scale_value(entry, value_type) for key, entry in value.items()}
+        quantity = next((member for member in members if isinstance(member, Quantity)), None)
+        if quantity is None or isinstance(value, bool) or not isinstance(value, int | float):
+            return value
+        return value * self.unit_factor(quantity.si)
+
+
+def _annotate(annotation: Any, metadata: Sequence[Any]) -> Any:
+    """Return an annotation with the markers that pydantic moved to the metadata of a field."""
+    return Annotated[(annotation, *metadata)] if metadata else annotation
+
+
+def _list_alternatives(annotation: Any) -> list[Any]:
+    """Return the members of nested unions without wrappers, and the markers of their quantities."""
+    if get_origin(annotation) is Annotated:
+        wrapped_type, *metadata = get_args(annotation)
+        markers = [marker for marker in metadata if isinstance(marker, Quantity | PolynomialOf)]
+        return [*_list_alternatives(wrapped_type), *markers]
+    if get_origin(annotation) in (Union, UnionType):
+        return [
+            alternative
+            for member in get_args(annotation)
+            for alternative in _list_alternatives(member)
+        ]
+    return [annotation]
+
+
+def _dimension_of_parameter(unit: str) -> Dimension:
+    """Return the dimension of an SI unit of a vessel file, such as kg m/s; dimensionless if none.
+
+    The exponent of the mass is not part of the text of a unit in newtons, so that it is tried.
+    """
+    for mass_power in (0, 1):
+        powers = parse_dimension(unit, mass_power)
+        if powers is not None:
+            return Dimension(mass_power, *powers)
+    return dimension_of_unit(unit) or DIMENSIONLESS
 
 
 class AddedMass(NamedTuple):

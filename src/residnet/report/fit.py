@@ -10,7 +10,7 @@ from residnet.report.blocks import Section
 from residnet.report.figure import Figure
 from residnet.report.figure_files import read_figures, write_figures
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections import data, free_runs, manoeuvres, models, runs, verdict
+from residnet.report.sections import data, derivatives, free_runs, manoeuvres, models, runs, verdict
 
 
 def _iterate_fit_sections(run: RunFiles) -> Iterator[Section | None]:
@@ -26,14 +26,16 @@ def _iterate_fit_sections(run: RunFiles) -> Iterator[Section | None]:
     yield free_runs.worst_runs_section(run, read_figures(folder, "free_runs"))
     yield data.quality_section(run)
     yield manoeuvres.booklet_section(run)
+    yield derivatives.derivatives_section(run)
     for folded_section in (
+        # before tables and lists, since print shows what is folded too
+        _figures_section("Figures", folder, "(?!(track|horizon|free_runs)$).*"),
         free_runs.errors_section(run),
         free_runs.limits_section(run),
         data.fit_data_section(run),
         models.models_section(run),
         free_runs.bands_section(run),
         models.goodness_section(run),
-        _figures_section("Figures", folder, "(?!(track|horizon|free_runs)$).*"),
         verdict.sanity_section(run),
     ):
         yield folded_section and replace(folded_section, is_folded=True)

@@ -99,6 +99,8 @@ class RunFolder:
         self.limits = path / "limits.json"
         self.goodness = path / "goodness.json"
         self.booklet = path / "booklet.json"
+        self.derivatives = path / "derivatives.json"
+        self.ship_derivatives = path / "derivatives_ship.json"
         self.selection = path / "selection.json"
         self.sanity = path / "sanity.json"
         self.excitation = path / "excitation.json"

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import (
     Config,
+    PolynomialOf,
     Radians,
     RadiansPerSecond,
     RevRate,
@@ -336,7 +337,7 @@ class SteeredConfig(ActuatorConfig, ABC):
         return SteeredActuators(self)
 
 
-Coefficients = tuple[float, float, float]
+Coefficients = Annotated[tuple[float, float, float], PolynomialOf("N", "1/s")]
 CurveRange = tuple[RevsPerSecond, RevsPerSecond]
 """Range of revolutions (astern, ahead) in which a curve was measured."""
 

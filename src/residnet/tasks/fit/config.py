@@ -13,11 +13,14 @@ from residnet.evaluation.booklet import BookletConfig
 from residnet.identification.settings import FitSettings, check_known_names
 from residnet.io.sources import DataConfig, LogsBySplit, list_input_files, read_split_logs
 from residnet.manoeuvres.trials_config import SimulatedTrials
+from residnet.physics.similarity import DerivativesConfig
 from residnet.report.fit_studies import find_fit_study
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, ExportRequest, FinishedRun, PackageTask
 
 if TYPE_CHECKING:
+    from residnet.dynamics.scaling import ScaleEffects
+    from residnet.physics.similarity import FroudeScaling
     from residnet.report.blocks import Section
     from residnet.tasks.fit.service import MonitoredLog, NextTrials, RefitResult
 
@@ -42,6 +45,8 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
         data: logs and splits.
         booklet: standard manoeuvres simulated by one of the refitted baselines, with intervals;
             null for none.
+        derivatives: main particulars, for the hydrodynamic derivatives of a baseline; null for
+            none.
         export: models that are exported when the run ends.
     """
 
@@ -49,6 +54,7 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
     study: str | None = None
     data: DataConfig
     booklet: BookletConfig | None = None
+    derivatives: DerivativesConfig | None = None
     export: ExportConfig = ExportConfig()
 
     supported_commands: ClassVar[tuple[str, ...]] = (
@@ -57,6 +63,7 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
         "export",
         "monitor",
         "plan-trial",
+        "scale",
     )
     _checked_logs: LogsBySplit | None = PrivateAttr(None)
 
@@ -74,6 +81,10 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
                 "booklet.model", (self.booklet.model,), self.refit, "refitted baseline"
             )
             self.booklet.steering_input()
+        if self.derivatives is not None:
+            check_known_names(
+                "derivatives.model", (self.derivatives.model,), self.all_baselines, "baseline"
+            )
         if self.study is not None:
             study_models = find_fit_study(self.study).models
             missing_models = [name for name in study_models if name not in self.model_names]
@@ -206,6 +217,35 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
         """
         next_trials: NextTrials = self.call_executor("plan_trial", run, model, trial_limits)
         return next_trials
+
+    def scale_run(
+        self,
+        run: RunFolder,
+        output_folder: Path,
+        scaling: FroudeScaling,
+        effects: ScaleEffects,
+        model_names: Sequence[str] = (),
+        *,
+        overwrite: bool = False,
+    ) -> FinishedRun:
+        """Write a run whose models and logs are those of a finished fit at another scale.
+
+        Args:
+            run: folder of the fit.
+            output_folder: folder of the new run.
+            scaling: ratios of lengths and densities.
+            effects: scale effects of viscosity.
+            model_names: models to scale; empty for all that can be scaled.
+            overwrite: replace an earlier run in the folder.
+
+        Raises:
+            UsageError: if a named model cannot be scaled, or the folder may not be used.
+            DataError: if the logs of the fit cannot be read.
+        """
+        finished_run: FinishedRun = self.call_executor(
+            "scale_run", run, output_folder, scaling, effects, model_names, overwrite=overwrite
+        )
+        return finished_run
 
     def export_model(self, request: ExportRequest) -> Path:
         """Export one model of a finished fit; returns the file.

@@ -42,6 +42,7 @@ from residnet.runs.folder import Provenance, RunFolder, require_apart
 from residnet.runs.model_store import RunModelStore
 from residnet.runs.task import ExportRequest, FinishedRun, TaskOutcome
 from residnet.tasks.fit.booklet import write_booklet
+from residnet.tasks.fit.derivatives import write_derivatives
 from residnet.tasks.fit.outcome import (
     EXTERNAL_SPLIT,
     build_fit_outcome,
@@ -54,6 +55,8 @@ from residnet.tasks.fit.outcome import (
 from residnet.training.records import CurrentsFile
 
 if TYPE_CHECKING:
+    from residnet.dynamics.scaling import ScaleEffects
+    from residnet.physics.similarity import FroudeScaling
     from residnet.tasks.fit.config import FitConfig
     from residnet.tasks.fit.service import MonitoredLog, NextTrials, RefitResult
 
@@ -121,6 +124,8 @@ def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
         except DataError as error:
             # the fit is complete: write its report before the error ends the run
             failure = str(error)
+    if config.derivatives is not None:
+        write_derivatives(folder, config.derivatives, identified_models[config.derivatives.model])
     exports = {
         name: partial(export_model, config, ExportRequest(folder, name))
         for name in config.export.models
@@ -288,3 +293,21 @@ def plan_trial(
     from residnet.tasks.fit.service import plan_next_trials
 
     return plan_next_trials(config, run, model, trial_limits)
+
+
+def scale_run(
+    config: FitConfig,
+    run: RunFolder,
+    output_folder: Path,
+    scaling: FroudeScaling,
+    effects: ScaleEffects,
+    model_names: Sequence[str],
+    *,
+    overwrite: bool,
+) -> FinishedRun:
+    """Write the run of another scale; see `FitConfig.scale_run`."""
+    from residnet.tasks.fit.scaling import scale_run as write_scaled_run
+
+    return write_scaled_run(
+        config, run, output_folder, scaling, effects, model_names, overwrite=overwrite
+    )
