@@ -117,3 +117,17 @@ def test_inputs_are_held_as_in_the_fit(hold: Any, expected: list[float]) -> None
     with torch.no_grad():
         states, _, _ = Rollout(model)(model.make_initial_state(1), w, torch.zeros(1, 0))
     assert states[0, :, 3].diff().tolist() == pytest.approx(expected)
+
+
+def test_a_gear_with_lag_and_delay_follows_its_command() -> None:
+    gear = GivenActuators({"delta": InputShare(steer=0.5, lag="2 s", delay="0.3 s")}, (), 0.1)
+    assert gear.state_names == ("delta", "_delta_delay1", "_delta_delay2", "_delta_delay3")
+    a = gear.make_initial_state(1, ())
+    angles = []
+    for _ in range(40):
+        a = gear.step_states(a, torch.full((1, 1), 0.5, dtype=torch.float64))
+        angles.append(float(a[0, 0]))
+    # three steps of dead time, then a first-order response
+    assert angles[:3] == [0.0, 0.0, 0.0]
+    expected = [0.5 * (1.0 - math.exp(-0.1 * (k - 2) / 2.0)) for k in range(3, 40)]
+    assert angles[3:] == pytest.approx(expected)

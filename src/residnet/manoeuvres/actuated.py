@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from residnet.manoeuvres.input_shares import InputShare
 
 
+_MAX_DELAY_STEPS = 1000
+"""Longest delay of an actuator in time steps."""
+
+
 class Actuators(nn.Module, ABC):
     """A set of actuators whose states do not depend on the motion of the hull.
 
@@ -101,16 +105,20 @@ class PlantActuators(Actuators):
 
 @final
 class GivenActuators(Actuators):
-    """Actuators with limits and rates from a config instead of a plant.
+    """Actuators with limits, rates, lags and delays from a config instead of a plant.
+
+    A command takes effect after its delay. The position then follows it with a first-order lag,
+    a_dot = (command - a) / T, within the rate limit. The response is exact for a constant command
+    below the rate limit, at any time step.
 
     Args:
         shares: mapping from demands to each input of the model by name; the command of an input
             has the prefix `cmd_`.
         exogenous: names of the exogenous inputs of the model.
-        dt: time step in s.
+        dt: time step in s. A delay is rounded to steps.
 
     Raises:
-        ConfigError: if a value has a wrong unit.
+        ConfigError: if a value has a wrong unit, or a delay is longer than 1000 steps.
     """
 
     def __init__(
@@ -123,9 +131,28 @@ class GivenActuators(Actuators):
         table = torch.tensor(rows, dtype=torch.float64)
         self.shares = table[:, :2].T.contiguous()
         self.centre, self.limit, self.rate = table[:, 2:].unbind(-1)
-        # an input without a rate limit equals its command and needs no state
-        self.rate_limited = [i for i, row in enumerate(rows) if row[4] != float("inf")]
-        self.state_names = tuple(list(shares)[i] for i in self.rate_limited)
+        # an input that equals its command needs no state
+        self.servo_indices = [i for i, share in enumerate(shares.values()) if share.has_dynamics]
+        lags = torch.tensor([share.lag for share in shares.values()], dtype=torch.float64)
+        # share of the remaining distance that a first-order lag covers in a step; 1 without lag
+        self.step_share = torch.where(lags > 0.0, -torch.expm1(-dt / lags.clamp(min=1e-12)), 1.0)
+        self.delay_steps = [round(share.delay / dt) for share in shares.values()]
+        if max(self.delay_steps, default=0) > _MAX_DELAY_STEPS:
+            raise ConfigError(
+                f"inputs: a delay of {max(self.delay_steps)} time steps is longer than"
+                f" {_MAX_DELAY_STEPS}; check its unit"
+            )
+        names = list(shares)
+        # positions first, then the commands under way of each input, the newest first
+        self.delay_inputs = [i for i in self.servo_indices for _ in range(self.delay_steps[i])]
+        self.state_names = (
+            *(names[i] for i in self.servo_indices),
+            *(
+                f"_{names[i]}_delay{k + 1}"
+                for i in self.servo_indices
+                for k in range(self.delay_steps[i])
+            ),
+        )
         self.dt = dt
 
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
@@ -134,15 +161,30 @@ class GivenActuators(Actuators):
         return self.centre.to(drive.dtype) + torch.minimum(torch.maximum(deviation, -limit), limit)
 
     def step_states(self, a: Tensor, w: Tensor) -> Tensor:
-        """Move the states [B, k] towards their commands by at most the rate limit."""
-        max_change = self.rate[self.rate_limited].to(a.dtype) * self.dt
-        difference = w[:, self.rate_limited] - a
-        return a + torch.minimum(torch.maximum(difference, -max_change), max_change)
+        """Move the positions [B, k] towards their delayed commands, and shift the delay lines."""
+        positions, *lines = a.split(
+            [len(self.servo_indices), *(self.delay_steps[i] for i in self.servo_indices)], dim=-1
+        )
+        targets = []
+        next_lines = []
+        for index, line in zip(self.servo_indices, lines, strict=True):
+            command = w[:, index : index + 1]
+            delayed = torch.cat((command, line), dim=-1)
+            targets.append(delayed[:, -1:])
+            next_lines.append(delayed[:, :-1])
+        if not targets:
+            return a
+        step_share = self.step_share[self.servo_indices].to(a.dtype)
+        max_change = self.rate[self.servo_indices].to(a.dtype) * self.dt
+        difference = step_share * (torch.cat(targets, dim=-1) - positions)
+        change = torch.minimum(torch.maximum(difference, -max_change), max_change)
+        return torch.cat((positions + change, *next_lines), dim=-1)
 
     def make_initial_state(self, n_rows: int, hull: Sequence[str]) -> Tensor:
         """Return the state with zero velocity, and the inputs without demand."""
         hull_state = torch.zeros(n_rows, len(hull), dtype=torch.float64)
-        actuator_state = self.centre[self.rate_limited].expand(n_rows, -1)
+        columns_of_centre = [*self.servo_indices, *self.delay_inputs]
+        actuator_state = self.centre[columns_of_centre].expand(n_rows, -1)
         return torch.cat((hull_state, actuator_state), dim=-1)
 
 

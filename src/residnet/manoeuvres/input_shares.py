@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from residnet.core.config import Config, Quantity
+from pydantic import Field
+
+from residnet.core.config import Config, Quantity, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.names import CHANNEL_UNITS
 
@@ -20,6 +22,8 @@ class InputShare(Config):
         centre: value without demand.
         limit: largest deviation from `centre` to both sides; None for the sum of drive and steer.
         rate: largest change per second; None for no rate limit.
+        lag: time constant of the first-order response to a command; 0 for an immediate response.
+        delay: time between a command and its first effect.
     """
 
     drive: float | str = 0.0
@@ -27,6 +31,13 @@ class InputShare(Config):
     centre: float | str = 0.0
     limit: float | str | None = None
     rate: float | str | None = None
+    lag: Seconds = Field(default=0.0, ge=0)
+    delay: Seconds = Field(default=0.0, ge=0)
+
+    @property
+    def has_dynamics(self) -> bool:
+        """Whether the input differs from its command: by a rate limit, a lag or a delay."""
+        return self.rate is not None or self.lag > 0.0 or self.delay > 0.0
 
     def to_si(self, name: str) -> list[float]:
         """Return drive, steer, centre, limit and rate of the input `name` in SI.

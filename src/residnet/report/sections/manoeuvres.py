@@ -87,6 +87,10 @@ _INDEX_TITLES = {
 }
 """Titles of indices that differ from the key with spaces."""
 _COMPARED_INDICES = (
+    "advance",
+    "transfer",
+    "tactical_diameter",
+    "steady_diameter",
     "first_overshoot",
     "second_overshoot",
     "initial_turning_time",
@@ -479,24 +483,36 @@ def booklet_section(run: RunFiles) -> Section | None:
                 warning = f"The intervals leave out {draws} that did not end the manoeuvre."
                 page_blocks.append(Bullets([warning], is_warning=True))
             blocks.append(Section(page_title(page), page_blocks))
-    repeated_pages = [page for page in content.pages if page.split]
-    if repeated_pages:
+    if content.remarks:
+        blocks.append(Bullets([f"Left out: {remark}." for remark in content.remarks]))
+    for kind, title, introduction in (
+        (
+            "zigzag",
+            "Measured zigzags, repeated in closed loop",
+            "The model steers the rudder angle of each trial and reverses it at the trial's"
+            " headings, from the state that the trial began with.",
+        ),
+        (
+            "turning_circle",
+            "Measured turning circles, repeated",
+            "The model holds the rudder angle of each trial, from the state that the trial began"
+            " with.",
+        ),
+    ):
+        repeated_pages = [page for page in content.pages if page.split and page.manoeuvre == kind]
+        if not repeated_pages:
+            continue
         first_overshoots = [page.indices.get("first_overshoot") for page in repeated_pages]
         differences = [
             abs(overshoot.difference)
             for overshoot in first_overshoots
             if overshoot is not None and overshoot.difference is not None
         ]
-        introduction = (
-            "The model steers the rudder angle of each trial and reverses it at the trial's"
-            " headings, from the state that the trial began with."
-        )
         if differences:
             largest_difference = format_number(math.degrees(max(differences)), 2)
             introduction += f" First overshoots differ by at most {largest_difference} deg."
-        title = "Measured zigzags, repeated in closed loop"
         blocks.append(
-            Section(title, [Text(introduction), _repeated_zigzag_table(content, repeated_pages)])
+            Section(title, [Text(introduction), _repeated_trial_table(content, repeated_pages)])
         )
     return Section("Manoeuvring booklet", blocks)
 
@@ -506,8 +522,8 @@ def page_title(page: BookletRow) -> str:
     return f"{page.name} ({page.split})" if page.split else page.name.replace("_", " ")
 
 
-def _repeated_zigzag_table(content: BookletFile, pages: Sequence[BookletRow]) -> Table:
-    """Return measured and predicted indices of the repeated zigzags, a row for each."""
+def _repeated_trial_table(content: BookletFile, pages: Sequence[BookletRow]) -> Table:
+    """Return measured and predicted indices of the repeated trials, a row for each."""
 
     def measured_index(page: BookletRow, name: str) -> BookletIndex | None:
         entry = page.indices.get(name)
@@ -556,7 +572,12 @@ def booklet_figures(run: RunFiles) -> Iterator[Figure]:
     if content is None or frame is None:
         return
     by_page = {str(name): rows for name, rows in frame.groupby("page", sort=False)}
-    circle_pages = [page for page in content.pages if page.manoeuvre == "turning_circle"]
+    circle_pages = [
+        page
+        for page in content.pages
+        # the track after a pull-out would hide the circles
+        if page.manoeuvre == "turning_circle" and not page.split and not page.demand.get("pull_out")
+    ]
     if circle_pages:
         yield _turning_circle_figure(by_page, circle_pages, content)
     zigzag_pages = [page for page in content.pages if page.manoeuvre == "zigzag"]

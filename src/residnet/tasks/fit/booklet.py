@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,8 +22,8 @@ from residnet.identification.prepared import PreparedSplits
 from residnet.identification.settings import FitSettings
 from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators
 from residnet.manoeuvres.base import Helm, Manoeuvre
-from residnet.manoeuvres.closed_loop import Zigzag
-from residnet.manoeuvres.indices import identify_zigzag
+from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
+from residnet.manoeuvres.indices import SteeredZigzag, identify_zigzag
 from residnet.manoeuvres.input_shares import InputShare
 from residnet.manoeuvres.trials import (
     ManoeuvreRun,
@@ -60,40 +62,47 @@ def write_booklet(
 
     craft = _build_craft(config, fitted_model, config.inputs)
     rudder = config.steering_input()
-    pages = [
-        _make_page(craft, config, flights, limit)
-        for flights in _simulate_draws(craft, config, fitted_model, config.manoeuvres)
-    ]
-    measured_zigzags = [
-        (prepared.log, split)
-        for split in config.repeat
-        for prepared in logs.get(split, ())
-        if prepared.log.manoeuvre == "zigzag"
-        and np.isfinite(prepared.log.stack(("psi", rudder))).all()
-    ]
-    if measured_zigzags:
-        shares = _input_shares_from_logs(config, [log for log, _ in measured_zigzags])
+    pages: list[BookletPage] = []
+    remarks: list[str] = []
+
+    def add_page(
+        vessel: SimulatedVessel, flights: Sequence[ManoeuvreRun], log: Log | None, split: str
+    ) -> None:
+        try:
+            pages.append(_make_page(vessel, config, flights, limit, log, split))
+        except DataError as error:
+            if not config.skip_failed:
+                raise
+            remarks.append(str(error))
+
+    for flights in _simulate_draws(craft, config, fitted_model, config.manoeuvres):
+        add_page(craft, flights, None, "")
+    measured_trials = _identify_measured_trials(config, logs, rudder, remarks)
+    if measured_trials:
+        shares = _input_shares_from_trials(config, measured_trials)
         craft = _build_craft(config, fitted_model, shares)
         craft = replace(
             craft,
             initial_state=torch.cat(
-                [_initial_state_of_log(craft, log) for log, _ in measured_zigzags]
+                [_initial_state_of_log(craft, trial.log) for trial in measured_trials]
             ),
         )
-        zigzags = [
-            _replicate_zigzag(log, rudder, shares, craft.dynamics.dt) for log, _ in measured_zigzags
-        ]
-        flights_by_zigzag = _simulate_draws(
-            craft, config, fitted_model, [gear_zigzag for _, gear_zigzag in zigzags]
+        replicas = [_replicate_trial(trial, shares, craft.dynamics.dt) for trial in measured_trials]
+        flights_by_trial = _simulate_draws(
+            craft, config, fitted_model, [simulated for _, simulated in replicas]
         )
-        for measured_log, (zigzag, _), flights in zip(
-            measured_zigzags, zigzags, flights_by_zigzag, strict=True
+        for trial, (nominal, _), flights in zip(
+            measured_trials, replicas, flights_by_trial, strict=True
         ):
-            renamed_flights = [replace(flight, manoeuvre=zigzag) for flight in flights]
-            pages.append(_make_page(craft, config, renamed_flights, limit, *measured_log))
+            renamed_flights = [replace(flight, manoeuvre=nominal) for flight in flights]
+            add_page(craft, renamed_flights, trial.log, trial.split)
+    if not pages:
+        raise DataError(f"booklet: no manoeuvre can be predicted: {remarks[0]}")
     folder.write_record(
         folder.booklet,
-        build_booklet(config.model, config.length, config.scale, config.draws, config.level, pages),
+        build_booklet(
+            config.model, config.length, config.scale, config.draws, config.level, pages, remarks
+        ),
     )
     parts = []
     for page in pages:
@@ -110,8 +119,8 @@ def write_booklet(
             )
     folder.write_table(folder.booklet.with_suffix(".parquet"), pd.concat(parts))
     return (
-        f"booklet: {len(config.manoeuvres)} manoeuvres, {len(measured_zigzags)} measured zigzags"
-        f" repeated,"
+        f"booklet: {sum(not page.split for page in pages)} manoeuvres,"
+        f" {sum(bool(page.split) for page in pages)} measured trials repeated,"
         f" {config.draws} draws each"
     )
 
@@ -212,45 +221,151 @@ def sample_parameters(fitted_model: FittedModel, draws: int, seed: int) -> torch
     return theta.reshape(1 + draws, *baseline.theta.shape)
 
 
-def _input_shares_from_logs(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]:
-    """Return the input shares; full drive and steer are the largest inputs in the logs."""
+class MeasuredTrial(NamedTuple):
+    """A measured zigzag or turning circle that the model repeats.
+
+    Attributes:
+        log: the log.
+        split: its split.
+        angle: rudder angle, rad; positive.
+        zigzag: parameters of a zigzag; None for a turning circle.
+        turn_sign: side of a turning circle, +1 to starboard; of a zigzag that of the first execute.
+        start: time of the first helm order in s after the first sample.
+        until: change of heading that a turning circle reaches, rad; 0 for a zigzag.
+    """
+
+    log: Log
+    split: str
+    angle: float
+    zigzag: SteeredZigzag | None
+    turn_sign: float
+    start: float
+    until: float
+
+
+_MIN_CIRCLE = 0.5 * math.pi
+"""Smallest change of heading of a turning circle that is repeated."""
+_MAX_CIRCLE = 3.0 * math.pi
+"""Change of heading at which a repeated turning circle ends, as IMO requires."""
+
+
+def _identify_measured_trials(
+    config: BookletConfig,
+    logs: Mapping[str, Sequence[PreparedLog]],
+    rudder: str,
+    remarks: list[str],
+) -> list[MeasuredTrial]:
+    """Return the zigzags and turning circles of the splits to repeat, zigzags first.
+
+    A trial that cannot be identified is an error, or a remark with `skip_failed`.
+    """
+    trials: list[MeasuredTrial] = []
+    identify_of_kind = {"zigzag": _identify_zigzag_trial, "turning_circle": _identify_circle}
+    for kind, identify in identify_of_kind.items():
+        for split in config.repeat:
+            for prepared in logs.get(split, ()):
+                log = prepared.log
+                if (
+                    log.manoeuvre != kind
+                    or rudder not in log.channels
+                    or not np.isfinite(log.stack(("psi", rudder))).all()
+                ):
+                    continue
+                try:
+                    trials.append(identify(log, split, rudder))
+                except DataError as error:
+                    # a part of a turning circle has no helm order to repeat
+                    if kind == "zigzag" and not config.skip_failed:
+                        raise
+                    remarks.append(str(error))
+    return trials
+
+
+def _identify_zigzag_trial(log: Log, split: str, rudder: str) -> MeasuredTrial:
+    zigzag = identify_zigzag(log, rudder)
+    return MeasuredTrial(log, split, zigzag.angle, zigzag, zigzag.first_sign, zigzag.start, 0.0)
+
+
+def _identify_circle(log: Log, split: str, rudder: str) -> MeasuredTrial:
+    """Identify a turning circle: the first helm order, its angle and the change of heading.
+
+    Raises:
+        DataError: if the log does not begin before the helm order, or turns too little.
+    """
+    angle = log[rudder] - np.median(log[rudder][: max(len(log) // 100, 3)])
+    held_angle = float(np.median(log[rudder][len(log) // 2 :]))
+    is_executed = np.abs(angle) > 0.1 * abs(held_angle)
+    first = int(np.argmax(is_executed))
+    start = float(log.t[max(first - 1, 0)] - log.t[0])
+    turn_sign = float(np.sign(held_angle))
+    heading_change = turn_sign * float(log["psi"][-1] - log["psi"][0])
+    if not is_executed.any() or first == 0 or heading_change < _MIN_CIRCLE:
+        raise DataError(
+            f"log {log.name}: no helm order, or a heading change of"
+            f" {math.degrees(heading_change):.0f} deg only; a turning circle to repeat needs its"
+            " beginning and 90 deg"
+        )
+    until = min(heading_change, _MAX_CIRCLE)
+    return MeasuredTrial(log, split, abs(held_angle), None, turn_sign, start, until)
+
+
+def _input_shares_from_trials(
+    config: BookletConfig, trials: Sequence[MeasuredTrial]
+) -> dict[str, InputShare]:
+    """Return the input shares; full drive and steer are the largest inputs in the trials."""
     rudder = config.steering_input()
-    max_rudder = max(identify_zigzag(log, rudder).angle for log in logs)
+    max_rudder = max(trial.angle for trial in trials)
     return {
         name: share.model_copy(
-            update={"steer": max_rudder, "limit": max_rudder}
+            # reversals are those of the measured rudder angle, which contain the dead time
+            update={"steer": max_rudder, "limit": max_rudder, "delay": 0.0}
             if name == rudder
-            else {"drive": max(float(log[name].mean()) for log in logs), "limit": None}
+            else {"drive": max(float(trial.log[name].mean()) for trial in trials), "limit": None}
         )
         for name, share in config.inputs.items()
     }
 
 
-def _replicate_zigzag(
-    log: Log, rudder: str, shares: Mapping[str, InputShare], time_step: float
-) -> tuple[Zigzag, Zigzag]:
-    """Return the zigzag of a log, and the same with the reversals at the measured headings.
+def _replicate_trial(
+    trial: MeasuredTrial, shares: Mapping[str, InputShare], time_step: float
+) -> tuple[Manoeuvre, Manoeuvre]:
+    """Return the manoeuvre of a log, and the one that the model performs.
 
-    The steering gear of the model reacts immediately, the real one after a delay: the headings at
-    which the measured rudder leaves its position are used. Reversals are detected half a step of
-    `time_step` seconds late on average, which is corrected.
+    The steering gear of the model reacts immediately, the real one after a delay: in a zigzag the
+    headings at which the measured rudder leaves its position are used. Reversals are detected half
+    a step of `time_step` seconds late on average, which is corrected.
     """
-    steered_indices = identify_zigzag(log, rudder)
+    log = trial.log
     drive_shares = [
         float(log[name].mean()) / float(share.drive)
         for name, share in shares.items()
-        if name != rudder
+        if share.steer in (0, 0.0) and float(share.drive) != 0.0
     ]
+    steer = next(float(share.steer) for share in shares.values() if share.steer not in (0, 0.0))
+    drive = min(drive_shares[0], 1.0) if drive_shares else 0.0
+    duration = float(log.t[-1] - log.t[0])
+    if trial.zigzag is None:
+        circle = TurningCircle(
+            name=log.name,
+            drive=drive,
+            steer=trial.turn_sign * trial.angle / steer,
+            start=trial.start,
+            until=trial.until,
+            # a slower model turns longer than the vessel did
+            duration=2.0 * duration,
+        )
+        return circle, circle
     zigzag = Zigzag(
         name=log.name,
-        drive=min(drive_shares[0], 1.0) if drive_shares else 0.0,
-        steer=steered_indices.angle / float(shares[rudder].steer),
-        heading=steered_indices.heading,
-        first="starboard" if steered_indices.first_sign > 0 else "port",
-        start=steered_indices.start,
-        duration=float(log.t[-1] - log.t[0]),
+        drive=drive,
+        steer=trial.angle / steer,
+        heading=trial.zigzag.heading,
+        first="starboard" if trial.turn_sign > 0 else "port",
+        start=trial.start,
+        duration=duration,
     )
-    heading = steered_indices.departure_heading - 0.5 * time_step * steered_indices.departure_rate
+    departure = trial.zigzag
+    heading = departure.departure_heading - 0.5 * time_step * departure.departure_rate
     return zigzag, zigzag.model_copy(update={"heading": heading})
 
 
