@@ -15,8 +15,11 @@ from residnet.core.files import atomic_write
 from residnet.core.log import Log
 from residnet.core.ownership import Manifest, record_folder
 from residnet.core.progress import report_progress
-from residnet.manoeuvres.trials import simulate_trial_logs
+from residnet.identification.scaling import scale_log
+from residnet.manoeuvres import ManoeuvreConfig
+from residnet.manoeuvres.trials import simulate_trial_logs, simulate_trials
 from residnet.manoeuvres.trials_config import SimulatedTrials
+from residnet.physics.similarity import FroudeScaling
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -65,6 +68,40 @@ COLUMN_NAMES = {
     "wind_speed": ("true wind speed [kn]", 3600.0 / 1852.0),
     "wind_dir": ("true wind direction [deg]", 180.0 / np.pi),
 }
+BASIN_FOLDER = "basin"
+"""Folder of the workbooks of a model basin."""
+BASIN_SCALE = 50.0
+"""Length of the ship divided by that of the model in the basin."""
+BASIN_LENGTH = 160.93 / BASIN_SCALE
+"""Length of the model in m; the ship is the vessel `mariner`."""
+_BASIN_MANOEUVRES: dict[str, dict[str, Any]] = {
+    "TC_35_S": {"kind": "turning_circle", "rudder": "35 deg"},
+    "TC_35_P": {"kind": "turning_circle", "rudder": "-35 deg"},
+    "TC_20_S": {"kind": "turning_circle", "rudder": "20 deg"},
+    "ZZ_20-20_S": {"kind": "zigzag", "rudder": "20 deg", "heading": "20 deg", "reversals": 5},
+    "ZZ_20-20_P": {
+        "kind": "zigzag", "rudder": "20 deg", "heading": "20 deg", "reversals": 5, "first": "port",
+    },
+    "ZZ_10-10_S": {"kind": "zigzag", "rudder": "10 deg", "heading": "10 deg", "reversals": 5},
+    "ZZ_10-10_P": {
+        "kind": "zigzag", "rudder": "10 deg", "heading": "10 deg", "reversals": 5, "first": "port",
+    },
+    "ZZ_15-5_S": {"kind": "zigzag", "rudder": "15 deg", "heading": "5 deg", "reversals": 5},
+}  # fmt: skip
+"""Tests of the model basin by the name of the workbook."""
+_BASIN_COLUMNS = {
+    "x": ("X", "m", 1.0, 0.003),
+    "y": ("Y", "m", 1.0, 0.003),
+    "psi": ("Heading", "deg", 180.0 / np.pi, 0.05),
+    "u": ("u", "m/s", 1.0, 0.004),
+    "v": ("v", "m/s", 1.0, 0.004),
+    "r": ("ROT", "deg/s", 180.0 / np.pi, 0.05),
+    "cmd_delta": ("Rudder order", "deg", 180.0 / np.pi, 0.0),
+    "delta": ("Rudder", "deg", 180.0 / np.pi, 0.03),
+}
+"""Columns of the workbooks: header, unit, factor from SI, standard deviation of the noise."""
+_BASIN_STEP = 0.1
+"""Sample interval of the workbooks in s."""
 _GAP_SECONDS = (30.0, 32.5)
 """Start and end in s of the gap in every fifth log."""
 _START_EPOCH = 1_717_000_000
@@ -82,7 +119,7 @@ def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
         UsageError: if the logs exist already, or cannot be written.
     """
     manifest = Manifest(folder)
-    for name in LAYOUTS:
+    for name in (*LAYOUTS, BASIN_FOLDER):
         layout = folder / name
         if not os.path.lexists(layout):
             continue
@@ -106,13 +143,93 @@ def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
                     with atomic_write(folder / name / f"{prefix}{log.name}.csv") as file:
                         table.to_csv(file, index=False, float_format="%.4f")
         report_progress("writing logs", len(LAYOUTS), len(LAYOUTS))
+        manifest.remove_owned(folder / BASIN_FOLDER)
+        basin_line = write_basin_workbooks(folder / BASIN_FOLDER)
     seconds = sum(float(log.t[-1] - log.t[0]) for log in logs)
     return [
         f"{len(logs)} logs of a simulated boat in wind, {seconds / 60.0:.0f} minutes, as",
         *(f"{folder}/{name}: {description}" for name, (description, _) in LAYOUTS.items()),
         "their faults: positions 0.3 s late, a rudder that stands 2 degrees off, gaps, noise",
+        basin_line,
         f"next: residnet new {folder}/two_files",
     ]
+
+
+def write_basin_workbooks(folder: Path) -> str:
+    """Write Excel workbooks of tests with a model of the vessel `mariner`; returns a line on them.
+
+    The ship performs the manoeuvres at full scale, and Froude's law of similarity gives the motion
+    of the model, so that full-scale predictions of the model have a known truth.
+
+    Args:
+        folder: folder of the workbooks.
+    """
+    try:
+        import openpyxl
+    except ImportError:
+        return f'{folder}: not written, it needs the extra excel (pip install "residnet[excel]")'
+    generator = np.random.default_rng(50)
+    for test_number, (name, log) in enumerate(simulate_basin_tests().items(), start=1):
+        workbook = openpyxl.Workbook()
+        sheet = workbook.active
+        assert sheet is not None
+        sheet.title = "Data"
+        kind = "Turning circle" if name.startswith("TC") else "Zigzag"
+        angle = name.split("_")[1].replace("-", "/")
+        for row in (
+            ("Model test", f"M-4711, scale 1:{BASIN_SCALE:g}"),
+            ("Test no.", 4711000 + test_number),
+            ("Type", f"{kind} {angle}" + (" deg" if kind == "Turning circle" else "")),
+            ("Lpp [m]", BASIN_LENGTH),
+            (),
+            ("Time", *(header for header, *_ in _BASIN_COLUMNS.values())),
+            ("s", *(unit for _, unit, *_ in _BASIN_COLUMNS.values())),
+        ):
+            sheet.append(row)
+        columns = [np.round(log.t - log.t[0], 3)]
+        for channel, (_, _, factor, deviation) in _BASIN_COLUMNS.items():
+            noise = deviation * generator.standard_normal(len(log))
+            columns.append(np.round(factor * log[channel] + noise, 5))
+        for values in np.column_stack(columns).tolist():
+            sheet.append(values)
+        with atomic_write(folder / f"{name}.xlsx") as file:
+            workbook.save(file)
+    return (
+        f"{folder}: {len(_BASIN_MANOEUVRES)} Excel files of a model basin (a ship at"
+        f" 1:{BASIN_SCALE:g}); residnet new {folder} --length {BASIN_LENGTH:.4g} --scale"
+        f" {BASIN_SCALE:g}"
+    )
+
+
+def simulate_basin_tests() -> dict[str, Log]:
+    """Return the motion of the model in the tests of the basin, without noise, by name."""
+    scaling = FroudeScaling(BASIN_SCALE)
+    config = validate_config(
+        {
+            "vessel": "mariner",
+            "duration": 900.0,
+            "step": _BASIN_STEP * scaling.time_factor,
+            # the manoeuvres below replace the random trials of the config
+            "trials": [{"kind": "zigzag", "count": 1, "heading": ["10 deg"]}],
+            "identification": {},
+            "validation": {},
+        },
+        SimulatedTrials,
+        "demo",
+    )
+    # the helm order comes after two ship lengths of approach
+    start = 2.0 * 160.93 / 7.7175
+    manoeuvres = [
+        validate_config(
+            {"name": name, "drive": 1.0, "start": start, **settings}, ManoeuvreConfig, "demo"
+        )
+        for name, settings in _BASIN_MANOEUVRES.items()
+    ]
+    runs = simulate_trials(manoeuvres, config)
+    return {
+        name: scale_log(run.true_log, scaling.inverse)
+        for name, run in zip(_BASIN_MANOEUVRES, runs, strict=True)
+    }
 
 
 def _cut_gap(log: Log, number: int) -> Log:

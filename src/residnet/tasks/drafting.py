@@ -58,6 +58,11 @@ from residnet.io.split import (
 )
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.quality import inspect_log
+from residnet.tasks.naval_draft import (
+    NavalParticulars,
+    choose_held_out_logs,
+    draft_naval_sections,
+)
 
 STOP = "stop: "
 """Prefix of the last line of a draft that must be completed before a run."""
@@ -107,6 +112,7 @@ def write_new_config(
     *,
     overwrite: bool,
     answers: Mapping[Key, str] | None = None,
+    naval: NavalParticulars | None = None,
 ) -> list[str]:
     """Draft a config for logs and write it; returns the lines for the terminal.
 
@@ -118,6 +124,7 @@ def write_new_config(
         answer_question: asks the user; None for the default answers.
         overwrite: replace an earlier config.
         answers: answers given in advance, by key of the config.
+        naval: length and scale, for a booklet and derivatives; None for neither.
 
     Raises:
         UsageError: if the file exists already, or a path does not.
@@ -132,7 +139,7 @@ def write_new_config(
     require_replaceable(output_file)
     ascii_name = unicodedata.normalize("NFKD", output_file.stem).encode("ascii", "ignore").decode()
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", ascii_name).strip("_.-") or "my_boat"
-    draft = draft_fit_config(logs, output_file.parent, name, answer_question, answers)
+    draft = draft_fit_config(logs, output_file.parent, name, answer_question, answers, naval)
     file = draft.save(output_file)
     n_guesses = len(draft.guesses)
     messages = [f"{key}: {reason}" for key, reason in draft.guesses[:_MAX_SHOWN_GUESSES]]
@@ -201,6 +208,7 @@ def draft_fit_config(
     name: str,
     answer_question: AnswerCallback | None = None,
     answers: Mapping[Key, str] | None = None,
+    naval: NavalParticulars | None = None,
 ) -> ConfigDraft:
     """Draft a config of the task `fit` for logs.
 
@@ -210,6 +218,7 @@ def draft_fit_config(
         name: name of the run.
         answer_question: answers questions; None for the default answers, marked as guesses.
         answers: answers given in advance, by key of the config.
+        naval: length and scale, for a booklet and derivatives; None for neither.
 
     Raises:
         UsageError: if a path does not exist.
@@ -228,12 +237,15 @@ def draft_fit_config(
         inputs, draft_logs.dof, list(draft_logs.complete_logs.values()), draft_notes
     )
     unexcited = find_unexcited_inputs(list(draft_logs.complete_logs.values()), inputs)
+    # commands beside measured angles are not inputs, but show the response of the steering gear
+    logs_with_commands = dict(draft_logs.complete_logs)
     all_inputs = draft_logs.keep_inputs((*inputs, *unexcited), draft_notes)
     inputs = all_inputs[: len(inputs)]
     dof = draft_logs.dof
     finding_codes, quality_warnings = _data_quality_warnings(list(draft_logs.logs.values()), inputs)
     # importing torch takes 190 MB: the inspection of long logs is done before
     from residnet.identification.recipe import (
+        SINGLE_MODEL_NAME,
         PreparationPlan,
         choose_integrator,
         make_evaluation_settings,
@@ -264,7 +276,9 @@ def draft_fit_config(
     usable_logs = draft_logs.select_usable(
         (*inputs, *preparation_recipe.wind_channels), preparation
     )
-    root, split_entries = _split_logs(draft_logs, usable_logs, folder, draft_notes)
+    root, split_entries = _split_logs(
+        draft_logs, usable_logs, folder, draft_notes, holds_out_manoeuvres=naval is not None
+    )
     if not splits_from_names(list(usable_logs.values())):
         # a split given by the names of folders is not changed
         _move_short_logs_to_training(
@@ -300,6 +314,14 @@ def draft_fit_config(
         "export": {"models": []},
         "evaluation": evaluation_settings,
     }
+    if naval is not None and not missing_text:
+        config |= draft_naval_sections(
+            [logs_with_commands[path] for path in usable_logs],
+            inputs,
+            naval,
+            SINGLE_MODEL_NAME,
+            draft_notes,
+        )
     validate_config(config, FitConfig, "draft", folder)
     guesses = tuple((".".join(key), text) for key, text in draft_notes.guessed_values)
     unused = [text for key, text in draft_notes.notes if key[-1] == "channels" or key == ("data",)]
@@ -514,9 +536,21 @@ _SplitEntry = tuple[Any, Log, float]
 
 
 def _split_logs(
-    draft_logs: _DraftLogs, usable_logs: Mapping[Path, Log], folder: Path, draft_notes: DraftNotes
+    draft_logs: _DraftLogs,
+    usable_logs: Mapping[Path, Log],
+    folder: Path,
+    draft_notes: DraftNotes,
+    *,
+    holds_out_manoeuvres: bool = False,
 ) -> tuple[str, dict[str, list[_SplitEntry]]]:
     """Return the common folder of the logs and their split.
+
+    Args:
+        draft_logs: all logs of the draft.
+        usable_logs: usable logs by path.
+        folder: folder of the config.
+        draft_notes: receives the reason of the split.
+        holds_out_manoeuvres: whether few logs are manoeuvres that are held out as a whole.
 
     Raises:
         DataError: if no usable log is available for a split.
@@ -537,6 +571,23 @@ def _split_logs(
     if splits_from_names(list(usable_logs.values())):
         reason = "folders or files are called after the splits"
     split_entries: dict[str, list[_SplitEntry]] = {split: [] for split in SPLITS}
+    whole_logs = choose_held_out_logs(usable_logs) if holds_out_manoeuvres else None
+    if whole_logs is not None:
+        for split, held_out_paths in whole_logs.items():
+            split_entries[split] = [
+                (
+                    path.resolve().relative_to(common_folder).as_posix(),
+                    usable_logs[path],
+                    draft_logs.longest_times[path],
+                )
+                for path in held_out_paths
+            ]
+        draft_notes.add_guess(
+            ("data", "split"),
+            "few manoeuvres: the mildest ones are held out as a whole, so that the models are"
+            " tested on manoeuvres that they have not seen",
+        )
+        return root, split_entries
     for split, logs in split_logs(list(usable_logs.values())).items():
         for log in logs:
             segment_limits = log.meta.get("stretch")
