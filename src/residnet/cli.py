@@ -423,6 +423,16 @@ def new(
             help="Time between two rows, such as '0.1 s', for tables without a column of time.",
         ),
     ] = None,
+    length: Annotated[
+        str | None,
+        typer.Option(help="Length of the vessel in the logs; drafts a booklet and derivatives."),
+    ] = None,
+    scale: Annotated[
+        float | None, typer.Option(help="Length of the ship divided by that in the logs.")
+    ] = None,
+    beam: Annotated[str | None, typer.Option(help="Beam in the scale of the logs.")] = None,
+    draught: Annotated[str | None, typer.Option(help="Draught in the scale of the logs.")] = None,
+    mass: Annotated[str | None, typer.Option(help="Displacement in the scale of the logs.")] = None,
     quiet: QuietOption = False,
 ) -> None:
     """Draft a complete config for `residnet run` from logs.
@@ -432,13 +442,19 @@ def new(
     """
     from residnet.io.drafting.channels import READER_KEY
     from residnet.tasks.drafting import STOP, write_new_config
+    from residnet.tasks.naval_draft import NavalParticulars
 
     options = {(*READER_KEY, "names"): names, (*READER_KEY, "time", "step"): step}
     answers = {key: answer for key, answer in options.items() if answer is not None}
+    naval = NavalParticulars.from_options(
+        length, scale, {"beam": beam, "draught": draught, "mass": mass}
+    )
     with show_progress(quiet=quiet):
         prompt = None if defaults else interactive_prompt()
         config_file = output_file or Path("my_boat.yaml")
-        lines = write_new_config(logs, config_file, prompt, overwrite=overwrite, answers=answers)
+        lines = write_new_config(
+            logs, config_file, prompt, overwrite=overwrite, answers=answers, naval=naval
+        )
     print("\n".join(lines))
     if lines[-1].startswith(STOP):
         raise typer.Exit(1)
@@ -827,12 +843,113 @@ def derivatives(
 
 
 @app.command()
-def report(folder: RunArgument, quiet: QuietOption = False) -> None:
-    """Rewrite the figures and the report of a finished run."""
-    from residnet.tasks.registry import report_run
+def scale(
+    folder: RunArgument,
+    scale: Annotated[
+        float, typer.Option("--scale", help="Length at full scale divided by that in the logs.")
+    ],
+    output_folder: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder of the run; RUN_full_scale by default."),
+    ] = None,
+    models: Annotated[
+        list[str] | None,
+        typer.Option("--model", metavar="NAME", help="Model to scale; all if not given."),
+    ] = None,
+    density_ratio: Annotated[
+        float, typer.Option(help="Density of the water at full scale divided by that in the logs.")
+    ] = 1.0,
+    resistance: Annotated[
+        float, typer.Option(help="Resistance coefficient of the ship divided by that of the model.")
+    ] = 1.0,
+    form_factor: Annotated[
+        float | None,
+        typer.Option(help="Form factor k, for the resistance by ITTC 1978 instead of a ratio."),
+    ] = None,
+    total_resistance: Annotated[
+        float | None, typer.Option(help="C_TM from a towing test, with --form-factor.")
+    ] = None,
+    length: Annotated[
+        str | None, typer.Option(help="Length of the model, with --form-factor.")
+    ] = None,
+    speed: Annotated[
+        str | None, typer.Option(help="Speed of the model, with --form-factor.")
+    ] = None,
+    propeller: Annotated[
+        float, typer.Option(help="Thrust at full scale divided by the scaled one.")
+    ] = 1.0,
+    rudder: Annotated[
+        float, typer.Option(help="Rudder force at full scale divided by the scaled one.")
+    ] = 1.0,
+    source: Annotated[str, typer.Option(help="Source of these scale effects.")] = "",
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
+    ] = False,
+    trust: Trust = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Scale the models and logs of a finished fit to full scale, by Froude's law of similarity.
+
+    The new run can be evaluated, exported and simulated like any other. Froude's law ignores
+    viscosity: factors of resistance, propeller and rudder correct it where their source is known.
+    """
+    from residnet.core.run_loader import name_damaged_key
+    from residnet.tasks.registry import open_finished_task
+    from residnet.tasks.scale_settings import make_scale_settings
 
     with show_progress(quiet=quiet):
-        page = report_run(folder)
+        run, task = open_finished_task(folder, "scale")
+        scaling, effects = make_scale_settings(
+            scale,
+            density_ratio,
+            {"resistance": resistance, "propeller": propeller, "rudder": rudder, "source": source},
+            form_factor=form_factor,
+            total_resistance=total_resistance,
+            length=length,
+            speed=speed,
+        )
+        output = output_folder or folder.with_name(f"{folder.resolve().name}_full_scale")
+        with name_damaged_key(folder):
+            finished_run = task.scale_run(
+                run, output, scaling, effects, models or (), overwrite=overwrite
+            )
+    print_result(finished_run)
+
+
+@app.command()
+def report(
+    folder: RunArgument,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Write a client report as PDF instead of the page.")
+    ] = False,
+    template: Annotated[
+        str,
+        typer.Option(help="Template of the PDF: 'client', or a Typst file of your own (.typ)."),
+    ] = "client",
+    logo: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Image in the head of the PDF.")
+    ] = None,
+    text: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="YAML: title, subtitle, client, author, reference, introduction, conclusions.",
+        ),
+    ] = None,
+    output_file: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="The PDF; RUN/client_report.pdf by default."),
+    ] = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Rewrite the figures and the report of a finished run, or write its client report."""
+    from residnet.tasks.registry import report_run, write_client_pdf
+
+    with show_progress(quiet=quiet):
+        if pdf:
+            page = write_client_pdf(folder, output_file, template, logo, text)
+        else:
+            page = report_run(folder)
     print(page)
 
 

@@ -152,6 +152,39 @@ def report_run(path: Path) -> Path:
     return page
 
 
+def write_client_pdf(
+    path: Path,
+    output_file: Path | None,
+    template: str,
+    logo: Path | None,
+    text_file: Path | None,
+) -> Path:
+    """Write the client report of a finished fit as PDF; returns the file.
+
+    Args:
+        path: folder of the run.
+        output_file: the PDF; None for client_report.pdf in the folder.
+        template: `client`, or a Typst file.
+        logo: image in the head; None for none.
+        text_file: YAML file with the user's own text; None for none.
+
+    Raises:
+        UsageError: if there is no finished fit, a file is missing, or Typst is not installed.
+        ConfigError: if the text has an unknown key.
+        DataError: if the template cannot be compiled.
+    """
+    from residnet.report.client import read_client_text, write_client_report
+
+    run = RunFolder.open(path)
+    require_free_space(output_file or path)
+    pdf_file = output_file or path / "client_report.pdf"
+    if pdf_file.suffix.lower() != ".pdf":
+        raise UsageError(f"--out {pdf_file}: expected a file name that ends in .pdf")
+    text = None if text_file is None else read_client_text(text_file)
+    with name_damaged_key(path):
+        return write_client_report(run.path, pdf_file, template=template, logo=logo, text=text)
+
+
 def list_catalogue(part_kind: str) -> list[tuple[str, str]]:
     """Return names and one-line descriptions of all parts of a kind, third-party ones included.
 
