@@ -13,8 +13,12 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from residnet.baselines.mmg import MMGBaseline
-from residnet.baselines.mmg_config import MMGConfig
-from residnet.baselines.mmg_parameters import PARAMETER_NAMES, default_priors
+from residnet.baselines.mmg_config import MMGConfig, SemiEmpiricalConfig
+from residnet.baselines.mmg_parameters import (
+    PARAMETER_NAMES,
+    clarke_priors,
+    default_priors,
+)
 from residnet.core.errors import ConfigError
 
 NAMES = ("u", "v", "r", "n", "delta")
@@ -133,3 +137,50 @@ def test_config_names_what_is_wrong() -> None:
         built(Y_w=(0.0, 1.0))
     with pytest.raises(ConfigError, match="'delta'"):
         MMGConfig.model_validate(TANKER).build(("u", "v", "r", "n"))
+
+
+def test_the_regressions_of_clarke_are_near_the_published_tanker() -> None:
+    """Table 3 of Yasukawa and Yoshimura (2015), measured by captive tests of the same hull."""
+    hull = MMGConfig.model_validate({**TANKER, "formulas": "clarke"}).hull
+    priors = clarke_priors(hull)
+    for name, tolerance in (("Y_v", 0.1), ("Y_r", 0.04), ("N_v", 0.01), ("N_r", 0.01)):
+        assert priors[name].mean == pytest.approx(PUBLISHED[name], abs=tolerance), name
+    assert priors["m_y"].mean == pytest.approx(PUBLISHED["m_y"], abs=0.06)
+    # what Clarke does not give is that of the default
+    assert priors["R_0"] == default_priors(hull)["R_0"]
+
+
+def test_a_semi_empirical_model_is_not_fitted() -> None:
+    config = SemiEmpiricalConfig.model_validate(
+        {**TANKER, "kind": "semi_empirical", "formulas": "clarke"}
+    )
+    baseline = config.build(NAMES)
+    samples = sampled(channels(300), published()(channels(300)).detach(), NAMES)
+    (solution,) = config.fit_solutions(baseline, samples)
+    assert solution.state == {}
+    values = {entry.term: entry.value for entry in solution.table}
+    assert values["N_v"] == pytest.approx(clarke_priors(config.hull)["N_v"].mean)
+    assert not config.is_parametric(NAMES)
+    assert len(baseline.free_indices()) == 0
+
+
+def test_the_evidence_widens_priors_that_the_logs_contradict_and_keeps_right_ones() -> None:
+    z = channels(4000)
+    generator = torch.Generator().manual_seed(1)
+    truth = published()(z).detach()
+    target = truth + 0.002 * torch.randn(truth.shape, generator=generator, dtype=torch.float64)
+    samples = sampled(z, target, NAMES)
+    factors = {}
+    for name, shift in (("right", 0.0), ("wrong", 8.0)):
+        priors = default_priors(MMGConfig.model_validate(TANKER).hull)
+        beliefs = {
+            key: (PUBLISHED[key] + shift * 0.1 * priors[key].sd, 0.1 * priors[key].sd)
+            for key in ("Y_v", "Y_r", "N_v", "N_r", "Y_vvv", "N_vvr")
+        }
+        fixed = {key: (PUBLISHED[key], 0.0) for key in PUBLISHED if key not in beliefs}
+        config = MMGConfig.model_validate(
+            {**TANKER, "beliefs": beliefs | fixed, "prior_weight": "evidence", "correlation": 1}
+        )
+        (solution,) = config.fit_solutions(config.build(NAMES), samples)
+        factors[name] = solution.notes["prior_factor"]
+    assert factors["right"] < 1.0 < factors["wrong"]

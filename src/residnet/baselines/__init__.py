@@ -25,6 +25,7 @@ else:
                 "nomoto": f"{_STEERING}:NomotoBaselineConfig",
                 "nomoto_sideslip": f"{_STEERING}:NomotoSideslipBaselineConfig",
                 "regressors": "residnet.baselines.regressors_config:RegressorsConfig",
+                "semi_empirical": "residnet.baselines.mmg_config:SemiEmpiricalConfig",
                 "still": "residnet.baselines.given_config:ZeroBaselineConfig",
             },
         ),

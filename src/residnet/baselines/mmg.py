@@ -297,8 +297,16 @@ def _subsample(samples: Samples) -> Samples:
     return samples.select(mask)
 
 
+_PRIOR_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""Factors on the standard deviations of the priors, of which the evidence chooses one."""
+
+
 def fit_mmg(config: MMGConfig, baseline: MMGBaseline, samples: Samples) -> Solution:
     """Compute the maximum a posteriori estimate by the Gauss-Newton method.
+
+    With `prior_weight: evidence` the priors are widened or narrowed by the factor with the largest
+    marginal likelihood in Laplace's approximation (MacKay 1992, Bayesian Interpolation, Neural
+    Computation 4(3), section 4). A refit takes the priors with this factor.
 
     Raises:
         FitError: if the accelerations at the prior means are not finite.
@@ -308,53 +316,79 @@ def fit_mmg(config: MMGConfig, baseline: MMGBaseline, samples: Samples) -> Solut
     # the likelihood of correlated samples must not outweigh the prior
     independent_samples = len(selected) / config.correlation
     free_index = baseline.free_indices()
-    mean, precision = baseline.prior()
+    mean, stated_precision = baseline.prior()
 
     def acceleration_residual(theta: Tensor) -> Tensor:
         baseline.theta[free_index] = theta
         predicted: Tensor = baseline(subsample.z)
         return subsample.target - predicted
 
-    def negative_log_posterior(theta: Tensor) -> float:
-        # Gaussian likelihood, concentrated with respect to the variance of each axis
-        negative_log_likelihood = (
-            0.5 * independent_samples * acceleration_residual(theta).square().mean(0).log().sum()
-        )
-        return float(negative_log_likelihood + 0.5 * (precision * (theta - mean).square()).sum())
-
-    def normal_equations(theta: Tensor) -> tuple[Tensor, Tensor]:
-        residual = acceleration_residual(theta)
-        axis_weight = independent_samples / len(subsample) / residual.square().mean(0)
-        jacobian = baseline.parameter_jacobian(subsample.z)
-        hessian = torch.einsum("bip,biq,i->pq", jacobian, jacobian, axis_weight) + torch.diag(
-            precision
-        )
-        gradient = torch.einsum("bip,bi,i->p", jacobian, residual, axis_weight)
-        return hessian, gradient + precision * (mean - theta)
-
-    def linearize(theta: Tensor) -> tuple[float, Callable[[float], tuple[float, Tensor]]]:
-        hessian, gradient = normal_equations(theta)
-
-        def try_step(damping: float) -> tuple[float, Tensor]:
-            damped_hessian = hessian + damping * torch.diag(hessian.diagonal())
-            next_theta = theta + torch.linalg.solve(damped_hessian, gradient)
-            return negative_log_posterior(next_theta), next_theta
-
-        return negative_log_posterior(theta), try_step
-
     if not torch.isfinite(acceleration_residual(mean)).all():
         raise FitError(
             "the MMG model's accelerations are not finite along the training logs; check"
             " hull, propeller and rudder, and units"
         )
-    theta_map = minimize_levenberg_marquardt(
-        # no initial damping: the prior makes the problem well-conditioned
-        mean,
-        linearize,
-        _MAX_STEPS,
-        min_relative_decrease=_MIN_RELATIVE_GAIN,
-        damping=0.0,
-    ).minimizer
-    standard_errors = torch.linalg.inv(normal_equations(theta_map)[0]).diagonal().sqrt()
+
+    def estimate(prior_factor: float) -> tuple[float, Tensor, Tensor]:
+        """Return the log evidence, the estimate and its Hessian with priors of this width."""
+        precision = stated_precision / prior_factor**2
+
+        def negative_log_posterior(theta: Tensor) -> float:
+            # Gaussian likelihood, concentrated with respect to the variance of each axis
+            mean_squares = acceleration_residual(theta).square().mean(0)
+            negative_log_likelihood = 0.5 * independent_samples * mean_squares.log().sum()
+            return float(
+                negative_log_likelihood + 0.5 * (precision * (theta - mean).square()).sum()
+            )
+
+        def normal_equations(theta: Tensor) -> tuple[Tensor, Tensor]:
+            residual = acceleration_residual(theta)
+            axis_weight = independent_samples / len(subsample) / residual.square().mean(0)
+            jacobian = baseline.parameter_jacobian(subsample.z)
+            hessian = torch.einsum("bip,biq,i->pq", jacobian, jacobian, axis_weight) + torch.diag(
+                precision
+            )
+            gradient = torch.einsum("bip,bi,i->p", jacobian, residual, axis_weight)
+            return hessian, gradient + precision * (mean - theta)
+
+        def linearize(theta: Tensor) -> tuple[float, Callable[[float], tuple[float, Tensor]]]:
+            hessian, gradient = normal_equations(theta)
+
+            def try_step(damping: float) -> tuple[float, Tensor]:
+                damped_hessian = hessian + damping * torch.diag(hessian.diagonal())
+                next_theta = theta + torch.linalg.solve(damped_hessian, gradient)
+                return negative_log_posterior(next_theta), next_theta
+
+            return negative_log_posterior(theta), try_step
+
+        theta_map = minimize_levenberg_marquardt(
+            # no initial damping: the prior makes the problem well-conditioned
+            mean,
+            linearize,
+            _MAX_STEPS,
+            min_relative_decrease=_MIN_RELATIVE_GAIN,
+            damping=0.0,
+        ).minimizer
+        hessian = normal_equations(theta_map)[0]
+        log_evidence = (
+            -negative_log_posterior(theta_map)
+            + 0.5 * float(precision.log().sum())
+            - 0.5 * float(torch.linalg.slogdet(hessian).logabsdet)
+        )
+        return log_evidence, theta_map, hessian
+
+    factors = _PRIOR_FACTORS if config.prior_weight == "evidence" else (1.0,)
+    estimates = {factor: estimate(factor) for factor in factors}
+    chosen = max(estimates, key=lambda factor: estimates[factor][0])
+    _, theta_map, hessian = estimates[chosen]
+    baseline.theta[free_index] = theta_map
+    baseline.prior_std = [chosen * deviation for deviation in baseline.prior_std]
+    standard_errors = torch.linalg.inv(hessian).diagonal().sqrt()
+    notes = {}
+    if config.prior_weight == "evidence":
+        notes["prior_factor"] = chosen
+        notes["log_evidence"] = {
+            f"{factor:g}": round(entry[0], 3) for factor, entry in estimates.items()
+        }
     theta = baseline.theta.detach().clone()
-    return Solution({}, {"theta": theta}, tuple(baseline.refresh_table((), standard_errors)))
+    return Solution({}, {"theta": theta}, tuple(baseline.refresh_table((), standard_errors)), notes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -14,6 +14,7 @@ from residnet.baselines.mmg_parameters import (
     MMGPropeller,
     MMGRudder,
     ParameterPrior,
+    clarke_priors,
     default_priors,
 )
 from residnet.core.names import VELOCITY_NAMES, suggest_name
@@ -45,6 +46,12 @@ class MMGConfig(IdentifiedConfig):
         correlation: number of successive acceleration samples with the information of one
             independent sample.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
+        formulas: regressions of the prior means of added masses and linear hull derivatives from
+            the main particulars: `kijima` (Kijima et al. 1990) or `clarke` (Clarke, Gedling and
+            Hine 1983).
+        prior_weight: `fixed` takes the standard deviations of the priors as they are; `evidence`
+            multiplies them by the factor with the largest marginal likelihood, so that few logs
+            stay near the regressions and many logs leave them.
     """
 
     kind: Literal["mmg"] = "mmg"
@@ -56,9 +63,11 @@ class MMGConfig(IdentifiedConfig):
     angle: str = "delta"
     correlation: int = Field(default=100, ge=1, le=100_000)
     manoeuvres: tuple[str, ...] = ()
+    formulas: Literal["kijima", "clarke"] = "kijima"
+    prior_weight: Literal["fixed", "evidence"] = "fixed"
 
     @model_validator(mode="after")
-    def _validate_beliefs(self) -> MMGConfig:
+    def _validate_beliefs(self) -> Self:
         for name in self.beliefs:
             if name not in PARAMETER_NAMES:
                 raise ValueError(
@@ -92,7 +101,8 @@ class MMGConfig(IdentifiedConfig):
         configured_priors = {
             name: ParameterPrior(*mean_and_std, "") for name, mean_and_std in self.beliefs.items()
         }
-        priors = (default_priors(self.hull) | configured_priors).values()
+        regressions = clarke_priors if self.formulas == "clarke" else default_priors
+        priors = (regressions(self.hull) | configured_priors).values()
         return MMGBaseline(MMGForces(self.hull, self.propeller, self.rudder, columns), priors)
 
     def validate_samples(self, samples: SampleOrigins) -> None:
@@ -103,3 +113,46 @@ class MMGConfig(IdentifiedConfig):
 
         assert isinstance(baseline, MMGBaseline)
         return [fit_mmg(self, baseline, samples)]
+
+
+class SemiEmpiricalConfig(MMGConfig):
+    """MMG model by regressions from main particulars alone, without a fit.
+
+    The parameters are the prior means: usual values of a merchant ship, and added masses and linear
+    hull derivatives by `formulas`. Their standard errors are the standard deviations of the priors.
+    It is a reference for identified models, and a start where there are no logs of a manoeuvre.
+
+    Attributes:
+        kind: name of this baseline in a config.
+    """
+
+    kind: Literal["semi_empirical"] = "semi_empirical"  # type: ignore[assignment]
+
+    def is_parametric(self, names: Sequence[str]) -> bool:
+        return False
+
+    def build(self, names: Sequence[str]) -> MMGBaseline:
+        """Build the baseline with every parameter fixed at its prior mean."""
+        baseline = super().build(names)
+        baseline.prior_std = [0.0] * len(baseline.prior_std)
+        return baseline
+
+    def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+        """Return the regressions; the samples are not used."""
+        from residnet.baselines.mmg import axis_of_parameter
+        from residnet.regression.estimator import Coefficient, Solution
+
+        priors = (
+            clarke_priors(self.hull) if self.formulas == "clarke" else default_priors(self.hull)
+        )
+        theta = baseline.get_parameter("theta")
+        table = tuple(
+            Coefficient(
+                axis_of_parameter(name),
+                name,
+                value,
+                self.beliefs[name][1] if name in self.beliefs else priors[name].sd,
+            )
+            for name, value in zip(PARAMETER_NAMES, theta.tolist(), strict=True)
+        )
+        return [Solution({}, {}, table)]

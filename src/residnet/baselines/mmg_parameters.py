@@ -9,6 +9,11 @@ from pydantic import Field
 
 from residnet.core.config import Config, Kilograms, Metres
 from residnet.physics.parameters import Density, SquareMetres
+from residnet.physics.similarity import (
+    Particulars,
+    estimate_added_mass,
+    estimate_linear_derivatives,
+)
 
 
 class MMGHull(Config):
@@ -153,6 +158,43 @@ def default_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
         "epsilon": ParameterPrior(1.05, 0.2, "wake at the propeller over wake at the rudder"),
         "kappa": ParameterPrior(0.5, 0.1, "share of the slipstream acceleration at the rudder"),
     }
+
+
+def clarke_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
+    """Return the default priors with linear hull derivatives by Clarke, Gedling and Hine (1983).
+
+    Clarke's regressions are in the prime I system (forces by 1/2 rho L^2 U^2) and do not contain
+    m U; the MMG system divides by 1/2 rho L d U^2, and its Y_r includes the added mass in surge
+    (Yasukawa and Yoshimura 2015, eq. (7)). The added masses are those of
+    `residnet.physics.similarity.estimate_added_mass`.
+    """
+    priors = default_priors(hull)
+    particulars = Particulars(
+        length=hull.length,
+        # the regressions are non-dimensional: the speed cancels
+        speed=1.0,
+        density=hull.density,
+        draught=hull.draught,
+        beam=hull.beam,
+        mass=hull.mass,
+    )
+    derivatives = estimate_linear_derivatives(particulars)
+    added_mass = estimate_added_mass(particulars)
+    assert derivatives is not None, "beam, draught and mass are known"
+    assert added_mass is not None, "beam, draught and mass are known"
+    mass_unit = 0.5 * hull.density * hull.length**2 * hull.draught
+    ratio = hull.length / hull.draught
+    surge = added_mass.surge / mass_unit
+    means = {
+        "m_x": surge,
+        "m_y": added_mass.sway / mass_unit,
+        "J_z": added_mass.yaw / (mass_unit * hull.length**2),
+        "Y_v": derivatives["Y_v"] * ratio,
+        "Y_r": derivatives["Y_r"] * ratio + surge,
+        "N_v": derivatives["N_v"] * ratio,
+        "N_r": derivatives["N_r"] * ratio,
+    }
+    return priors | {name: priors[name]._replace(mean=mean) for name, mean in means.items()}
 
 
 PARAMETER_NAMES = tuple(default_priors(MMGHull(length=1.0, beam=0.2, draught=0.1, mass=10.0)))
