@@ -95,7 +95,7 @@ def test_pages_hold_values_with_intervals_and_limits_beside_measured_ones(
     assert len(list((run / "figures").glob("*booklet*.png"))) == 3
     said = command("plan-trial", run, "--time", "60 s", "--out", tmp_path / "plan")
     assert said.code == 0
-    assert "they narrow the intervals of predictions" in said.out
+    assert "they narrow the prediction intervals" in said.out
     assert (tmp_path / "plan" / "next_tracks.csv").read_text().count("\n") > 100
 
 

@@ -121,9 +121,12 @@ def test_a_basin_predicts_the_ship_at_full_scale(tmp_path: Path, command: Comman
     )  # fmt: skip
     assert said.code == 0, said.err
     content = yaml.safe_load(config.read_text())
-    content |= {"baseline": {"kind": "regressors", "sets": ["linear"]}}
-    content["baselines"] = {"hull": {"kind": "regressors", "sets": ["abkowitz"], "ridge": 1e-6}}
-    content["refit"] = {"hull": {"horizon": "10 s", "every": "5 s"}}
+    content |= {"baseline": {"kind": "regressors", "terms": ["1", "u", "v", "r", "delta"]}}
+    turn = ["1", "v", "r", "u v", "u r", "v^3", "v^2 r", "v r^2", "r^3", "u|u| delta", "delta^3"]
+    surge = ["1", "u", "u^2", "v^2", "r^2", "v r", "delta^2", "v delta"]
+    terms = {"u": surge, "v": turn, "r": turn}
+    content["baselines"] = {"hull": {"kind": "regressors", "terms": terms, "ridge": 1e-8}}
+    content["refit"] = {"hull": {"horizon": "15 s", "every": "7 s"}}
     del content["recipe"]
     run = tmp_path / "run"
     said = command("run", write_yaml(config, content), "--out", run)
@@ -133,6 +136,10 @@ def test_a_basin_predicts_the_ship_at_full_scale(tmp_path: Path, command: Comman
     diameter = pages["circle_35_starboard"]["tactical_diameter"]
     measured = pages["TC_35_S"]["tactical_diameter"]["measured"]
     assert diameter["ship"] == pytest.approx(50.0 * measured, rel=0.05)
+    # the gear's lag and rate are part of the manoeuvre: the overshoot is that of the test
+    overshoot = pages["zigzag_10_10"]["first_overshoot"]["value"]
+    truth = pages["ZZ_10-10_S"]["first_overshoot"]["measured"]
+    assert math.degrees(overshoot) == pytest.approx(math.degrees(truth), abs=1.0)
     assert (run / "derivatives.json").is_file()
     assert (run / "derivatives_ship.json").is_file()
     ship = tmp_path / "ship"

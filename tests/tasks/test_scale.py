@@ -28,7 +28,7 @@ def test_the_full_scale_run_has_the_errors_of_the_model_in_units_of_the_ship(
     assert any(row["model"] == "baseline" for row in scaled_rows)
     for row in scaled_rows:
         original = rows[row["model"], row["split"], row["protocol"], row["manoeuvre"]]
-        assert row["nrmse_mean"] == pytest.approx(original["nrmse_mean"], rel=1e-4)
+        assert row["nrmse"]["mean"] == pytest.approx(original["nrmse"]["mean"], rel=1e-4)
         assert row["rmse"]["u"] == pytest.approx(4.0 * original["rmse"]["u"], rel=1e-4)
     model = residnet.load(run, "baseline")
     assert residnet.load(ship, "baseline").dt == pytest.approx(4.0 * model.dt)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, Any, final
 
 import torch
 from torch import Tensor, nn
@@ -384,7 +384,7 @@ def fit_mmg(config: MMGConfig, baseline: MMGBaseline, samples: Samples) -> Solut
     baseline.theta[free_index] = theta_map
     baseline.prior_std = [chosen * deviation for deviation in baseline.prior_std]
     standard_errors = torch.linalg.inv(hessian).diagonal().sqrt()
-    notes = {}
+    notes: dict[str, Any] = {}
     if config.prior_weight == "evidence":
         notes["prior_factor"] = chosen
         notes["log_evidence"] = {

@@ -341,7 +341,7 @@ def apply_scale_effects(
     baseline = scaled_model.baseline
     if isinstance(baseline, RegressorBaseline):
         with torch.no_grad():
-            baseline.theta *= _effect_factors(baseline, effects)
+            baseline.theta.copy_(baseline.theta * _effect_factors(baseline, effects))
         return spec, scaled_model
     if isinstance(baseline, MMGBaseline) and isinstance(spec.baseline, MMGConfig):
         config = spec.baseline

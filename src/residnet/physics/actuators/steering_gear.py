@@ -216,7 +216,7 @@ def _fit_parameters(
         residuals,
         [math.log(min(max(initial[name], 1.01 * lower[name]), upper[name])) for name in names],
         bounds=([math.log(lower[n]) for n in names], [math.log(upper[n]) for n in names]),
-        diff_step=1e-3,
+        diff_step=[1e-3] * len(names),
         x_scale=0.3,
         max_nfev=60,
     )
@@ -225,7 +225,8 @@ def _fit_parameters(
     # errors of one movement are correlated: the effective number of samples is smaller
     correlation = float(np.clip(np.corrcoef(errors[:-1], errors[1:])[0, 1], 0.0, 0.99))
     inflation = (1.0 + correlation) / (1.0 - correlation)
-    gram = fit.jac.T @ fit.jac
+    jacobian = np.asarray(fit.jac, dtype=float)
+    gram = jacobian.T @ jacobian
     variance = cost / max(len(errors) - len(names), 1) * inflation
     covariance = variance * np.linalg.pinv(gram)
     return np.asarray(fit.x), np.asarray(covariance), cost

@@ -25,9 +25,7 @@ from residnet.identification.fitter import FittedModel
 from residnet.identification.identified import evaluate_splits, make_candidates
 from residnet.identification.prepared import convert_to_motion_through_water, prepare_splits
 from residnet.identification.scaling import scale_fitted_model, scale_log
-from residnet.io.readers.base import CanonicalConfig
-from residnet.io.sources import LogsBySplit, MeasuredLogs
-from residnet.io.split import SplitConfig
+from residnet.io.sources import LogsBySplit
 from residnet.manoeuvres.input_shares import InputShare
 from residnet.physics.similarity import FroudeScaling
 from residnet.preprocessing.motion import MotionConfig, complete_motion
@@ -77,6 +75,8 @@ def scale_run(
         )
     if run.path.resolve().is_relative_to(output_folder.resolve()):
         raise UsageError(f"{output_folder}: contains the run {run.path}; choose another --out")
+    if output_folder.exists() and not output_folder.is_dir():
+        raise UsageError(f"{output_folder}: is a file, expected a folder; choose another --out")
     store = RunModelStore(run)
     names = _resolve_models(run, store, model_names)
     begin_stage(f"{config.name}: reading logs")
@@ -181,22 +181,14 @@ def scale_fit_config(
     """
     scaled = scaling.scale_config(config)
     root = folder.resolve()
-    split = SplitConfig.model_construct(
-        file=None,
-        root=root,
-        auto=(),
-        **{
-            name: tuple(_log_file(name, index, log) for index, log in enumerate(members))
-            for name, members in logs.items()
-        },
-    )
+    files = {
+        name: [_log_file(name, index, log) for index, log in enumerate(members)]
+        for name, members in logs.items()
+    }
     text = f"scaled by Froude's law with ratio {scaling.scale:g}"
     update = {
         "name": f"{config.name}_full_scale",
         "description": f"{config.description}; {text}" if config.description else text,
-        "data": MeasuredLogs.model_construct(
-            kind="measured", reader=CanonicalConfig(), split=split
-        ),
         "prepare": scaled.prepare.model_copy(update={"motion": MotionConfig()}),
         "booklet": None if config.booklet is None else scale_booklet(config.booklet, scaling),
         "derivatives": None
@@ -213,9 +205,13 @@ def scale_fit_config(
     scaled = scaled.model_copy(update=update)
     # the root exists when the logs are read, not yet when the config is validated
     root.mkdir(parents=True, exist_ok=True)
-    return validate_config(
-        scaled.model_dump(mode="json", by_alias=True), type(config), "full-scale config"
-    )
+    content = scaled.model_dump(mode="json", by_alias=True)
+    content["data"] = {
+        "kind": "measured",
+        "reader": {"kind": "canonical"},
+        "split": {"root": str(root), **files},
+    }
+    return validate_config(content, type(config), "full-scale config")
 
 
 def scale_booklet(config: BookletConfig, scaling: FroudeScaling) -> BookletConfig:
