@@ -1,0 +1,67 @@
+"""`residnet report --pdf`: the client report of a fit, and its errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from made_run import made_run
+from tiny import Command, write_yaml
+
+from residnet.report.client import ClientText, write_client_report
+from residnet.report.client_content import build_sections
+from residnet.report.run_reader import RunFiles
+
+typst = pytest.importorskip("typst")
+
+LOGO = (
+    '<svg xmlns="http://www.w3.org/2000/svg" width="40" height="20">'
+    '<rect width="40" height="20"/></svg>'
+)
+
+
+def test_the_sections_have_the_tests_the_errors_and_the_limits(tmp_path: Path) -> None:
+    run = RunFiles(made_run(tmp_path / "run"))
+    sections = build_sections(run, {})
+    titles = [section.title for section in sections]
+    assert titles == [
+        "Summary",
+        "Vessel and tests",
+        "Validation on held-out manoeuvres",
+        "Limits of validity",
+    ]
+    for section in sections:
+        for block in section.to_data()["blocks"]:
+            if block["kind"] == "table":
+                assert all(len(row) == len(block["header"]) for row in block["rows"])
+
+
+def test_the_pdf_has_logo_and_text_of_the_user(tmp_path: Path) -> None:
+    run = made_run(tmp_path / "run")
+    logo = tmp_path / "logo.svg"
+    logo.write_text(LOGO)
+    text = ClientText(title="Trials of #Anna*", client="A yard", introduction=("One $paragraph_.",))
+    pdf = write_client_report(run, tmp_path / "a.pdf", logo=logo, text=text)
+    assert pdf.read_bytes()[:5] == b"%PDF-"
+    # a template of the user's own gets the same data; its markup is not that of the text
+    template = tmp_path / "mine.typ"
+    template.write_text('#let data = json("report.json")\n#data.title\n#image(data.logo)')
+    write_client_report(run, tmp_path / "b.pdf", template=str(template), logo=logo, text=text)
+
+
+def test_wrong_files_are_one_line(tmp_path: Path, command: Command) -> None:
+    run = made_run(tmp_path / "run")
+    for options, message in (
+        (("--template", "none.typ"), "expected 'client' or an existing Typst file"),
+        (("--logo", tmp_path / "none.svg"), "expected an existing image"),
+        (("--out", tmp_path / "report.doc"), "ends in .pdf"),
+        (("--text", write_yaml(tmp_path / "a.yaml", {"titel": "a"})), "titel"),
+    ):
+        said = command("report", run, "--pdf", *options)
+        assert said.code == 2, options
+        assert message in said.err
+    broken = tmp_path / "broken.typ"
+    broken.write_text("#unknown")
+    said = command("report", run, "--pdf", "--template", broken)
+    assert said.code == 1
+    assert "Typst cannot compile the template" in said.err
