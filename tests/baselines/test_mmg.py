@@ -161,7 +161,9 @@ def test_a_semi_empirical_model_is_not_fitted() -> None:
     values = {entry.term: entry.value for entry in solution.table}
     assert values["N_v"] == pytest.approx(clarke_priors(config.hull)["N_v"].mean)
     assert not config.is_parametric(NAMES)
-    assert len(baseline.free_indices()) == 0
+    assert baseline.parameter_counts() == [0.0, 0.0, 0.0]
+    prior_means = MMGConfig.model_validate({**TANKER, "formulas": "clarke"}).build(NAMES)
+    assert torch.equal(baseline(channels(20)), prior_means(channels(20)))
 
 
 def test_the_evidence_widens_priors_that_the_logs_contradict_and_keeps_right_ones() -> None:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, final
 import torch
 from torch import Tensor, nn
 
-from residnet.baselines.base import ParametricBaseline, select_manoeuvres
+from residnet.baselines.base import Baseline, ParametricBaseline, select_manoeuvres
 from residnet.baselines.mmg_parameters import (
     PARAMETER_NAMES,
     MMGHull,
@@ -283,6 +283,24 @@ class MMGBaseline(ParametricBaseline):
             )
             for i, name in enumerate(PARAMETER_NAMES)
         ]
+
+
+@final
+class SemiEmpiricalBaseline(Baseline):
+    """MMG model of nu_dot [..., 3] whose parameters theta [34] are regressions, not fitted."""
+
+    def __init__(self, force_model: MMGForces, theta: Sequence[float]) -> None:
+        super().__init__()
+        self.force_model = force_model
+        self.theta = nn.Buffer(torch.tensor(theta, dtype=torch.float64))
+
+    def forward(self, z: Tensor) -> Tensor:
+        nu_dot: Tensor = self.force_model(z, self.theta.to(z.dtype))
+        return nu_dot
+
+    def parameter_counts(self) -> list[float]:
+        """Return zeros, since no parameter is fitted."""
+        return [0.0] * self.n_dof
 
 
 def axis_of_parameter(name: str) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self, final
 
 from pydantic import Field, model_validator
 
@@ -22,18 +23,13 @@ from residnet.core.sample_origins import SampleOrigins
 
 if TYPE_CHECKING:
     from residnet.baselines.base import Baseline
-    from residnet.baselines.mmg import MMGBaseline
+    from residnet.baselines.mmg import MMGBaseline, MMGForces, SemiEmpiricalBaseline
     from residnet.core.samples import Samples
     from residnet.regression.estimator import Solution
 
 
-class MMGConfig(IdentifiedConfig):
-    """MMG standard model of a ship with one propeller and one rudder.
-
-    The model follows Yasukawa and Yoshimura (2015). Every parameter has a prior with a mean and
-    a standard deviation, which default to usual values. The fit is the maximum a posteriori
-    estimate from the measured accelerations. A `refit` of this baseline on free runs continues from
-    it and yields the standard errors of the prediction intervals.
+class MMGParticularsConfig(IdentifiedConfig, ABC):
+    """Particulars of a ship with one propeller and one rudder, and the regressions on them.
 
     Attributes:
         hull: particulars of the hull.
@@ -43,28 +39,18 @@ class MMGConfig(IdentifiedConfig):
             differ from the defaults; a standard deviation of 0 fixes the parameter.
         revolutions: channel of the propeller revolutions, 1/s.
         angle: channel of the rudder angle, rad, positive to starboard.
-        correlation: number of successive acceleration samples with the information of one
-            independent sample.
-        manoeuvres: kinds of manoeuvre to fit on; empty for all.
         formulas: regressions of the prior means of added masses and linear hull derivatives from
             the main particulars: `kijima` (Kijima et al. 1990) or `clarke` (Clarke, Gedling and
             Hine 1983).
-        prior_weight: `fixed` takes the standard deviations of the priors as they are; `evidence`
-            multiplies them by the factor with the largest marginal likelihood, so that few logs
-            stay near the regressions and many logs leave them.
     """
 
-    kind: Literal["mmg"] = "mmg"
     hull: MMGHull
     propeller: MMGPropeller
     rudder: MMGRudder
     beliefs: dict[str, tuple[float, Annotated[float, Field(ge=0)]]] = Field(default_factory=dict)
     revolutions: str = "n"
     angle: str = "delta"
-    correlation: int = Field(default=100, ge=1, le=100_000)
-    manoeuvres: tuple[str, ...] = ()
     formulas: Literal["kijima", "clarke"] = "kijima"
-    prior_weight: Literal["fixed", "evidence"] = "fixed"
 
     @model_validator(mode="after")
     def _validate_beliefs(self) -> Self:
@@ -76,10 +62,7 @@ class MMGConfig(IdentifiedConfig):
         return self
 
     def check_channels(self, names: Sequence[str]) -> None:
-        require_channels(names, self.required_channels, "the baseline 'mmg'")
-
-    def is_parametric(self, names: Sequence[str]) -> bool:
-        return True
+        require_channels(names, self.required_channels, f"the baseline '{self.kind}'")
 
     def has_regressors(self, names: Sequence[str]) -> bool:
         return False
@@ -92,18 +75,58 @@ class MMGConfig(IdentifiedConfig):
         """Channels of velocities, propeller revolutions and rudder angle."""
         return (*VELOCITY_NAMES, self.revolutions, self.angle)
 
-    def build(self, names: Sequence[str]) -> MMGBaseline:
-        """Build the baseline for channels `names`, with every parameter at its prior mean."""
-        from residnet.baselines.mmg import MMGBaseline, MMGForces
-
-        self.check_channels(names)
-        columns = [list(names).index(name) for name in self.required_channels]
+    def priors(self) -> list[ParameterPrior]:
+        """Return the prior of every parameter, in the order of `PARAMETER_NAMES`."""
+        regressions = clarke_priors if self.formulas == "clarke" else default_priors
         configured_priors = {
             name: ParameterPrior(*mean_and_std, "") for name, mean_and_std in self.beliefs.items()
         }
-        regressions = clarke_priors if self.formulas == "clarke" else default_priors
-        priors = (regressions(self.hull) | configured_priors).values()
-        return MMGBaseline(MMGForces(self.hull, self.propeller, self.rudder, columns), priors)
+        return list((regressions(self.hull) | configured_priors).values())
+
+    def build_forces(self, names: Sequence[str]) -> MMGForces:
+        """Build the force model for channels `names`.
+
+        Raises:
+            ConfigError: if a channel is missing.
+        """
+        from residnet.baselines.mmg import MMGForces
+
+        self.check_channels(names)
+        columns = [list(names).index(name) for name in self.required_channels]
+        return MMGForces(self.hull, self.propeller, self.rudder, columns)
+
+
+@final
+class MMGConfig(MMGParticularsConfig):
+    """MMG standard model of a ship with one propeller and one rudder.
+
+    The model follows Yasukawa and Yoshimura (2015). Every parameter has a prior with a mean and
+    a standard deviation, which default to usual values. The fit is the maximum a posteriori
+    estimate from the measured accelerations. A `refit` of this baseline on free runs continues from
+    it and yields the standard errors of the prediction intervals.
+
+    Attributes:
+        correlation: number of successive acceleration samples with the information of one
+            independent sample.
+        manoeuvres: kinds of manoeuvre to fit on; empty for all.
+        prior_weight: `fixed` takes the standard deviations of the priors as they are; `evidence`
+            multiplies them by the factor with the largest marginal likelihood, so that few logs
+            stay near the regressions and many logs leave them.
+    """
+
+    kind: Literal["mmg"] = "mmg"
+    correlation: int = Field(default=100, ge=1, le=100_000)
+    manoeuvres: tuple[str, ...] = ()
+    prior_weight: Literal["fixed", "evidence"] = "fixed"
+
+    def is_parametric(self, names: Sequence[str]) -> bool:
+        return True
+
+    def build(self, names: Sequence[str]) -> MMGBaseline:
+        """Build the baseline for channels `names`, with every parameter at its prior mean."""
+        from residnet.baselines.mmg import MMGBaseline
+
+        return MMGBaseline(self.build_forces(names), self.priors())
 
     def validate_samples(self, samples: SampleOrigins) -> None:
         samples.require_manoeuvres(self.manoeuvres)
@@ -115,7 +138,8 @@ class MMGConfig(IdentifiedConfig):
         return [fit_mmg(self, baseline, samples)]
 
 
-class SemiEmpiricalConfig(MMGConfig):
+@final
+class SemiEmpiricalConfig(MMGParticularsConfig):
     """MMG model by regressions from main particulars alone, without a fit.
 
     The parameters are the prior means: usual values of a merchant ship, and added masses and linear
@@ -126,33 +150,26 @@ class SemiEmpiricalConfig(MMGConfig):
         kind: name of this baseline in a config.
     """
 
-    kind: Literal["semi_empirical"] = "semi_empirical"  # type: ignore[assignment]
+    kind: Literal["semi_empirical"] = "semi_empirical"
 
     def is_parametric(self, names: Sequence[str]) -> bool:
         return False
 
-    def build(self, names: Sequence[str]) -> MMGBaseline:
-        """Build the baseline with every parameter fixed at its prior mean."""
-        baseline = super().build(names)
-        baseline.prior_std = [0.0] * len(baseline.prior_std)
-        return baseline
+    def build(self, names: Sequence[str]) -> SemiEmpiricalBaseline:
+        """Build the baseline with every parameter at its prior mean."""
+        from residnet.baselines.mmg import SemiEmpiricalBaseline
+
+        return SemiEmpiricalBaseline(
+            self.build_forces(names), [prior.mean for prior in self.priors()]
+        )
 
     def fit_solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """Return the regressions; the samples are not used."""
         from residnet.baselines.mmg import axis_of_parameter
         from residnet.regression.estimator import Coefficient, Solution
 
-        priors = (
-            clarke_priors(self.hull) if self.formulas == "clarke" else default_priors(self.hull)
-        )
-        theta = baseline.get_parameter("theta")
         table = tuple(
-            Coefficient(
-                axis_of_parameter(name),
-                name,
-                value,
-                self.beliefs[name][1] if name in self.beliefs else priors[name].sd,
-            )
-            for name, value in zip(PARAMETER_NAMES, theta.tolist(), strict=True)
+            Coefficient(axis_of_parameter(name), name, prior.mean, prior.sd)
+            for name, prior in zip(PARAMETER_NAMES, self.priors(), strict=True)
         )
         return [Solution({}, {}, table)]
