@@ -32,7 +32,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import BandTable, ModelSpec
 from residnet.heads.base import Features, ResidualScale
 from residnet.heads.basis import BasisHead
-from residnet.physics.signals import RestoringAcceleration
+from residnet.physics.signals import SoftVelocityLimit
 from residnet.physics.similarity import FroudeScaling, is_drive, is_rudder
 from residnet.physics.symmetry import get_dof
 from residnet.physics.terms import parse_term
@@ -41,6 +41,8 @@ _VERIFIED_STEPS = 8
 """Steps of the free runs that verify a scaled model."""
 _VERIFIED_RUNS = 16
 """Number of free runs that verify a scaled model, from random states of the training range."""
+_VERIFIED_HISTORY = 4
+"""Samples of the measured past of these runs."""
 _MAX_DEVIATION = 1e-6
 """Largest deviation of these runs as a share of the training range; softening constants of square
 roots, which have a unit, cause smaller ones."""
@@ -272,7 +274,7 @@ def _part_factors(
                 factors[prefix + key] = channel_factors(part.names)
         elif isinstance(part, ResidualScale):
             factors[f"{prefix}std"] = acceleration
-        elif isinstance(part, RestoringAcceleration):
+        elif isinstance(part, SoftVelocityLimit):
             bounds = channel_factors(list(names)[: part.n_channels])
             factors[f"{prefix}low"] = bounds
             factors[f"{prefix}high"] = bounds
@@ -413,11 +415,18 @@ def _largest_deviation(
     x = torch.cat((pose, velocities), dim=-1)
     scaled_x = torch.cat((pose, velocities * factors[:n]), dim=-1)
     rows = _VERIFIED_RUNS
-    s = torch.zeros(rows, original.n_state, dtype=torch.float64)
-    scaled_s = torch.zeros(rows, scaled.n_state, dtype=torch.float64)
+    # networks with a memory begin from a measured past
+    histories = low + width * draw(rows, _VERIFIED_HISTORY, len(channels))
+    past = torch.cat((pose[:, None].expand(-1, _VERIFIED_HISTORY, -1), histories[..., :n]), dim=-1)
+    scaled_past = torch.cat((past[..., :3], histories[..., :n] * factors[:n]), dim=-1)
     copies = original.head.batch_ensemble_size
-    if copies > 1:
-        x, scaled_x, s, scaled_s = (part.repeat(copies, 1) for part in (x, scaled_x, s, scaled_s))
+    x, scaled_x = (part.repeat(copies, 1) for part in (x, scaled_x))
+    past, scaled_past, past_inputs = (
+        part.repeat(copies, 1, 1) for part in (past, scaled_past, histories[..., n:])
+    )
+    with torch.no_grad():
+        s = original.warmup(past, past_inputs)
+        scaled_s = scaled.warmup(scaled_past, past_inputs * factors[n:])
     deviation = 0.0
     with torch.no_grad():
         for step in range(_VERIFIED_STEPS):
