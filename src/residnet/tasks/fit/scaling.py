@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from residnet.core.config import dump_config, validate_config
 from residnet.core.errors import DataError, UsageError
+from residnet.core.files import make_file_stem
 from residnet.core.log import Log
 from residnet.core.names import suggest_name
 from residnet.core.progress import begin_stage, log_message
@@ -162,7 +163,7 @@ def _scale_logs(config: FitConfig, scaling: FroudeScaling) -> LogsBySplit:
 
 def _log_file(split: str, index: int, log: Log) -> str:
     # parts of one recording have equal names
-    return f"{LOG_FOLDER}/{split}_{index + 1:03d}_{log.name}.parquet"
+    return f"{LOG_FOLDER}/{split}_{index + 1:03d}_{make_file_stem(log.name)}.parquet"
 
 
 def scale_fit_config(
@@ -217,10 +218,13 @@ def scale_fit_config(
 def scale_booklet(config: BookletConfig, scaling: FroudeScaling) -> BookletConfig:
     """Return a booklet at the target scale, whose `scale` is what remains to the ship."""
 
+    scaled = scaling.scale_config(config)
+
     def scale_share(name: str, share: InputShare) -> InputShare:
         drive, steer, centre, limit, rate = share.to_si(name)
         factor = scaling.channel_factor(name)
-        return share.model_copy(
+        # lag and delay have units in the config and are scaled already
+        return scaled.inputs[name].model_copy(
             update={
                 "drive": drive * factor,
                 "steer": steer * factor,
@@ -230,7 +234,6 @@ def scale_booklet(config: BookletConfig, scaling: FroudeScaling) -> BookletConfi
             }
         )
 
-    scaled = scaling.scale_config(config)
     return scaled.model_copy(
         update={
             "scale": config.scale / scaling.scale,
