@@ -81,7 +81,7 @@ def test_without_commands_the_rate_alone_is_estimated_and_named() -> None:
 def test_logs_without_a_rudder_have_a_note_instead_of_a_booklet() -> None:
     sections, notes = draft([zigzag("a", 20.0)], inputs=("n",))
     assert sections == {}
-    assert any("one rudder among the inputs" in text for _, text in notes.notes)
+    assert any("one rudder among the inputs" in text for _, text in notes.guessed_values)
 
 
 def test_of_few_manoeuvres_the_mildest_ones_are_held_out() -> None:

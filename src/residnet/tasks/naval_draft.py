@@ -129,14 +129,14 @@ def draft_naval_sections(
             if len(rudders) == 1
             else f"it needs one rudder among the inputs, and there are {rudders or 'none'}"
         )
-        draft_notes.add_note(("description",), f"no booklet and no derivatives: {reason}")
+        draft_notes.add_guess(("description",), f"no booklet and no derivatives: {reason}")
         return {}
     rudder = rudders[0]
     largest_rudder_deg = math.degrees(max(float(np.nanmax(np.abs(log[rudder]))) for log in logs))
     # measured angles overshoot the ordered ones by noise and offsets
     angle_deg = min(5.0 * math.floor(largest_rudder_deg / 5.0 + 0.1), _IMO_RUDDER_DEG)
     if angle_deg < 5.0:
-        draft_notes.add_note(
+        draft_notes.add_guess(
             ("description",),
             f"no booklet: the rudder moves by {largest_rudder_deg:.2g} deg at most",
         )
