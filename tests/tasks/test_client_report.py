@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from made_run import made_run
-from tiny import Command, write_yaml
+from tiny import write_yaml
 
-from residnet.report.client import ClientText, write_client_report
+from residnet.core.errors import ConfigError, DataError, UsageError
+from residnet.report.client import ClientText, read_client_text, write_client_report
 from residnet.report.client_content import build_sections
 from residnet.report.run_reader import RunFiles
 
@@ -49,19 +51,24 @@ def test_the_pdf_has_logo_and_text_of_the_user(tmp_path: Path) -> None:
     write_client_report(run, tmp_path / "b.pdf", template=str(template), logo=logo, text=text)
 
 
-def test_wrong_files_are_one_line(tmp_path: Path, command: Command) -> None:
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"template": "none.typ"}, "expected 'client' or an existing Typst file"),
+        ({"logo": Path("none.svg")}, "expected an existing image"),
+    ],
+)
+def test_a_missing_file_is_one_line(settings: dict[str, Any], message: str, tmp_path: Path) -> None:
     run = made_run(tmp_path / "run")
-    for options, message in (
-        (("--template", "none.typ"), "expected 'client' or an existing Typst file"),
-        (("--logo", tmp_path / "none.svg"), "expected an existing image"),
-        (("--out", tmp_path / "report.doc"), "ends in .pdf"),
-        (("--text", write_yaml(tmp_path / "a.yaml", {"titel": "a"})), "titel"),
-    ):
-        said = command("report", run, "--pdf", *options)
-        assert said.code == 2, options
-        assert message in said.err
+    with pytest.raises(UsageError, match=message):
+        write_client_report(run, tmp_path / "a.pdf", **settings)
+
+
+def test_a_wrong_template_or_text_is_one_line(tmp_path: Path) -> None:
+    run = made_run(tmp_path / "run")
     broken = tmp_path / "broken.typ"
     broken.write_text("#unknown")
-    said = command("report", run, "--pdf", "--template", broken)
-    assert said.code == 1
-    assert "Typst cannot compile the template" in said.err
+    with pytest.raises(DataError, match="Typst cannot compile the template"):
+        write_client_report(run, tmp_path / "a.pdf", template=str(broken))
+    with pytest.raises(ConfigError, match="titel"):
+        read_client_text(write_yaml(tmp_path / "a.yaml", {"titel": "a"}))
