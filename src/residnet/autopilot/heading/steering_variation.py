@@ -112,6 +112,7 @@ class VariedPlant(Dynamics):
         self.input_columns = [0 if k == command else others[k] for k in range(n_inputs)]
 
         self.rudder = names.index(axis.gear) if axis.gear in names else -1
+        # 1 in the columns of the slowed velocities, and of the angles of the steering gear
         slowed = torch.tensor([1.0 if name in axis.slowed else 0.0 for name in names])
         self.slowed = nn.Buffer(slowed, persistent=False)
         gear = torch.tensor([1.0 if "delta" in name else 0.0 for name in names])
@@ -183,7 +184,7 @@ class VariedModel(Dynamics):
         model: the hull.
         dt: step in s.
         input_columns: column of w for each input of the model; the rudder's command is the first.
-        mean: whether the inputs of the model are means over the step.
+        mean: whether the inputs of the model are means over the step, not values at its start.
         rate: largest rate of the rudder in rad/s; None for no limit.
         lag: time constant of the rudder in s; None for none.
         axis: the controlled axis.
