@@ -407,6 +407,8 @@ def evaluate_limit_cycles(
 class TrackingMetrics:
     """Metrics of a closed-loop simulation of motion control; SI, angles in rad.
 
+    Equations and tables are those of Jervan 2020.
+
     Attributes:
         position_mae, position_mse: mean and mean square distance to the desired position in m, m^2
             (4.6).
@@ -418,8 +420,8 @@ class TrackingMetrics:
             (m/s)^2, (rad/s)^2 and per second squared (Table 4.8).
         energy: integral of |tau' nu| in J, surge and sway, then yaw.
         power: `energy` per second in W (Table 4.13).
-        iaew: integral of |e| times integral of power (3.18), position [m s J] and heading [rad s
-            J].
+        iaew: integral of the absolute error times the work, which is the integral of the power
+            (3.18), for position [m s J] and heading [rad s J].
     """
 
     position_mae: float
