@@ -1,4 +1,4 @@
-"""Runs the example notebook and writes it as a page while the site is built."""
+"""Runs the example notebooks and writes them as pages while the site is built."""
 
 from __future__ import annotations
 
@@ -11,26 +11,28 @@ import nbformat
 from nbconvert.exporters import MarkdownExporter
 from nbconvert.preprocessors import ExecutePreprocessor
 
-NOTEBOOK = Path(__file__).parents[2] / "examples" / "from_python.ipynb"
-PAGE = "tutorials/from_python"
+EXAMPLES = Path(__file__).parents[2] / "examples"
+NAMES = ("from_python", "own_head")
 
 
-def write() -> None:
-    """Write the page and its figures; a cell that fails ends the build."""
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
+def write_page(name: str) -> None:
+    """Write the page of a notebook and its figures; a cell that fails ends the build."""
+    page = f"tutorials/{name}"
+    notebook = nbformat.read(EXAMPLES / f"{name}.ipynb", as_version=4)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["PYTHONPATH"] = os.pathsep.join(
-            [str(NOTEBOOK.parents[1] / "src"), os.environ.get("PYTHONPATH", "")]
+            [str(EXAMPLES.parent / "src"), os.environ.get("PYTHONPATH", "")]
         )
         ExecutePreprocessor(timeout=600).preprocess(notebook, {"metadata": {"path": folder}})
     text, resources = MarkdownExporter().from_notebook_node(
-        notebook, resources={"output_files_dir": Path(PAGE).name}
+        notebook, resources={"output_files_dir": Path(page).name}
     )
-    with mkdocs_gen_files.open(f"{PAGE}.md", "w") as file:
+    with mkdocs_gen_files.open(f"{page}.md", "w") as file:
         file.write(text)
-    for name, data in resources["outputs"].items():
-        with mkdocs_gen_files.open(f"{Path(PAGE).parent}/{name}", "wb") as figure:
+    for figure_name, data in resources["outputs"].items():
+        with mkdocs_gen_files.open(f"{Path(page).parent}/{figure_name}", "wb") as figure:
             figure.write(data)
 
 
-write()
+for notebook_name in NAMES:
+    write_page(notebook_name)
