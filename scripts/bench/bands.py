@@ -161,10 +161,10 @@ def trials(
             identification=counts,
             validation={kind: max(count // 5, 1) for kind, count in counts.items()},
         )
-        manoeuvres = config.draw()
+        manoeuvres = config.draw_manoeuvres()
         out: dict[str, list[Log]] = {}
         for log, split in zip(
-            simulate_trial_logs(manoeuvres, config), config.splits(manoeuvres), strict=True
+            simulate_trial_logs(manoeuvres, config), config.assign_splits(manoeuvres), strict=True
         ):
             out.setdefault("test" if log.manoeuvre in judges else split, []).append(log)
     return out

@@ -54,7 +54,7 @@ def trials(vessel: str, sea: dict[str, Any], seed: int, count: int) -> list[Log]
     ]
     sea = {"current_each": [0.0, 0.3], **sea}
     config = bench.programme(vessel, seed, drawn, disturbance=sea)
-    logs = simulate_trial_logs(config.draw(), config)
+    logs = simulate_trial_logs(config.draw_manoeuvres(), config)
     order = np.random.default_rng(seed).permutation(len(logs))[:count]
     return [logs[i] for i in order]
 

@@ -108,7 +108,7 @@ def drawn(vessel: str, seed: int, times: int) -> tuple[float, float, np.ndarray]
             [{"kind": "zigzag", "count": 7, "heading": ["10 deg"], "drive": [0.3, 0.7]}],
             disturbance={"force_x": 10, "force_y": 10, "force_n": 10},
         )
-        first = simulate_trial_logs(programme.draw(), programme)
+        first = simulate_trial_logs(programme.draw_manoeuvres(), programme)
         others = sorted(propose_manoeuvres(limits), key=lambda one: one.kind)
         later = simulate_trial_logs(others, programme.model_copy(update={"seed": seed + 1}))
         shares = shares_of(vessel, programme.vessel)

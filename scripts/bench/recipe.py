@@ -94,7 +94,7 @@ def of_shipped(name: str, seconds: float, _: int, random: np.random.Generator) -
         noise={"u": noise, "v": noise, "r": f"{random.uniform(0.05, 0.5)} deg/s"},
         disturbance=dict(forces),
     )
-    logs = simulate_trial_logs(config.draw(), config)
+    logs = simulate_trial_logs(config.draw_manoeuvres(), config)
     return [logs[i] for i in random.permutation(len(logs))]
 
 
