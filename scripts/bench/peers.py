@@ -19,7 +19,7 @@ interpolated. Free runs start from the measured past that the protocol grants.
 | sindy | pysindy | polynomial degree 2, 3; threshold .003, .01, .03, .1 |
 | narmax | sysidentpy | FROLS with 4, 8, 12, 20 terms of degree 1, 2, two lags |
 | boosting | scikit-learn | 50, 150, 400 trees of 15 leaves, three lags |
-| gru, lstm | torch | learning rate 3e-3, 6e-3; six networks with an encoder of the past |
+| gru, lstm | torch | none; six networks of 32 units with an encoder of the past |
 """
 
 from __future__ import annotations
@@ -425,7 +425,7 @@ class Recurrent(nn.Module):
 class Gru(Peer):
     """Six gated recurrent units in free run with growing horizons, averaged."""
 
-    grid: ClassVar[dict[str, tuple[Any, ...]]] = {"rate": (3e-3, 6e-3)}
+    learning_rate = 3e-3
     cell = "gru"
     n_members = 6
     n_batches = 300
@@ -443,13 +443,13 @@ class Gru(Peer):
         longest = max(min(self.horizon, shortest - self.n_past - 1), 2)
         net = Recurrent(self.n_members, rows[0].shape[1], 32, self.cell)
         average = copy.deepcopy(net)
-        optimizer = torch.optim.AdamW(net.parameters(), lr=settings["rate"], weight_decay=1e-3)
+        optimizer = torch.optim.AdamW(net.parameters(), lr=self.learning_rate, weight_decay=1e-3)
         for batch in range(self.n_batches):
             progress = batch / self.n_batches
             share = 0.3 if progress < 0.25 else 0.6 if progress < 0.5 else 1.0
             length = max(round(share * longest), 2)
             optimizer.param_groups[0]["lr"] = (
-                settings["rate"]
+                self.learning_rate
                 * max(0.5 * (1.0 + np.cos(np.pi * progress)), 0.02)
                 * min((batch + 1) / 20, 1.0)
             )
@@ -540,29 +540,43 @@ class Comparison:
         """Return the mean NRMSE of a peer over the windows of a split, as in metrics.json."""
         scaling = self.scaling
         logs = self.splits[name]
-        errors = []
+        # windows with equal lengths of past and run are simulated as one batch
+        batches: dict[tuple[int, int], list[Any]] = {}
         for window in self.windows(name):
-            log = logs[window.log_index]
             n_past = min(self.n_past, window.start // scaling.factor)
-            past = scaling.decimate(log, window.start - n_past * scaling.factor, window.start + 1)
-            n_steps = -(-(window.stop - window.start - 1) // scaling.factor)
-            w = scaling.average_inputs(log.w[window.start : window.stop - 1], n_steps)
-            runs = Runs(past.x[None, :-1], past.w[None], past.x[None, -1], w[None])
-            x = np.concatenate((past.x[-1:], peer.simulate(runs)[0]))
-            fine = np.arange(window.stop - window.start) / scaling.factor
-            predicted = np.stack(
-                [np.interp(fine, np.arange(len(x)), column) for column in x.T], axis=1
-            )
-            difference = predicted * scaling.x_std + scaling.x_mean
-            difference = difference - log.y[window.start : window.stop, VELOCITIES]
-            usable = log.usable[window.start : window.stop]
-            # without the initial sample, which is measured; u and v only at usable samples
-            rmse = [
-                np.sqrt(np.mean(difference[1:, k][usable[1:] if k < 2 else slice(None)] ** 2))
-                for k in range(3)
-            ]
-            errors.append(np.mean(np.array(rmse) / self.scales))
+            batches.setdefault((n_past, window.stop - window.start), []).append(window)
+        errors = []
+        for (n_past, length), windows in batches.items():
+            n_steps = -(-(length - 1) // scaling.factor)
+            pasts = []
+            inputs = []
+            for window in windows:
+                log = logs[window.log_index]
+                begin = window.start - n_past * scaling.factor
+                pasts.append(scaling.decimate(log, begin, window.start + 1))
+                future = log.w[window.start : window.stop - 1]
+                inputs.append(scaling.average_inputs(future, n_steps))
+            past_x = np.stack([past.x for past in pasts])
+            past_w = np.stack([past.w for past in pasts])
+            runs = Runs(past_x[:, :-1], past_w, past_x[:, -1], np.stack(inputs))
+            simulated = np.concatenate((past_x[:, -1:], peer.simulate(runs)), axis=1)
+            for window, x in zip(windows, simulated, strict=True):
+                errors.append(self.score(x, logs[window.log_index], window))
         return float(np.mean(errors))
+
+    def score(self, x: np.ndarray, log: PreparedLog, window: Any) -> float:
+        """Return the NRMSE of standardised velocities [T + 1, 3] at the step of the peers."""
+        scaling = self.scaling
+        fine = np.arange(window.stop - window.start) / scaling.factor
+        predicted = np.stack([np.interp(fine, np.arange(len(x)), column) for column in x.T], axis=1)
+        difference = predicted * scaling.x_std + scaling.x_mean
+        difference = difference - log.y[window.start : window.stop, VELOCITIES]
+        usable = log.usable[window.start : window.stop]
+        # u and v are scored at usable samples only, see `FreeRunErrors.is_scored`
+        rmse = [
+            np.sqrt(np.mean(difference[usable if k < 2 else slice(None), k] ** 2)) for k in range(3)
+        ]
+        return float(np.mean(np.array(rmse) / self.scales))
 
     def judge(self, name: str) -> dict[str, Any]:
         """Tune and fit a peer; return its test error, settings and CPU seconds."""
