@@ -623,6 +623,13 @@ def compare(splits: dict[str, Any], peers: Sequence[str]) -> dict[str, Any]:
         if name in rows.index
     }
     comparison = Comparison(models.data)
+    # the same model in both computations: windows, scales and masks of this script are the recipe's
+    error = comparison.judge("constant_velocity")["error"]
+    if not np.isclose(error, rows.nrmse_mean["constant_velocity"], rtol=0.02):
+        raise RuntimeError(
+            f"constant velocity: error {error:.4f} here, but"
+            f" {rows.nrmse_mean['constant_velocity']:.4f} in metrics.json"
+        )
     return record | {name: comparison.judge(name) for name in peers}
 
 
