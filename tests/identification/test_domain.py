@@ -10,12 +10,12 @@ import torch
 from steered_logs import Steering, steered_log
 
 from residnet.core.layout import SURGE_SWAY_YAW
-from residnet.dynamics.domain import DomainCheck
+from residnet.dynamics.domain import DomainCheck, log_domain_distance
 from residnet.dynamics.domain_config import (
     MAX_TABLE_BYTES,
     OperatingDomain,
 )
-from residnet.identification.domain import estimate_domain
+from residnet.identification.domain import estimate_density, estimate_domain
 from residnet.identification.excitation import assess_excitation
 from residnet.physics.signals_config import SignalsConfig
 
@@ -77,6 +77,29 @@ def test_ranges_have_a_margin_for_the_amplitudes_of_new_logs() -> None:
     # the margin is no licence to extrapolate
     assert np.all(margins <= 0.75 * values.std(axis=0) + 1e-9)
     assert np.mean([flagged(domain, log, ("delta",)) for log in new_logs]) < 0.02
+
+
+def test_the_log_distance_compares_with_the_training_data() -> None:
+    signals = SignalsConfig(inputs=("delta",))
+    logs = logs_of("steps", range(6))
+    density = estimate_density(logs, signals)
+    domain = estimate_domain(logs, signals, 0.1)
+    assert (density.channels, density.factor) == (domain.channels, domain.factor)
+
+    def distance(log: Any, amplitude: float) -> np.ndarray:
+        y = log.y.copy()
+        y[:, 4:] *= amplitude
+        values = log_domain_distance(density, y, amplitude * log.w, STATES, ("delta",))
+        assert values is not None
+        return values
+
+    # the mean of q over the training data is the number of monomials
+    mean_square = np.mean([np.exp(2.0 * distance(log, 1.0)).mean() for log in logs])
+    assert abs(mean_square - 1.0) < 1e-2
+    for log in logs_of("steps", range(10, 14)):
+        assert distance(log, 1.0).mean() < 0.2
+        assert distance(log, 4.0).mean() > 1.0
+    assert log_domain_distance(OperatingDomain(n_logs=1), log.y, log.w, STATES, ("delta",)) is None
 
 
 def test_open_loop_is_outside_of_logs_of_a_controller() -> None:

@@ -21,6 +21,7 @@ import math
 from collections.abc import Sequence
 from typing import final
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -34,6 +35,37 @@ def monomials(z: Tensor, degree: int) -> Tensor:
         n_channels = z.shape[-1]
         columns += [z[..., i : i + 1] * z[..., i:] for i in range(n_channels)]
     return torch.cat(columns, dim=-1)
+
+
+def log_domain_distance(
+    domain: OperatingDomain,
+    states: np.ndarray,
+    inputs: np.ndarray,
+    state_names: Sequence[str],
+    input_names: Sequence[str],
+) -> np.ndarray | None:
+    """Return half the logarithm of q over its mean at each sample [T]; None without a density.
+
+    Over the training data, the mean of q is the number of monomials. Far from these data the value
+    grows as the logarithm of the distance times the degree of the monomials.
+
+    Args:
+        domain: the domain.
+        states: states [T, nx].
+        inputs: inputs [T, m].
+        state_names: names of the states.
+        input_names: names of the inputs.
+    """
+    if domain.degree == 0:
+        return None
+    names = [*state_names, *input_names]
+    columns = [names.index(name) for name in domain.channels]
+    values = np.concatenate((states, inputs), axis=1)[:, columns]
+    z = torch.from_numpy((values - np.array(domain.centre)) / np.array(domain.scale))
+    n_features = math.isqrt(len(domain.factor))
+    factor = np.array(domain.factor).reshape(n_features, n_features)
+    scores = (monomials(z, domain.degree).numpy() @ factor.T) ** 2
+    return np.asarray(0.5 * np.log(np.maximum(scores.sum(axis=1), 1e-12) / n_features))
 
 
 @final

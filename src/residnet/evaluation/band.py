@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,14 @@ from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.layout import DYNAMIC_STATES, EXTRA_STATES, HEADING, PLANAR_LAYOUT, VELOCITIES
-from residnet.evaluation.records import Activity, BandRow, BandsFile, ByChannel, CurveByChannel
+from residnet.evaluation.records import (
+    Activity,
+    BandRow,
+    BandsFile,
+    ByChannel,
+    CurveByChannel,
+    DistanceEffect,
+)
 
 if TYPE_CHECKING:
     from residnet.dynamics.store import BandTable
@@ -225,6 +233,9 @@ class Band:
         typical_spread: root mean square standard deviation between ensemble members [G, c] over the
             calibration runs; None without an ensemble.
         channels: names of the channels.
+        distance_threshold: running mean of the log distance to the training data above which a
+            width increases; infinite if no calibration run is of another kind of manoeuvre.
+        distance_slope: slope of the log width above the threshold [c]; None without these runs.
     """
 
     level: float
@@ -242,16 +253,44 @@ class Band:
     cautions: tuple[str, ...] = ()
     typical_spread: np.ndarray | None = None
     channels: tuple[str, ...] = PLANAR_LAYOUT.band_channels
+    distance_threshold: float = math.inf
+    distance_slope: np.ndarray | None = None
 
-    def half_widths(self, states: np.ndarray, spread: np.ndarray | None = None) -> np.ndarray:
+    def half_widths(
+        self,
+        states: np.ndarray,
+        spread: np.ndarray | None = None,
+        distance: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return half widths [L, c] along a run with predicted states [L + 1, 3 + n].
 
         Beyond the longest calibrated horizon they grow in proportion to time. A disagreement of the
-        ensemble members above its typical value adds to the variance.
+        ensemble members above its typical value adds to the variance, and a distance to the
+        training data that is unusual for the calibration runs multiplies the width.
 
         Args:
+            states: predicted states, including the initial state.
             spread: standard deviation between ensemble members [L, c]; None without an ensemble.
+            distance: running mean of the log distance to the training data [L]; None if unknown.
         """
+        half_widths = self._widths_near_training_data(states, spread)
+        if distance is None or self.distance_slope is None:
+            return half_widths
+        return half_widths * self.distance_factors(distance)
+
+    def distance_factors(self, distance: np.ndarray) -> np.ndarray:
+        """Return the factors [L, c] on half widths at log distances [L] to the training data."""
+        if self.distance_slope is None:
+            return np.ones((len(distance), len(self.channels)))
+        excess = np.maximum(distance - self.distance_threshold, 0.0)
+        return np.asarray(
+            np.exp(np.minimum(np.outer(excess, self.distance_slope), _MAX_LOG_FACTOR))
+        )
+
+    def _widths_near_training_data(
+        self, states: np.ndarray, spread: np.ndarray | None
+    ) -> np.ndarray:
+        """Return half widths [L, c] without the factor of the distance to the training data."""
         intensities = self.intensity.standardize_run(states, self.step)
         half_widths = self.interpolate(self.half_width, len(intensities)) * width_factors(
             intensities, self.slope
@@ -323,6 +362,11 @@ class Band:
                 slope=map_curves(self.slope),
             ),
             usual_spread=None if self.typical_spread is None else map_curves(self.typical_spread),
+            distance=None
+            if self.distance_slope is None
+            else DistanceEffect(
+                threshold=self.distance_threshold, slope=map_values(self.distance_slope)
+            ),
         )
 
     @classmethod
@@ -353,6 +397,8 @@ class Band:
             cautions=row.cautions,
             typical_spread=None if row.usual_spread is None else table(row.usual_spread),
             channels=channels,
+            distance_threshold=math.inf if row.distance is None else row.distance.threshold,
+            distance_slope=None if row.distance is None else table(row.distance.slope),
         )
 
 

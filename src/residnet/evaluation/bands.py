@@ -53,6 +53,7 @@ class RunErrors:
         states: predicted states [L + 1, 3 + n], including the initial state.
         spread: standard deviation between ensemble members [L, c]; None without an ensemble.
         dof: degrees of freedom, which determine the channels.
+        distance: running mean of the log distance to the training data [L]; None if unknown.
     """
 
     log: str
@@ -61,10 +62,11 @@ class RunErrors:
     states: np.ndarray
     spread: np.ndarray | None = None
     dof: DegreesOfFreedom = SURGE_SWAY_YAW
+    distance: np.ndarray | None = None
 
     def half_widths(self, band: Band) -> np.ndarray:
         """Return the half widths [L, c] of a band along the run."""
-        return band.half_widths(self.states, self.spread)
+        return band.half_widths(self.states, self.spread, self.distance)
 
     def __len__(self) -> int:
         return len(self.error)
@@ -102,7 +104,13 @@ def compute_run_errors(
     errors_by_window = np.split(channel_errors, errors.window_starts[1:])
     return [
         RunErrors(
-            log.log.name, log.log.manoeuvre, error[1:], prediction.states, prediction.spread, dof
+            log.log.name,
+            log.log.manoeuvre,
+            error[1:],
+            prediction.states,
+            prediction.spread,
+            dof,
+            prediction.distance,
         )
         for log, error, prediction in zip(
             (logs[window.log_index] for window in windows),
@@ -264,7 +272,11 @@ class _CalibrationRuns:
 
 
 def calibrate_band(
-    runs: Sequence[RunErrors], coverage_level: float, step: float, score_unit: np.ndarray
+    runs: Sequence[RunErrors],
+    coverage_level: float,
+    step: float,
+    score_unit: np.ndarray,
+    other_kind_runs: Sequence[RunErrors] = (),
 ) -> Band:
     """Return the band that covers a share `coverage_level` of the errors of new runs.
 
@@ -277,6 +289,8 @@ def calibrate_band(
         coverage_level: nominal coverage.
         step: time step of the runs in s.
         score_unit: unit of the interval scores [c].
+        other_kind_runs: runs over logs of a kind of manoeuvre of which the model and its domain
+            contain no log; they determine how widths grow with the distance to the training data.
     """
     all_errors = _to_calibration_runs(runs, step)
     names = all_errors.names
@@ -342,6 +356,7 @@ def calibrate_band(
         typical_spread=typical_spread,
         channels=channels,
     )
+    band = _fit_distance_effect(band, runs, weights, other_kind_runs)
     largest_ratios = largest_error_ratios(
         [run.error for run in runs], [run.half_widths(band) for run in runs]
     )
@@ -357,6 +372,52 @@ def calibrate_band(
     return replace(
         band, simultaneous_factor=simultaneous_factor, cautions=describe_few_logs(band.n_logs)
     )
+
+
+_DISTANCE_LEVEL = 0.9
+"""Share of the samples of the calibration runs at which the distance does not change the width."""
+_DISTANCE_SLOPES = np.linspace(0.0, 3.0, 61)
+"""Slopes among which the smallest quantile loss selects."""
+
+
+def _fit_distance_effect(
+    band: Band,
+    runs: Sequence[RunErrors],
+    weights: np.ndarray,
+    other_kind_runs: Sequence[RunErrors],
+) -> Band:
+    """Return the band with a width that grows with the distance to the training data.
+
+    The slope is the quantile regression (Koenker and Bassett 1978) of the log ratios of error to
+    half width against the excess of the distance, without intercept and not negative.
+    """
+    runs_of_both = [*runs, *other_kind_runs]
+    if not other_kind_runs or any(run.distance is None for run in runs_of_both):
+        return band
+    distances = [run.distance for run in runs if run.distance is not None]
+    sample_weights = np.repeat(weights, [len(distance) for distance in distances])
+    pooled = np.concatenate(distances)
+    threshold = float(weighted_quantile(pooled[:, None], sample_weights, _DISTANCE_LEVEL)[0])
+    excess = np.concatenate(
+        [
+            np.maximum(run.distance - threshold, 0.0)
+            for run in other_kind_runs
+            if run.distance is not None
+        ]
+    )
+    ratios = np.concatenate([run.error / run.half_widths(band) for run in other_kind_runs])
+    run_weights = compute_run_weights([run.log for run in other_kind_runs])
+    other_weights = np.repeat(run_weights, [len(run) for run in other_kind_runs])
+    slope = np.zeros(len(band.channels))
+    for channel in range(len(slope)):
+        is_counted = np.isfinite(ratios[:, channel]) & (excess > 0.0)
+        if not is_counted.any():
+            continue
+        log_ratios = np.log(np.maximum(ratios[is_counted, channel], 1e-6))
+        residuals = log_ratios - np.outer(_DISTANCE_SLOPES, excess[is_counted])
+        losses = np.where(residuals > 0.0, band.level * residuals, (band.level - 1.0) * residuals)
+        slope[channel] = _DISTANCE_SLOPES[int((losses @ other_weights[is_counted]).argmin())]
+    return replace(band, distance_threshold=threshold, distance_slope=slope)
 
 
 def _sample_at_horizons(series: Sequence[np.ndarray], steps: np.ndarray) -> np.ndarray:

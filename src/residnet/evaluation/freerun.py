@@ -21,6 +21,8 @@ from residnet.core.layout import (
     to_horizontal_plane,
 )
 from residnet.dynamics.base import Dynamics
+from residnet.dynamics.domain import log_domain_distance
+from residnet.dynamics.domain_config import OperatingDomain
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
@@ -55,6 +57,9 @@ class Candidate:
         bands: prediction intervals by protocol; may be empty.
         members: members of an ensemble of trajectories; empty for a single model.
         spread_members: models whose disagreement measures extrapolation; empty for none.
+        domain: operating domain of the training logs, to which predictions have a distance; None if
+            unknown.
+        domain_inputs: names of the prepared inputs.
     """
 
     name: str
@@ -68,6 +73,8 @@ class Candidate:
     bands: Mapping[str, Band] = field(default_factory=dict)
     members: tuple[str, ...] = ()
     spread_members: tuple[str, ...] = ()
+    domain: OperatingDomain | None = None
+    domain_inputs: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -79,11 +86,14 @@ class Prediction:
         has_diverged: whether the free run has diverged.
         spread: standard deviation between ensemble members by channel, from the first step on
             [L - 1, c]; None without an ensemble.
+        distance: running mean of the log distance to the training data, from the first step on
+            [L - 1], see `log_domain_distance`; None without a density.
     """
 
     states: np.ndarray
     has_diverged: bool
     spread: np.ndarray | None = None
+    distance: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -282,7 +292,34 @@ def run_free_runs(
             predictions[entry.name] = [
                 replace(prediction, spread=spread) for prediction, spread in predictions_and_spreads
             ]
+    for entry in candidates:
+        if entry.domain is not None:
+            predictions[entry.name] = [
+                replace(prediction, distance=_mean_log_distance(entry, window, prediction, logs))
+                for window, prediction in zip(windows, predictions[entry.name], strict=True)
+            ]
     return {candidate.name: predictions[candidate.name] for candidate in candidates}
+
+
+def _mean_log_distance(
+    candidate: Candidate, window: Window, prediction: Prediction, logs: Sequence[PreparedLog]
+) -> np.ndarray | None:
+    """Return the running mean [L - 1] of the log distance of a prediction to the training data.
+
+    Errors of a free run come from all of its past, hence the mean from the start on.
+    """
+    assert candidate.domain is not None, "the caller checks this"
+    log = logs[window.log_index]
+    distance = log_domain_distance(
+        candidate.domain,
+        prediction.states[1:],
+        log.w[window.start : window.stop - 1],
+        log.dof.state_names,
+        candidate.domain_inputs,
+    )
+    if distance is None:
+        return None
+    return np.asarray(np.cumsum(distance) / np.arange(1, len(distance) + 1))
 
 
 def standard_deviation_between_models(states: Sequence[np.ndarray]) -> np.ndarray:

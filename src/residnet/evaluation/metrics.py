@@ -834,7 +834,9 @@ def iterate_rollout_columns(
                     if any(bands_by_model.values()):
                         lower = upper = np.full_like(prediction.states, np.nan)
                         if band is not None:
-                            half_widths = band.half_widths(prediction.states, prediction.spread)
+                            half_widths = band.half_widths(
+                                prediction.states, prediction.spread, prediction.distance
+                            )
                             lower, upper = band_limits(prediction.states, half_widths)
                         states_by_suffix |= {"_low": lower, "_high": upper}
                     tables.append(

@@ -540,6 +540,19 @@ class Activity(Record):
     slope: CurveByChannel
 
 
+class DistanceEffect(Record):
+    """How the width of a prediction interval grows with the distance to the training data.
+
+    Attributes:
+        threshold: running mean of half the logarithm of the density score over its limit, above
+            which the width grows.
+        slope: slope of the log width above the threshold, by channel.
+    """
+
+    threshold: float
+    slope: ByChannel
+
+
 class BandRow(Record):
     """Prediction intervals of the free runs of one model under one protocol, by channel.
 
@@ -558,6 +571,8 @@ class BandRow(Record):
         score_unit: root mean square constant-velocity errors, the unit of interval scores.
         activity: dependence of the width on the motion.
         usual_spread: typical disagreement of the members of an ensemble; None for other models.
+        distance: effect of the distance to the training data, from kinds of manoeuvres that the fit
+            did not contain; None if the training logs are of one kind.
     """
 
     level: float
@@ -574,6 +589,7 @@ class BandRow(Record):
     score_unit: ByChannel
     activity: Activity
     usual_spread: CurveByChannel | None
+    distance: DistanceEffect | None = None
 
 
 class BandsFile(FileRecord):

@@ -16,6 +16,7 @@ from residnet.core.errors import FitError
 from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.progress import begin_stage
 from residnet.core.samples import Samples
+from residnet.dynamics.domain_config import OperatingDomain
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.evaluation.band import (
     Band,
@@ -34,6 +35,7 @@ from residnet.evaluation.bands import (
 from residnet.evaluation.freerun import Candidate, run_free_runs
 from residnet.evaluation.protocol import Window
 from residnet.heads.base import ClosedFormHead
+from residnet.identification.domain import estimate_density
 from residnet.identification.fitter import (
     FittedModel,
     compute_residual_samples,
@@ -209,21 +211,42 @@ def calibrate_bands(
     )
     fold_models = LeaveFoldOutModels(identified, fold_of_log)
     models_by_fold = fold_models.models_by_fold if int(fold_of_log.max()) > 0 else [{}]
+    kinds, kind_of_log = np.unique(
+        [log.log.manoeuvre for log in identified.training_logs], return_inverse=True
+    )
+    # with one kind there is no evidence on other kinds
+    models_by_kind = (
+        LeaveFoldOutModels(identified, kind_of_log).models_by_fold if len(kinds) > 1 else []
+    )
     bands_by_model: dict[str, dict[str, Band]] = {}
     for protocol in identified.settings.evaluation.protocols:
         calibration = _ProtocolCalibration(
             identified, protocol, config, fold_models.failure_reasons
         )
         for fold_index, models in enumerate(models_by_fold):
-            logs_of_fold = paged.PageReleasingList(
-                log
-                for log, fold_number in zip(identified.training_logs, fold_of_log, strict=True)
-                if fold_number == fold_index
+            logs_of_fold = _select_logs(identified.training_logs, fold_of_log == fold_index)
+            other_logs = _select_logs(identified.training_logs, fold_of_log != fold_index)
+            calibration.add_runs(
+                models,
+                logs_of_fold,
+                calibration.cross_validated_errors,
+                # a log in its own domain would be closer to the training data than a new one
+                estimate_density(other_logs or logs_of_fold, identified.settings.signals),
             )
-            calibration.add_runs(models, logs_of_fold, is_validation=False)
+        for kind_index, models in enumerate(models_by_kind):
+            other_logs = _select_logs(identified.training_logs, kind_of_log != kind_index)
+            calibration.add_runs(
+                models,
+                _select_logs(identified.training_logs, kind_of_log == kind_index),
+                calibration.other_kind_errors,
+                estimate_density(other_logs, identified.settings.signals),
+            )
         if not identified.validation_in_training:
             calibration.add_runs(
-                {name: entry.model for name, entry in identified.items()}, validation, True
+                {name: entry.model for name, entry in identified.items()},
+                validation,
+                calibration.validation_errors,
+                estimate_density(identified.training_logs, identified.settings.signals),
             )
         for name, band in calibration.calibrate_all().items():
             bands_by_model.setdefault(name, {})[protocol] = band
@@ -234,6 +257,13 @@ def calibrate_bands(
         spec = models_with_bands[name].spec.model_copy(update={"band": longest_band.to_table()})
         models_with_bands[name] = replace(models_with_bands[name], spec=spec, bands=bands)
     return models_with_bands
+
+
+def _select_logs(logs: Sequence[PreparedLog], is_selected: np.ndarray) -> Sequence[PreparedLog]:
+    """Return the selected logs [L] bool."""
+    return paged.PageReleasingList(
+        log for log, selected in zip(logs, is_selected, strict=True) if selected
+    )
 
 
 class _ProtocolCalibration:
@@ -274,11 +304,24 @@ class _ProtocolCalibration:
         )
         self.cross_validated_errors: dict[str, list[RunErrors]] = {}
         self.validation_errors: dict[str, list[RunErrors]] = {}
+        self.other_kind_errors: dict[str, list[RunErrors]] = {}
 
     def add_runs(
-        self, models: Mapping[str, HybridDynamics], logs: Sequence[PreparedLog], is_validation: bool
+        self,
+        models: Mapping[str, HybridDynamics],
+        logs: Sequence[PreparedLog],
+        errors_by_model: dict[str, list[RunErrors]],
+        domain: OperatingDomain,
     ) -> None:
-        """Add the errors of free runs over logs that the models were not fitted on."""
+        """Add the errors of free runs over logs that the models were not fitted on.
+
+        Args:
+            models: models by name.
+            logs: the logs.
+            errors_by_model: where the errors are added.
+            domain: density of the logs that the models were fitted on.
+        """
+        is_validation = errors_by_model is self.validation_errors
         windows = self._make_windows(logs)[:: 1 if is_validation else self.window_stride]
         if not windows or not models:
             return
@@ -290,6 +333,8 @@ class _ProtocolCalibration:
                 model,
                 members=trajectory_member_names(self.fitted_models[name]),
                 spread_members=spread_members,
+                domain=domain,
+                domain_inputs=tuple(self.fitted_models.settings.signals.input_columns),
             )
             for name, model in models.items()
         ]
@@ -298,9 +343,7 @@ class _ProtocolCalibration:
         )
         for name, predictions in predictions_by_model.items():
             errors_of_runs = compute_run_errors(windows, predictions, logs)
-            (self.validation_errors if is_validation else self.cross_validated_errors).setdefault(
-                name, []
-            ).extend(errors_of_runs)
+            errors_by_model.setdefault(name, []).extend(errors_of_runs)
 
     def _make_windows(self, logs: Sequence[PreparedLog]) -> list[Window]:
         return [
@@ -332,7 +375,11 @@ class _ProtocolCalibration:
                 name, []
             )
             bands_by_model[name] = calibrate_band(
-                errors_of_runs, self.config.level, self.dt, score_unit
+                errors_of_runs,
+                self.config.level,
+                self.dt,
+                score_unit,
+                self.other_kind_errors.get(name, ()),
             )
         reference_names = find_reference_names(self.fitted_models.values())
         for name, fitted_model in self.fitted_models.items():

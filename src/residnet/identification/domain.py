@@ -131,27 +131,11 @@ def estimate_domain(
         scores.append(_held_out_range_excesses(rows, np.maximum(margins, 1e-9 * scale), folds))
         smallest_limits.append(1.0)
     density: dict[str, object] = {}
-    is_in_density = [name not in (*WIND_INPUTS, *signals.unexcited) for name in channels]
-    density_channels = list(itertools.compress(channels, is_in_density))
+    density_channels, density_columns = _select_density_channels(channels, columns, signals)
     if density_channels:
-        density_columns = list(itertools.compress(columns, is_in_density))
-        rows = [part[:, density_columns] for part in parts]
-        centre = np.concatenate(rows).mean(axis=0)
-        scale = np.concatenate(rows).std(axis=0)
-        fits_table = 8 * count_features(len(density_channels), 2) ** 2 <= MAX_TABLE_BYTES
-        degree = 2 if fits_table else 1
-        features = [
-            monomials(torch.from_numpy((row - centre) / scale), degree).numpy() for row in rows
-        ]
-        moments = np.array([feature.T @ feature / len(feature) for feature in features])
+        density, features, moments = _estimate_density(parts, density_channels, density_columns)
         scores.append(_held_out_scores(features, moments, folds))
         smallest_limits.append(1e-9)
-        density = {
-            "channels": density_channels,
-            "centre": centre.tolist(),
-            "scale": scale.tolist(),
-            "factor": _factorize(moments.mean(axis=0)).reshape(-1).tolist(),
-        }
     limits, false_flags = _calibrate_limits(scores, smallest_limits)
     for k, relation in enumerate(relations):
         relations[k] = relation.model_copy(update={"tolerance": limits[k]})
@@ -170,6 +154,61 @@ def estimate_domain(
             **density,
         }
     )
+
+
+def estimate_density(logs: Sequence[PreparedLog], signals: SignalsConfig) -> OperatingDomain:
+    """Estimate the density of velocities and inputs of logs, without ranges, relations and limit.
+
+    Args:
+        logs: training logs.
+        signals: inputs of the model.
+    """
+    samples = [_usable_samples(log, len(logs)) for log in logs if log.usable.any()]
+    names = (*signals.dof.state_names, *signals.input_columns)
+    density: dict[str, object] = {}
+    if samples:
+        channels, columns = _varying_channels(samples, names, signals)
+        channels, columns = _select_density_channels(channels, columns, signals)
+        if channels:
+            density = _estimate_density(samples, channels, columns)[0]
+    return OperatingDomain.model_validate({"n_logs": max(len(logs), 1), **density})
+
+
+def _select_density_channels(
+    channels: Sequence[str], columns: Sequence[int], signals: SignalsConfig
+) -> tuple[list[str], list[int]]:
+    """Return the channels of the density with their columns: without wind and unexcited inputs."""
+    is_in_density = [name not in (*WIND_INPUTS, *signals.unexcited) for name in channels]
+    return (
+        list(itertools.compress(channels, is_in_density)),
+        list(itertools.compress(columns, is_in_density)),
+    )
+
+
+def _estimate_density(
+    parts: Sequence[np.ndarray], channels: Sequence[str], columns: Sequence[int]
+) -> tuple[dict[str, object], list[np.ndarray], np.ndarray]:
+    """Return the keys of the density of a domain, and the monomials and moments of each part.
+
+    Args:
+        parts: samples of the logs or of their parts, [K, nx + m] each.
+        channels: channels of the density.
+        columns: their columns.
+    """
+    rows = [part[:, columns] for part in parts]
+    centre = np.concatenate(rows).mean(axis=0)
+    scale = np.concatenate(rows).std(axis=0)
+    fits_table = 8 * count_features(len(channels), 2) ** 2 <= MAX_TABLE_BYTES
+    degree = 2 if fits_table else 1
+    features = [monomials(torch.from_numpy((row - centre) / scale), degree).numpy() for row in rows]
+    moments = np.array([feature.T @ feature / len(feature) for feature in features])
+    density: dict[str, object] = {
+        "channels": channels,
+        "centre": centre.tolist(),
+        "scale": scale.tolist(),
+        "factor": _factorize(moments.mean(axis=0)).reshape(-1).tolist(),
+    }
+    return density, features, moments
 
 
 def _calibrate_limits(

@@ -156,6 +156,8 @@ def make_candidates(
             bands=fitted_model.bands,
             members=trajectory_member_names(fitted_model),
             spread_members=spread_members,
+            domain=fitted_model.spec.domain,
+            domain_inputs=tuple(fitted_model.spec.signals.input_columns),
         )
         for name, fitted_model in models_by_name.items()
     ]

@@ -175,3 +175,44 @@ def test_a_band_widens_where_unlike_models_lie_farther_apart_than_usual() -> Non
     assert 0.89 < share(band, of_unlike_models(400, 0.02, 2)) < 0.92
     again = Band.from_record(band.to_record())
     np.testing.assert_allclose(beyond[0].half_widths(again), beyond[0].half_widths(band))
+
+
+def draw_distant_runs(n_logs: int, farthest: float, slope: float, seed: int) -> list[RunErrors]:
+    """Return runs at log distances of up to `farthest`, whose errors grow with exp(slope d)."""
+    random = np.random.default_rng(seed)
+    drawn = []
+    for number in range(n_logs):
+        distance = np.full(LENGTH, random.uniform(-1.0, farthest))
+        size = np.exp(slope * np.maximum(distance, 0.0))[:, None] * [1, 2, 3, 4, 5]
+        states = np.zeros((LENGTH + 1, 6))
+        states[:, 3] = 1.0
+        error = np.abs(size * random.normal(size=(1, 5)))
+        drawn.append(RunErrors(f"log{number}", "", error, states, distance=distance))
+    return drawn
+
+
+def test_widths_grow_with_the_distance_to_the_training_data() -> None:
+    """The calibration runs lie within the domain, and runs of another kind far outside."""
+    near = draw_distant_runs(100, 0.0, 0.8, 0)
+    plain = calibrate_band(near, 0.9, STEP, np.ones(5))
+    band = calibrate_band(near, 0.9, STEP, np.ones(5), draw_distant_runs(100, 3.0, 0.8, 1))
+    assert plain.distance_slope is None
+    assert band.distance_slope is not None
+    np.testing.assert_allclose(band.distance_slope, 0.8, atol=0.25)
+
+    def share(band: Band, drawn: list[RunErrors]) -> float:
+        return float(np.mean([is_covered(run.error, run.half_widths(band)) for run in drawn]))
+
+    far = draw_distant_runs(400, 3.0, 0.8, 2)
+    assert share(plain, far) < 0.65
+    assert 0.85 < share(band, far) < 0.95
+    assert share(band, near) == pytest.approx(share(plain, near), abs=0.01)
+    again = Band.from_record(band.to_record())
+    np.testing.assert_allclose(far[0].half_widths(again), far[0].half_widths(band))
+
+
+def test_errors_that_do_not_grow_with_the_distance_leave_the_widths() -> None:
+    near = draw_distant_runs(100, 0.0, 0.0, 0)
+    band = calibrate_band(near, 0.9, STEP, np.ones(5), draw_distant_runs(400, 3.0, 0.0, 1))
+    assert band.distance_slope is not None
+    np.testing.assert_allclose(band.distance_slope, 0.0, atol=0.06)
