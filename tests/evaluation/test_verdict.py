@@ -325,6 +325,17 @@ def test_data_outside_the_training_range_and_the_doctor_are_told() -> None:
     assert said[1] == "Data doctor: nothing would mislead a fit."
 
 
+def test_windows_unlike_those_that_calibrated_the_intervals_are_named() -> None:
+    limits = under(beyond_calibration={"mlp": 0.4})
+    sentence = "40 % of the test windows are farther from the training data than any run"
+    assert any(
+        text.startswith(sentence) for text in write_verdict(evidence(limits_by_protocol=limits))
+    )
+    limits = under(beyond_calibration={"mlp": 0.1, "hull": 1.0})
+    verdict = write_verdict(evidence(limits_by_protocol=limits))
+    assert not any("farther from the training" in text for text in verdict)
+
+
 def test_an_old_run_without_these_files_still_has_a_verdict() -> None:
     said = write_verdict(evidence(selection=None, limits_by_protocol={}))
     assert said == [

@@ -234,8 +234,10 @@ class Band:
             calibration runs; None without an ensemble.
         channels: names of the channels.
         distance_threshold: running mean of the log distance to the training data above which a
-            width increases; infinite if no calibration run is of another kind of manoeuvre.
-        distance_slope: slope of the log width above the threshold [c]; None without these runs.
+            width increases; infinite if the calibration runs have no distance.
+        largest_distance: largest such mean at the end of a calibration run; infinite if unknown.
+        distance_slope: slope of the log width above the threshold [c]; None if no run over logs of
+            a kind of manoeuvre that is not in the training data determines it.
     """
 
     level: float
@@ -254,6 +256,7 @@ class Band:
     typical_spread: np.ndarray | None = None
     channels: tuple[str, ...] = PLANAR_LAYOUT.band_channels
     distance_threshold: float = math.inf
+    largest_distance: float = math.inf
     distance_slope: np.ndarray | None = None
 
     def half_widths(
@@ -362,11 +365,13 @@ class Band:
                 slope=map_curves(self.slope),
             ),
             usual_spread=None if self.typical_spread is None else map_curves(self.typical_spread),
-            distance=None
-            if self.distance_slope is None
-            else DistanceEffect(
-                threshold=self.distance_threshold, slope=map_values(self.distance_slope)
-            ),
+            distance=DistanceEffect(
+                threshold=self.distance_threshold,
+                largest=self.largest_distance,
+                slope=None if self.distance_slope is None else map_values(self.distance_slope),
+            )
+            if math.isfinite(self.distance_threshold)
+            else None,
         )
 
     @classmethod
@@ -398,7 +403,10 @@ class Band:
             typical_spread=None if row.usual_spread is None else table(row.usual_spread),
             channels=channels,
             distance_threshold=math.inf if row.distance is None else row.distance.threshold,
-            distance_slope=None if row.distance is None else table(row.distance.slope),
+            largest_distance=math.inf if row.distance is None else row.distance.largest,
+            distance_slope=table(row.distance.slope)
+            if row.distance is not None and row.distance.slope is not None
+            else None,
         )
 
 

@@ -391,20 +391,18 @@ def _fit_distance_effect(
     The slope is the quantile regression (Koenker and Bassett 1978) of the log ratios of error to
     half width against the excess of the distance, without intercept and not negative.
     """
-    runs_of_both = [*runs, *other_kind_runs]
-    if not other_kind_runs or any(run.distance is None for run in runs_of_both):
-        return band
     distances = [run.distance for run in runs if run.distance is not None]
+    if len(distances) < len(runs):
+        return band
     sample_weights = np.repeat(weights, [len(distance) for distance in distances])
     pooled = np.concatenate(distances)
     threshold = float(weighted_quantile(pooled[:, None], sample_weights, _DISTANCE_LEVEL)[0])
-    excess = np.concatenate(
-        [
-            np.maximum(run.distance - threshold, 0.0)
-            for run in other_kind_runs
-            if run.distance is not None
-        ]
-    )
+    largest_distance = max(float(distance[-1]) for distance in distances)
+    band = replace(band, distance_threshold=threshold, largest_distance=largest_distance)
+    other_distances = [run.distance for run in other_kind_runs if run.distance is not None]
+    if not other_kind_runs or len(other_distances) < len(other_kind_runs):
+        return band
+    excess = np.maximum(np.concatenate(other_distances) - threshold, 0.0)
     ratios = np.concatenate([run.error / run.half_widths(band) for run in other_kind_runs])
     run_weights = compute_run_weights([run.log for run in other_kind_runs])
     other_weights = np.repeat(run_weights, [len(run) for run in other_kind_runs])
@@ -417,7 +415,7 @@ def _fit_distance_effect(
         residuals = log_ratios - np.outer(_DISTANCE_SLOPES, excess[is_counted])
         losses = np.where(residuals > 0.0, band.level * residuals, (band.level - 1.0) * residuals)
         slope[channel] = _DISTANCE_SLOPES[int((losses @ other_weights[is_counted]).argmin())]
-    return replace(band, distance_threshold=threshold, distance_slope=slope)
+    return replace(band, distance_slope=slope)
 
 
 def _sample_at_horizons(series: Sequence[np.ndarray], steps: np.ndarray) -> np.ndarray:

@@ -422,6 +422,7 @@ class ProtocolEvaluation:
             compared=self.compare_with_references(),
             outside=self.share_outside_training_range(),
             horizons=tuple(self.evaluate_horizons(dt)),
+            beyond_calibration=self.share_beyond_calibration(),
         )
 
     def evaluate_horizons(self, dt: float) -> list[HorizonRow]:
@@ -612,6 +613,20 @@ class ProtocolEvaluation:
             }
             for model_name in self.errors
         }
+
+    def share_beyond_calibration(self) -> dict[str, float]:
+        """Return by model the share of windows beyond the calibration of its intervals.
+
+        These windows are farther from the training data than any run that calibrated the intervals.
+        """
+        shares = {}
+        for candidate in self.candidates:
+            band = candidate.bands.get(self.free_run.protocol)
+            predictions = self.free_run.predictions[candidate.name]
+            distances = [one.distance[-1] for one in predictions if one.distance is not None]
+            if band is not None and len(distances) == len(predictions) > 0:
+                shares[candidate.name] = float(np.mean(np.array(distances) > band.largest_distance))
+        return shares
 
     def share_outside_training_range(self) -> OutsideRange:
         """Return the share of samples outside the range of the training data.

@@ -416,6 +416,8 @@ class ProtocolLimits(Record):
         compared: paired differences by model and reference model.
         outside: share of the samples outside the training range.
         horizons: pose errors by horizon.
+        beyond_calibration: share of the windows that are farther from the training data than any
+            run that calibrated the prediction intervals, by model.
     """
 
     kinematics: KinematicErrors
@@ -424,6 +426,7 @@ class ProtocolLimits(Record):
     compared: dict[str, dict[str, PairedDifference | None]]
     outside: OutsideRange
     horizons: tuple[HorizonRow, ...]
+    beyond_calibration: dict[str, float] = Field(default_factory=dict)
 
 
 class RepeatTolerance(Record):
@@ -543,14 +546,18 @@ class Activity(Record):
 class DistanceEffect(Record):
     """How the width of a prediction interval grows with the distance to the training data.
 
+    The distance is the running mean of half the logarithm of the density score over its limit.
+
     Attributes:
-        threshold: running mean of half the logarithm of the density score over its limit, above
-            which the width grows.
-        slope: slope of the log width above the threshold, by channel.
+        threshold: distance above which the width grows.
+        largest: largest distance at the end of a calibration run.
+        slope: slope of the log width above the threshold, by channel; None if all training logs
+            are of one kind of manoeuvre, so that the width does not depend on the distance.
     """
 
     threshold: float
-    slope: ByChannel
+    largest: float
+    slope: ByChannel | None
 
 
 class BandRow(Record):
@@ -572,7 +579,7 @@ class BandRow(Record):
         activity: dependence of the width on the motion.
         usual_spread: typical disagreement of the members of an ensemble; None for other models.
         distance: effect of the distance to the training data, from kinds of manoeuvres that the fit
-            did not contain; None if the training logs are of one kind.
+            did not contain; None without a density of the training data.
     """
 
     level: float

@@ -135,6 +135,7 @@ def write_verdict(evidence: VerdictEvidence) -> list[str]:
         describe_soundness(evidence),
         "" if evidence.selection is None else evidence.selection.reason,
         describe_extrapolation(evidence),
+        describe_distance(evidence),
     ]
     return [sentence for sentence in sentences if sentence]
 
@@ -532,6 +533,24 @@ def describe_extrapolation(evidence: VerdictEvidence) -> str:
         f"Of the {evidence.split} data, {_format_percent(outside_share)} lies outside the range"
         f" of the training"
         f" data ({channel_texts}); these runs are the only evidence on the model there."
+    )
+
+
+_NOMINAL_MISS_RATE = 0.1
+"""Share of samples outside of 90 % prediction intervals."""
+
+
+def describe_distance(evidence: VerdictEvidence) -> str:
+    """Return a sentence on windows unlike those that calibrated the intervals; may be empty."""
+    limits = _protocol_limits(evidence)
+    share = 0.0 if limits is None else limits.beyond_calibration.get(evidence.selected, 0.0)
+    # fewer windows than the intervals may miss do not change their coverage
+    if share <= _NOMINAL_MISS_RATE:
+        return ""
+    return (
+        f"{_format_percent(share)} of the {evidence.split} windows are farther from the training"
+        " data than any run that calibrated the prediction intervals; the nominal coverage does"
+        " not hold for them."
     )
 
 
