@@ -23,6 +23,7 @@ import math
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -225,6 +226,7 @@ def compared(judged: Sequence[Judged]) -> dict[str, np.ndarray]:
         "one width": [
             np.broadcast_to(band.constant_width, run.error.shape) for run, band in judged
         ],
+        "no distance": [band.half_widths(run.states, run.spread) for run, band in judged],
         "hindsight": [after.interpolate(after.unconditional_width, len(run)) for run, _ in judged],
     }
     out = {}
@@ -246,6 +248,10 @@ def show(found: Found) -> None:
             held = np.mean([coverage(of) for of in chosen if of], axis=0)
             cells = "".join(f"{cell:10.3f}" for cell in held)
             print(f"{kind:28s}{sum(map(len, chosen)):6d}{cells}")
+        near = [[(replace(run, distance=None), band) for run, band in of] for of in each]
+        held = np.mean([coverage(of) for of in near], axis=0)
+        cells = "".join(f"{cell:10.3f}" for cell in held)
+        print(f"{'all, without the distance':28s}{sum(map(len, near)):6d}{cells}")
         scores = [compared(judged) for judged in each]
         for name in scores[0]:
             shown = np.mean([one[name] for one in scores], axis=0)
