@@ -15,6 +15,7 @@ single logs differs tells how far a band may be off.
     python scripts/bench/bands.py RUN [--model physics]
     python scripts/bench/bands.py --cross CONFIG [--model physics] [--alone] [--kinds] [-s K=V]
     python scripts/bench/bands.py --draws 12 [--seed 0] [--logs 40] [--test 25] [--others]
+        [--calibrated 2]
 """
 
 from __future__ import annotations
@@ -127,16 +128,21 @@ def crossed(config: FitConfig, model: str, seed: int, by_kind: bool) -> Found:
 
 
 def trials(
-    vessel: str, random: np.random.Generator, logs: int, test: int, others: bool
+    vessel: str,
+    random: np.random.Generator,
+    logs: int,
+    test: int,
+    others: bool,
+    calibrated: int = 2,
 ) -> dict[str, list[Log]]:
     """Return logs of a scattered vessel: so many for fits, and so many of each kind to judge.
 
-    Of `others`, kinds judge that no fit has.
+    Of `others`, kinds judge that no fit has: all but the first `calibrated` ones.
     """
     # at least a tenth of the calibration's logs is of each kind that there is
     kinds = ["zigzag", *random.permutation(KINDS[1:4])[: int(random.integers(1, 4))]]
     if others:
-        kinds = kinds[:2]
+        kinds = [*kinds, *(kind for kind in KINDS[1:4] if kind not in kinds)][:calibrated]
     shares = 0.1 + random.dirichlet(np.full(len(kinds), 2.0)) * (1.0 - 0.1 * len(kinds))
     each = np.floor(shares * logs).astype(int)
     each[0] += logs - each.sum()
@@ -287,7 +293,7 @@ def main() -> None:
     """Print the tables of a run, of a config's folds, or of drawn vessels."""
     given = bench.options(
         __doc__, run=("runs/esso_osaka",), cross=None, model=None, alone=False, kinds=False, s=[],
-        draws=0, seed=0, logs=40, test=25, others=False,
+        draws=0, seed=0, logs=40, test=25, others=False, calibrated=2,
     )  # fmt: skip
     if given.draws:
         found = Found()
@@ -295,7 +301,7 @@ def main() -> None:
             started = time.process_time()
             random = np.random.default_rng([given.seed, number])
             vessel = list(PUSH)[number % len(PUSH)]
-            logs = trials(vessel, random, given.logs, given.test, given.others)
+            logs = trials(vessel, random, given.logs, given.test, given.others, given.calibrated)
             drawn(found, vessel, number, logs)
             took = time.process_time() - started
             print(f"draw {number + 1}: {vessel}, {took:.0f} s", flush=True)

@@ -205,8 +205,8 @@ def conformal_level(level: float, n_scores: float) -> float:
     return min(level * (1.0 + 1.0 / n_scores), 1.0)
 
 
-_MAX_LOG_FACTOR = 2.0
-"""Largest logarithm of the factor by which the intensity of the motion changes a width."""
+MAX_LOG_FACTOR = 2.0
+"""Largest logarithm of the factor by which intensity or distance changes a width."""
 
 
 @dataclass(frozen=True)
@@ -286,9 +286,7 @@ class Band:
         if self.distance_slope is None:
             return np.ones((len(distance), len(self.channels)))
         excess = np.maximum(distance - self.distance_threshold, 0.0)
-        return np.asarray(
-            np.exp(np.minimum(np.outer(excess, self.distance_slope), _MAX_LOG_FACTOR))
-        )
+        return np.asarray(np.exp(np.minimum(np.outer(excess, self.distance_slope), MAX_LOG_FACTOR)))
 
     def _widths_near_training_data(
         self, states: np.ndarray, spread: np.ndarray | None
@@ -429,7 +427,7 @@ def excess_disagreement(
 
 def width_factors(intensities: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """Return the factors [..., c] on half widths for intensity measures [..., 2 n]."""
-    return np.asarray(np.exp(np.clip(intensities @ slope, -_MAX_LOG_FACTOR, _MAX_LOG_FACTOR)))
+    return np.asarray(np.exp(np.clip(intensities @ slope, -MAX_LOG_FACTOR, MAX_LOG_FACTOR)))
 
 
 BandsByModel = Mapping[str, Mapping[str, Band]]

@@ -18,6 +18,7 @@ from residnet.core.layout import (
     DegreesOfFreedom,
 )
 from residnet.evaluation.band import (
+    MAX_LOG_FACTOR,
     Band,
     MotionIntensity,
     band_channels,
@@ -377,7 +378,7 @@ def calibrate_band(
 _DISTANCE_LEVEL = 0.9
 """Share of the samples of the calibration runs at which the distance does not change the width."""
 _DISTANCE_SLOPES = np.linspace(0.0, 3.0, 61)
-"""Slopes among which the smallest quantile loss selects."""
+"""Slopes among which the smallest interval score selects."""
 
 
 def _fit_distance_effect(
@@ -388,8 +389,8 @@ def _fit_distance_effect(
 ) -> Band:
     """Return the band with a width that grows with the distance to the training data.
 
-    The slope is the quantile regression (Koenker and Bassett 1978) of the log ratios of error to
-    half width against the excess of the distance, without intercept and not negative.
+    The slope of each channel is not negative and has the smallest interval score over the runs of
+    another kind. A proper score rates wide intervals as well as misses.
     """
     distances = [run.distance for run in runs if run.distance is not None]
     if len(distances) < len(runs):
@@ -403,18 +404,18 @@ def _fit_distance_effect(
     if not other_kind_runs or len(other_distances) < len(other_kind_runs):
         return band
     excess = np.maximum(np.concatenate(other_distances) - threshold, 0.0)
-    ratios = np.concatenate([run.error / run.half_widths(band) for run in other_kind_runs])
+    errors = np.concatenate([run.error for run in other_kind_runs])
+    half_widths = np.concatenate([run.half_widths(band) for run in other_kind_runs])
     run_weights = compute_run_weights([run.log for run in other_kind_runs])
     other_weights = np.repeat(run_weights, [len(run) for run in other_kind_runs])
     slope = np.zeros(len(band.channels))
     for channel in range(len(slope)):
-        is_counted = np.isfinite(ratios[:, channel]) & (excess > 0.0)
-        if not is_counted.any():
-            continue
-        log_ratios = np.log(np.maximum(ratios[is_counted, channel], 1e-6))
-        residuals = log_ratios - np.outer(_DISTANCE_SLOPES, excess[is_counted])
-        losses = np.where(residuals > 0.0, band.level * residuals, (band.level - 1.0) * residuals)
-        slope[channel] = _DISTANCE_SLOPES[int((losses @ other_weights[is_counted]).argmin())]
+        is_counted = np.isfinite(errors[:, channel]) & (excess > 0.0)
+        factors = np.exp(np.minimum(np.outer(_DISTANCE_SLOPES, excess[is_counted]), MAX_LOG_FACTOR))
+        scores = interval_score(
+            errors[is_counted, channel], half_widths[is_counted, channel] * factors, band.level
+        )
+        slope[channel] = _DISTANCE_SLOPES[int((scores @ other_weights[is_counted]).argmin())]
     return replace(band, distance_slope=slope)
 
 
