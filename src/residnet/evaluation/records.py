@@ -551,8 +551,8 @@ class DistanceEffect(Record):
     Attributes:
         threshold: distance above which the width grows.
         largest: largest distance at the end of a calibration run.
-        slope: slope of the log width above the threshold, by channel; None if the training logs have
-            fewer than three kinds of manoeuvres, so that the width does not depend on the distance.
+        slope: slope of the log width above the threshold, by channel; None if the training logs
+            have fewer than three kinds of manoeuvres, so that the width is independent of it.
     """
 
     threshold: float
