@@ -279,7 +279,7 @@ class Band:
         half_widths = self._widths_near_training_data(states, spread)
         if distance is None or self.distance_slope is None:
             return half_widths
-        return half_widths * self.distance_factors(distance)
+        return np.asarray(half_widths * self.distance_factors(distance))
 
     def distance_factors(self, distance: np.ndarray) -> np.ndarray:
         """Return the factors [L, c] on half widths at log distances [L] to the training data."""
