@@ -546,7 +546,8 @@ class Activity(Record):
 class DistanceEffect(Record):
     """How the width of a prediction interval grows with the distance to the training data.
 
-    The distance is the running mean of half the logarithm of the density score over its limit.
+    The distance is the running mean of half the logarithm of the inverse Christoffel function over
+    its mean in the training data.
 
     Attributes:
         threshold: distance above which the width grows.
