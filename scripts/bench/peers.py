@@ -45,6 +45,7 @@ from torch import Tensor, nn
 
 import residnet
 from residnet.core.layout import VELOCITIES
+from residnet.evaluation.freerun import FreeRunErrors
 from residnet.preprocessing.prepare import PreparedLog
 
 _STEPS_PER_FREE_RUN = 100
@@ -536,17 +537,19 @@ class Comparison:
                 windows += self.protocol.make_overlapping_windows(log, i, self.step, 2.0)
         return windows
 
-    def error(self, peer: Peer, name: str) -> float:
-        """Return the mean NRMSE of a peer over the windows of a split, as in metrics.json."""
+    def errors(self, peer: Peer, name: str) -> np.ndarray:
+        """Return the NRMSE of a peer in each window of a split, as metrics.json averages it."""
         scaling = self.scaling
         logs = self.splits[name]
         # windows with equal lengths of past and run are simulated as one batch
-        batches: dict[tuple[int, int], list[Any]] = {}
-        for window in self.windows(name):
+        batches: dict[tuple[int, int], list[int]] = {}
+        all_windows = self.windows(name)
+        for number, window in enumerate(all_windows):
             n_past = min(self.n_past, window.start // scaling.factor)
-            batches.setdefault((n_past, window.stop - window.start), []).append(window)
-        errors = []
-        for (n_past, length), windows in batches.items():
+            batches.setdefault((n_past, window.stop - window.start), []).append(number)
+        errors = np.empty(len(all_windows))
+        for (n_past, length), numbers in batches.items():
+            windows = [all_windows[number] for number in numbers]
             n_steps = -(-(length - 1) // scaling.factor)
             pasts = []
             inputs = []
@@ -560,9 +563,9 @@ class Comparison:
             past_w = np.stack([past.w for past in pasts])
             runs = Runs(past_x[:, :-1], past_w, past_x[:, -1], np.stack(inputs))
             simulated = np.concatenate((past_x[:, -1:], peer.simulate(runs)), axis=1)
-            for window, x in zip(windows, simulated, strict=True):
-                errors.append(self.score(x, logs[window.log_index], window))
-        return float(np.mean(errors))
+            for number, window, x in zip(numbers, windows, simulated, strict=True):
+                errors[number] = self.score(x, logs[window.log_index], window)
+        return errors
 
     def score(self, x: np.ndarray, log: PreparedLog, window: Any) -> float:
         """Return the NRMSE of standardised velocities [T + 1, 3] at the step of the peers."""
@@ -597,14 +600,19 @@ class Comparison:
             for settings in grid if len(grid) > 1 else []:
                 try:
                     peer.fit(train, **settings)
-                    error = self.error(peer, "validation")
+                    error = float(self.errors(peer, "validation").mean())
                 except (np.linalg.LinAlgError, ValueError):
                     continue
                 if error < best[0]:
                     best = (error, settings)
             peer.fit(both, **best[1])
-        error = self.error(peer, "test")
-        return {"error": error, "settings": best[1], "seconds": time.process_time() - begin}
+        errors = self.errors(peer, "test")
+        return {
+            "error": float(errors.mean()),
+            "windows": errors.tolist(),
+            "settings": best[1],
+            "seconds": time.process_time() - begin,
+        }
 
 
 _NETWORKS = ("gru", "lstm")
@@ -617,11 +625,21 @@ def compare(splits: dict[str, Any], peers: Sequence[str]) -> dict[str, Any]:
     seconds = time.process_time() - begin
     rows = residnet.metrics(models, split="test")
     rows = rows[rows.protocol == models.data.evaluation.selection].set_index("model")
-    record: dict[str, Any] = {
-        name: {"error": float(rows.nrmse_mean[name]), "seconds": seconds}
-        for name in ("ensemble", "hull", "baseline")
-        if name in rows.index
-    }
+    evaluation = models.runs["test"].evaluation
+    selection = models.data.evaluation.selection
+    run = next(run for run in evaluation.free_runs if run.protocol == selection)
+    scales = models.data.evaluation.scales.to_array()
+    record: dict[str, Any] = {}
+    for name in ("ensemble", "hull", "baseline"):
+        if name in rows.index:
+            free_run_errors = FreeRunErrors.from_predictions(
+                run.windows, run.predictions[name], evaluation.logs
+            )
+            record[name] = {
+                "error": float(rows.nrmse_mean[name]),
+                "windows": free_run_errors.nrmse(scales).tolist(),
+                "seconds": seconds,
+            }
     comparison = Comparison(models.data)
     # the same model in both computations: windows, scales and masks of this script are the recipe's
     error = comparison.judge("constant_velocity")["error"]
@@ -639,8 +657,13 @@ def summarize(records: Sequence[dict[str, Any]]) -> str:
         "| model | NRMSE | relative to `ensemble` | `ensemble` better in | CPU s |",
         "| --- | --- | --- | --- | --- |",
     ]
+    # the windows of a draw are the pairs where there is a single draw
     errors = {
-        name: np.array([record["models"][name]["error"] for record in records])
+        name: np.array(
+            [record["models"][name]["error"] for record in records]
+            if len(records) > 1
+            else records[0]["models"][name]["windows"]
+        )
         for name in records[0]["models"]
     }
     seconds = {
@@ -682,7 +705,9 @@ def main() -> None:
                 file.write(json.dumps(record) + "\n")
     for name in dict.fromkeys(record["vessel"] for record in records):
         chosen = [record for record in records if record["vessel"] == name]
-        print(f"\n{name}, {len(chosen)} draws\n\n{summarize(chosen)}")
+        n_windows = len(chosen[0]["models"]["ensemble"]["windows"])
+        print(f"\n{name}: {len(chosen)} draws, {n_windows} test windows each\n")
+        print(summarize(chosen))
 
 
 if __name__ == "__main__":
