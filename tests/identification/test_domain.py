@@ -93,9 +93,10 @@ def test_the_log_distance_compares_with_the_training_data() -> None:
         assert values is not None
         return values
 
-    # the mean of q over the training data is the number of monomials
+    # without the ridge the mean of q over the training data is the number of monomials; the ridge
+    # removes the directions in which the speed, which hardly varies here, is collinear
     mean_square = np.mean([np.exp(2.0 * distance(log, 1.0)).mean() for log in logs])
-    assert abs(mean_square - 1.0) < 1e-2
+    assert 0.8 < mean_square <= 1.0
     for log in logs_of("steps", range(10, 14)):
         assert distance(log, 1.0).mean() < 0.2
         assert distance(log, 4.0).mean() > 1.0

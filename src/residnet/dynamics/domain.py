@@ -44,10 +44,11 @@ def log_domain_distance(
     state_names: Sequence[str],
     input_names: Sequence[str],
 ) -> np.ndarray | None:
-    """Return half the logarithm of q over its mean at each sample [T]; None without a density.
+    """Return half the logarithm of q over the number of monomials at each sample [T].
 
-    Over the training data, the mean of q is the number of monomials. Far from these data the value
-    grows as the logarithm of the distance times the degree of the monomials.
+    Over the training data, the mean of q is the number of monomials without the regularisation and
+    slightly less with it. Far from these data the value grows as the logarithm of the distance
+    times the degree of the monomials.
 
     Args:
         domain: the domain.
@@ -55,6 +56,9 @@ def log_domain_distance(
         inputs: inputs [T, m].
         state_names: names of the states.
         input_names: names of the inputs.
+
+    Returns:
+        The values; None for a domain without a density.
     """
     if domain.degree == 0:
         return None
