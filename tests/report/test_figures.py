@@ -115,7 +115,7 @@ def test_a_figure_is_written_and_read_back(tmp_path: Path) -> None:
     assert (read.panels[1].y_limits, read.panels[2].y_log) == ([-2.0, 2.0], True)
     assert [case.note for case in read.cases] == ["A note.", "Other."]
     x, y = read.cases[0].curves[1]["a"]
-    assert len(x) == 600, "no more samples than a screen shows"
+    assert len(x) == 400, "no more samples than a screen shows"
     np.testing.assert_allclose(y, np.sin(x), atol=1e-3)
     assert (x[0], x[-1]) == pytest.approx((0.0, 10.0), abs=1e-3)
     assert len(split_at_gaps(*read.cases[0].curves[1]["measured"])) == 2, "a gap stays one"
@@ -208,7 +208,7 @@ def test_the_page_of_a_fit_stands_alone_and_loads_nothing(run: Path) -> None:
     assert '<meta name="viewport"' in text
     sources = Page(text).sources
     assert all(source.startswith(("data:image/png;base64,", "#")) for source in sources)
-    assert sum(source.startswith("data:") for source in sources) == 8
+    assert sum(source.startswith("data:") for source in sources) == 7
     markup = re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
     # clip paths of drawings are in the page itself
     assert not re.search(r"url\((?!#)|@import|https?://", markup)

@@ -98,8 +98,13 @@ frame.onload = async () => {
   const walker = page.createTreeWalker(place, NodeFilter.SHOW_TEXT);
   while (walker.nextNode()) {
     const box = walker.currentNode.parentElement;
-    if (walker.currentNode.data.trim() && box.getClientRects().length)
-      smallest = Math.min(smallest, parseFloat(page.defaultView.getComputedStyle(box).fontSize));
+    if (walker.currentNode.data.trim() && box.getClientRects().length) {
+      /* texts of a drawing are scaled with it */
+      const matrix = box.getScreenCTM ? box.getScreenCTM() : null;
+      const scale = matrix ? Math.hypot(matrix.a, matrix.b) : 1;
+      smallest = Math.min(
+        smallest, scale * parseFloat(page.defaultView.getComputedStyle(box).fontSize));
+    }
   }
   const panels = [...page.querySelectorAll(".panel")].map(panel => {
     const canvas = deepest(panel, "canvas");

@@ -174,6 +174,7 @@ class Figure:
         chooser: label of the selection list.
         columns: number of panel columns.
         static_images: paths of the PNG files.
+        is_drawing: whether a page shows the first case as a drawing that needs no JavaScript.
     """
 
     kind: ClassVar[str] = "figure"
@@ -186,6 +187,7 @@ class Figure:
     chooser: str = ""
     columns: int = 1
     static_images: Sequence[Path] = ()
+    is_drawing: bool = False
 
     @property
     def html_id(self) -> str:
@@ -228,6 +230,7 @@ class Figure:
             panels=preview_panels,
             cases=cases,
             static_images=(),
+            is_drawing=True,
         )
 
     def curve_names(self, panel: int) -> list[str]:

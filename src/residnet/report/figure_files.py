@@ -94,7 +94,7 @@ def write_figure(folder: Path, figure: Figure, name: str = "") -> Figure:
     return replace(figure, static_images=image_paths)
 
 
-_STORED_FIELDS = ("name", "title", "caption", "chooser", "columns")
+_STORED_FIELDS = ("name", "title", "caption", "chooser", "columns", "is_drawing")
 _FORMER_KINDS = {"across": "hline", "upright": "vline", "strip": "vspan"}
 """Kind of a curve by its name in files of earlier versions."""
 
@@ -170,7 +170,8 @@ def _read_figure(path: Path) -> Figure | None:
                 for packed_panel in case["curves"]
             ]
         return Figure(
-            **{name: content[name] for name in _STORED_FIELDS},
+            # files of earlier versions have no drawings
+            **{name: content[name] for name in _STORED_FIELDS if name in content},
             styles={name: GlyphStyle(**style) for name, style in content["looks"].items()},
             panels=[Panel(**panel) for panel in content["panels"]],
             cases=[Case(**case) for case in content["cases"]],

@@ -42,10 +42,10 @@ _MIN_BREAKABLE_LENGTH = 20
 def render_figures(sections: Sequence[Section]) -> InteractiveFigures | None:
     """Render the interactive figures of the sections; None without figures.
 
-    Figures of the first screen, whose section has no title, are drawings in the page itself.
-    Rendering takes most of the time of a page. A page that is written twice renders once.
+    Drawings are not interactive. Rendering takes most of the time of a page. A page that is
+    written twice renders once.
     """
-    return render_bokeh(_collect_figures([section for section in sections if section.title]))
+    return render_bokeh([figure for figure in _collect_figures(sections) if not figure.is_drawing])
 
 
 def write_page(
@@ -60,8 +60,8 @@ def write_page(
     """Write `report.html` of a run folder atomically.
 
     The page is self-contained: images, styles and scripts are embedded. Without JavaScript, and in
-    print, static images replace the interactive figures. The figures of the first screen are
-    drawings that need no JavaScript. Glossary terms link to their definitions
+    print, static images replace the interactive figures. The drawings of the first screen
+    need no JavaScript. Glossary terms link to their definitions
     at the end of the page. Provenance and configuration follow if the folder holds
     `provenance.json` and `resolved.yaml`.
 

@@ -21,8 +21,11 @@ FIGURE_WIDTH = 7.0
 """Width of every image in inches: the text width of an A4 page, so that 9 pt text prints at 9
 pt.
 """
-INLINE_WIDTH = 4.6
-"""Width of a drawing of the first screen in inches: half of a page, or a phone held upright."""
+INLINE_WIDTH = 3.7
+"""Width of a drawing of the first screen in inches, that of a phone: text has at least 11 px."""
+_INLINE_MAP_HEIGHT = 1.9
+_MAX_INLINE_WIDTH = 5.0
+"""Width in inches to which a drawing grows on a large screen."""
 _MAP_HEIGHT = 4.2
 """Height of a row of maps in inches."""
 _DASHES: dict[str, Any] = {
@@ -41,8 +44,8 @@ RC_PARAMS: Any = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 9,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
     "legend.fontsize": 9,
     "legend.frameon": False,
     "legend.handlelength": 2.6,
@@ -64,6 +67,7 @@ def render_matplotlib(
     case: Case | None = None,
     panel_numbers: Sequence[int] = (),
     width: float = FIGURE_WIDTH,
+    map_height: float = 0.0,
 ) -> Any:
     """Return a matplotlib figure of a case: maps in one row, other panels below.
 
@@ -72,6 +76,7 @@ def render_matplotlib(
         case: a case of the figure; the first one if None.
         panel_numbers: numbers of the panels to draw; all if empty.
         width: width in inches.
+        map_height: height of a row of maps in inches; 0 for a height in proportion to the width.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -90,7 +95,8 @@ def render_matplotlib(
         for k in range(n_lines)
     ]
     n_map_columns = max(len(maps), 1)
-    map_lines = [width / FIGURE_WIDTH * (_MAP_HEIGHT if len(maps) < 3 else 3.0)] if maps else []
+    map_height = map_height or width / FIGURE_WIDTH * (_MAP_HEIGHT if len(maps) < 3 else 3.0)
+    map_lines = [map_height] if maps else []
     with rc_context(RC_PARAMS):
         canvas = Canvas(
             figsize=(width, 0.5 + sum([*map_lines, *heights])), dpi=DPI, layout="constrained"
@@ -274,25 +280,29 @@ def _legend_above(canvas: Any, handles: dict[str, Any], width: float) -> None:
 def draw_svg(figure: Figure) -> str:
     """Draw the first case of a figure as an SVG element, for the first screen of a page.
 
-    The element has no fixed size: it is as wide as its container, at most `INLINE_WIDTH`. Texts
+    The element has no fixed size: it is as wide as its container, up to a limit. Texts
     are text, so that a reader can search and enlarge them.
     """
     from matplotlib import rc_context
 
-    canvas = render_matplotlib(figure, width=INLINE_WIDTH)
+    canvas = render_matplotlib(figure, width=INLINE_WIDTH, map_height=_INLINE_MAP_HEIGHT)
     stream = io.StringIO()
-    # a fixed salt makes the identifiers of clip paths the same in every run
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": figure.html_id}):
+    with rc_context({"svg.fonttype": "none"}):
         canvas.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     text = stream.getvalue()
     body = text[text.index(">", text.index("<svg")) + 1 :]
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     # identifiers of groups repeat in every drawing and are not referred to
     body = re.sub(r'<g id="[^"]*"', "<g", body).replace("xlink:href", "href")
+    # those of clip paths and markers are random: numbers make pages reproducible
+    for number, identifier in enumerate(dict.fromkeys(re.findall(r' id="([^"]+)"', body))):
+        body = re.sub(
+            rf'(["#]){re.escape(identifier)}(["\)])', rf"\1{figure.html_id}-{number}\2", body
+        )
     width, height = (72.0 * size for size in canvas.get_size_inches())
     return (
-        f'<svg viewBox="0 0 {width:g} {height:g}" style="max-width: {INLINE_WIDTH:g}in" role="img"'
-        f' aria-label="{escape(figure.title)}">{body.strip()}'
+        f'<svg viewBox="0 0 {width:g} {height:g}" style="max-width: {_MAX_INLINE_WIDTH:g}in"'
+        f' role="img" aria-label="{escape(figure.title)}">{body.strip()}'
     )
 
 

@@ -49,8 +49,8 @@ They limit the page to a few megabytes and keep the curve smooth.
 _TRACK_PANEL = Panel("north [m]", "east [m]", kind="map", height=380)
 _N_OPENING_PANELS = 3
 """Number of motion panels on the first screen: surge, sway and yaw rate of a planar vessel."""
-_OPENING_PANEL_HEIGHT = 95
-"""Height of a motion panel on the first screen, so that track and velocities fit a laptop."""
+_OPENING_PANEL_HEIGHT = 62
+"""Height of a motion panel on the first screen, so that the table fits below it on a phone."""
 _MOTION_TITLES = {
     "u": "surge velocity\nu",
     "v": "sway velocity\nv",
@@ -231,7 +231,8 @@ def track_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | Non
             if name in visible_curves[0]
         },
         panels,
-        [Case("", visible_curves[: len(panels)])],
+        [Case("", visible_curves[: len(panels)], has_static_image=False)],
+        is_drawing=True,
     )
 
 
