@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.autopilot.manoeuvres import SEGMENTS, FourCorner
+from residnet.autopilot.manoeuvres import FOUR_CORNER_POSES, FourCorner
 from residnet.autopilot.motion_config import MotionPIDConfig
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
@@ -248,7 +248,7 @@ def test_four_corner_course_of_the_ferry(vessel: str) -> None:
     assert found["mean_position_error"] < 1.0
     assert found["mean_heading_error"] < 5 * DEG
     # each segment ends near its pose, the ninth's turn goes the long way round as it is written
-    for i, (north, east, heading) in enumerate(SEGMENTS):
+    for i, (north, east, heading) in enumerate(FOUR_CORNER_POSES):
         k = (i + 1) * 300 - 1
         assert math.hypot(motion["x"][k] - north, motion["y"][k] - east) < 1.5
         assert motion["psi"][k] == pytest.approx(heading, abs=8 * DEG)

@@ -1,4 +1,4 @@
-"""Interfaces of controllers and guidance, and the closed loop as the source of a rollout."""
+"""Interfaces of controllers and guidance, and the closed loop as input source of a simulation."""
 
 from __future__ import annotations
 
@@ -40,9 +40,10 @@ class Policy(StatefulModule):
         """
 
     def replace_rudder_in_memory(self, s: Tensor, rudder: Tensor) -> Tensor:
-        """Return the memory corrected for the rudder angle [B, 1] that is applied.
+        """Replace the stored rudder angle by the rudder angle [B, 1] that was actually applied.
 
-        A controller without an observer returns the memory unchanged.
+        The memory of an observer contains the rudder angle. A controller without an observer
+        returns the memory unchanged.
         """
         return s
 
@@ -65,7 +66,10 @@ class Reference(StatefulModule):
         """
 
     def is_finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
-        """Return which rows [B] have arrived; called only if `may_finish` is set."""
+        """Return which rows [B] have reached the end of the course.
+
+        The method is called only if `may_finish` is set.
+        """
         return torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
 
 
@@ -83,9 +87,9 @@ class RecordedReference(Reference):
 
 @final
 class ClosedLoop(Source):
-    """Guidance and controller as the source of the inputs of a rollout.
+    """Guidance and controller as the source of the inputs of a simulation.
 
-    The commands replace the first columns of w.
+    The c commands replace the first c columns of w.
     """
 
     def __init__(self, policy: Policy, reference: Reference) -> None:
@@ -108,7 +112,7 @@ class ClosedLoop(Source):
         )
 
     def is_finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Return which rows have arrived at the end of the guidance."""
+        """Return which rows have reached the end of the course."""
         return self.reference.is_finished(x, k, memory[:, : self.reference.n_state])
 
 
@@ -116,8 +120,8 @@ class ClosedLoop(Source):
 class ReferenceInInputs(Source):
     """A controller whose reference is passed in the last columns of the inputs, w [B, m + r].
 
-    Because it does not depend on the number of the time step, it can be compiled. The commands
-    replace the first of the m columns.
+    Because it does not depend on the number of the time step, it can be compiled. The c
+    commands replace the first c of the m input columns.
 
     Args:
         policy: controller.

@@ -24,21 +24,21 @@ if TYPE_CHECKING:
     from residnet.autopilot.guidance import WaypointGuidance
     from residnet.engine.rollout import Source
 
-_POSE = PLANAR_LAYOUT.pose
+_POSE_NAMES = PLANAR_LAYOUT.pose
 
 
 class Waypoints(Manoeuvre):
     """Straight legs between way-points with line-of-sight guidance.
 
-    The steer is proportional to heading error and yaw rate (PD control).
+    The steering command is proportional to heading error and yaw rate (PD control).
 
     Attributes:
-        drive: constant drive.
+        drive: constant propulsion command, as a fraction of its maximum.
         points: way-points (north, east); the first leg begins at the initial position.
         acceptance: radius of the circle in which a way-point counts as reached.
         lookahead: distance along the leg to the point towards which the vessel steers.
-        gain: share of full steer per rad of heading error.
-        rate_gain: share of full steer per rad/s of yaw rate.
+        gain: steering command, as a fraction of its maximum, per rad of heading error.
+        rate_gain: steering command, as a fraction of its maximum, per rad/s of yaw rate.
     """
 
     kind: Literal["waypoints"] = "waypoints"
@@ -50,7 +50,7 @@ class Waypoints(Manoeuvre):
     rate_gain: Seconds = Field(default=1.0, ge=0)
 
     def build_guidance(self, state: tuple[str, ...]) -> WaypointGuidance:
-        """Return the guidance over states with these names."""
+        """Return the guidance law for a state vector with these names."""
         from residnet.autopilot.guidance import LookAheadLineOfSight, WaypointGuidance
 
         return WaypointGuidance(
@@ -62,7 +62,7 @@ class Waypoints(Manoeuvre):
         """Return the closed loop on position and heading, with a separate course for each row."""
         from residnet.manoeuvres.sources import StackedSource
 
-        for name in (*_POSE, "r"):
+        for name in (*_POSE_NAMES, "r"):
             helm.state_column(name)
         sources = [m._build_loop(helm) for m in manoeuvres if isinstance(m, Waypoints)]
         return StackedSource(sources, [1] * len(sources))
@@ -77,6 +77,7 @@ class Waypoints(Manoeuvre):
         autopilot = HeadingPD(helm.state, kp=self.gain, kd=self.rate_gain, limit=1.0)
 
         def to_commands(steer: Tensor) -> Tensor:
+            # `demand` maps the propulsion and steering commands, each within +-1, to the vessel
             return helm.demand(torch.full_like(steer[:, 0], self.drive), steer[:, 0])
 
         return ClosedLoop(AllocatedPolicy(autopilot, to_commands), self.build_guidance(helm.state))
@@ -90,11 +91,16 @@ class Waypoints(Manoeuvre):
         return f"the last of {len(self.points)} way-points"
 
     def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return cross-track errors relative to the active legs, and the duration of the course."""
+        """Return cross-track errors relative to the active legs, and the duration of the course.
+
+        Args:
+            log: simulated or measured motion.
+            length: length of the hull in m; not used.
+        """
         import torch
 
-        x = torch.from_numpy(np.nan_to_num(log.stack(_POSE)))
-        guidance = self.build_guidance(_POSE)
+        x = torch.from_numpy(np.nan_to_num(log.stack(_POSE_NAMES)))
+        guidance = self.build_guidance(_POSE_NAMES)
         s = guidance.initial_state(x[:1])
         errors: list[float] = []
         for k in range(len(log)):
@@ -113,7 +119,7 @@ _RIGHT_ANGLE = math.pi / 2
 _HALF_RIGHT_ANGLE = math.pi / 4
 # Table 4.1 prints the twelve poses twice (J12 in docs/documents/corrections.md);
 # headings are not wrapped, so that the vessel turns in the direction written in the table (J13)
-SEGMENTS: tuple[Waypoint, ...] = (
+FOUR_CORNER_POSES: tuple[Waypoint, ...] = (
     (0.0, -15.0, -_RIGHT_ANGLE),
     (15.0, -15.0, 0.0),
     (15.0, 0.0, 0.0),
@@ -127,6 +133,7 @@ SEGMENTS: tuple[Waypoint, ...] = (
     (0.0, -15.0, -_HALF_RIGHT_ANGLE),
     (0.0, 0.0, 0.0),
 )
+"""Poses (north and east in m, heading in rad) of the four-corner course."""
 
 
 class FourCorner(Manoeuvre):
@@ -144,7 +151,7 @@ class FourCorner(Manoeuvre):
     """
 
     kind: Literal["four_corner"] = "four_corner"
-    poses: Annotated[tuple[Waypoint, ...], Field(min_length=1)] = SEGMENTS
+    poses: Annotated[tuple[Waypoint, ...], Field(min_length=1)] = FOUR_CORNER_POSES
     interval: Seconds = Field(default=60.0, gt=0)
     frequency: tuple[RadiansPerSecond, RadiansPerSecond, RadiansPerSecond] = (0.195, 0.195, 0.415)
     damping: tuple[float, float, float] = (0.7, 0.7, 0.7)
@@ -161,7 +168,10 @@ class FourCorner(Manoeuvre):
         )
 
     def duration_within(self, duration: float) -> float:
-        """Return one interval per pose, or `self.duration` if it is shorter."""
+        """Return the total duration in s: the number of poses times `interval`.
+
+        It is at most `self.duration`, if that is set; the argument is not used.
+        """
         return min(self.filter_config.duration, self.duration or math.inf)
 
     @classmethod
@@ -175,6 +185,7 @@ class FourCorner(Manoeuvre):
         from residnet.autopilot.motion import AllocatedPolicy
         from residnet.manoeuvres.sources import StackedSource
 
+        # `forces` allocates surge force, sway force and yaw moment to the commands
         if helm.forces is None or helm.state[MOTION] != PLANAR_LAYOUT.state_names:
             raise UsageError(
                 "a four-corner course needs a vessel in surge, sway and yaw with commands for"
@@ -191,11 +202,16 @@ class FourCorner(Manoeuvre):
         return StackedSource(sources, [1] * len(sources))
 
     def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return the mean distance from the reference, and mean absolute error of the heading."""
+        """Return the mean distance from the reference, and mean absolute error of the heading.
+
+        Args:
+            log: simulated or measured motion.
+            length: length of the hull in m; not used.
+        """
         import torch
 
         reference = self.filter_config.build(float(log.t[1] - log.t[0]))
-        x = torch.from_numpy(log.stack(_POSE))
+        x = torch.from_numpy(log.stack(_POSE_NAMES))
         s = reference.initial_state(x[:1])
         desired_poses = []
         for k in range(len(log)):

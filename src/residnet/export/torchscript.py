@@ -1,7 +1,8 @@
 """The format `torchscript`: one file that a controller loads with torch alone.
 
-The file is frozen, and its card is an extra file of the archive. TorchScript is code: load only
-files that you trust. The format `aoti` compiles a step ahead of time, for this machine.
+The module is frozen; its metadata (model card, card.json) is stored as an extra file in the
+archive. TorchScript is code: load only files that you trust. The format `aoti` compiles the
+function of one time step ahead of time, for this type of machine.
 """
 
 from __future__ import annotations
@@ -56,20 +57,20 @@ _EXECUTOR_SETTINGS = {
         ),
     },
 }
-"""Additional card entry of this format: executor settings for a fast first call."""
+"""Additional entries of the model card: executor settings for a fast first call."""
 
 
-def get_size(tensor: Tensor, dimensions: int, dimension: int) -> int:
-    """Return the size of one dimension, or 1 if the tensor has another number of dimensions.
+def get_size(tensor: Tensor, n_dimensions: int, axis: int) -> int:
+    """Return the size along an axis, or 1 if the tensor has another number of dimensions.
 
     TorchScript compiles this function. The following check of the shape then fails with its own
     message instead of an index error.
     """
-    return tensor.shape[dimension] if tensor.dim() == dimensions else 1
+    return tensor.shape[axis] if tensor.dim() == n_dimensions else 1
 
 
 def require_shape(name: str, tensor: Tensor, shape: list[int]) -> None:
-    """Check the shape of a tensor, since arithmetic might broadcast another one.
+    """Check the shape of a tensor, because a wrong shape might be broadcast without an error.
 
     TorchScript compiles this function: Python raises `torch.jit.Error`, C++ an exception, with this
     message.
@@ -122,8 +123,9 @@ def trace_function(function: Callable[..., Any], examples: tuple[Tensor, ...], w
 
 
 class ScriptedModel(LoadedExport):
-    """A scripted module, for one row."""
+    """Loaded TorchScript module, evaluated with a batch size of one."""
 
+    # the module runs the operations of the model in torch, in the same order
     reorders_sums = False
 
     def __init__(self, module: Any, dtype: torch.dtype) -> None:
@@ -139,10 +141,18 @@ class ScriptedModel(LoadedExport):
                 output[0].numpy() for output in self.module(*self._to_tensors(step_arguments))
             )
 
-    def initial_memory(self, *measured_past: NumberArray) -> NumberArray | None:
-        make_memory = self.module.warmup if len(measured_past) > 1 else self.module.initial_state
+    def initial_memory(self, *warmup_arguments: NumberArray) -> NumberArray | None:
+        """Return the memory after a measured past.
+
+        Args:
+            warmup_arguments: for a vessel the measured states [T, nx] and inputs [T, m], for a
+                controller the first measurement alone.
+        """
+        make_memory = self.module.warmup if len(warmup_arguments) > 1 else self.module.initial_state
         with torch.no_grad():
-            initial_memory: NumberArray = make_memory(*self._to_tensors(measured_past))[0].numpy()
+            initial_memory: NumberArray = make_memory(*self._to_tensors(warmup_arguments))[
+                0
+            ].numpy()
         return initial_memory
 
     def rollout(self, *rollout_arguments: NumberArray) -> NumberArray | None:
@@ -175,8 +185,8 @@ class TorchScriptExporter(Exporter):
                 torch.jit.script(module), preserved_attrs=list(exported.methods)
             )
             for method in exported.methods:
-                # the executor would optimise graphs at run time, but not with the settings for a
-                # fast first call, so that it is done here
+                # with the settings for a fast first call the executor does not optimise graphs at
+                # run time; optimise them here instead
                 graph = scripted._c._get_method(method).graph
                 passes = torch._C
                 passes._jit_pass_inline(graph)
@@ -186,7 +196,7 @@ class TorchScriptExporter(Exporter):
                     passes._jit_pass_peephole(graph)
                     passes._jit_pass_cse(graph)
                     passes._jit_pass_dce(graph)
-            # the parity check uses a saved and reloaded module; the file differs only by the card
+            # the parity check uses a saved and reloaded module; the file differs only by its card
             reloaded = ScriptedModel(torch.jit.load(io.BytesIO(_serialise(scripted))), dtype)
             with optimized_execution(False):
                 parity_entry = {
@@ -240,9 +250,9 @@ class AotiExporter(Exporter):
     about: ClassVar[str] = "The model's step compiled for this machine (AOTInductor), one row."
 
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
-        """Compile the step and write package and card.
+        """Compile the function of one time step; write the package and its model card.
 
-        Float64 is used if the track depends on rounding in float32.
+        Float64 is used if the simulated trajectory is too sensitive to rounding in float32.
         """
         exported.require_finite_numbers()
         with tempfile.TemporaryDirectory() as folder:

@@ -693,7 +693,7 @@ class MonitorVerdict:
         is_alarm: whether the largest score exceeds the threshold; an online detector keeps the
             alarm until the scores are clearly below the threshold.
         threshold: threshold of the scores.
-        hypotheses: possible changes in descending order of their explained squares.
+        hypotheses: possible changes in descending order of `explained_square`.
         innovation_rms: root mean square of the whitened innovations of each channel; 1 on clean
             logs.
     """

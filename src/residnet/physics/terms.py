@@ -1,8 +1,8 @@
 """Named regressors: products of channels and of functions of a channel.
 
 Examples of names are `u|u|`, `v |r|`, `n^2 sin(delta)` and `1`. Hulls, baselines (hydrodynamic
-derivatives) and closed-form heads (basis functions) use the same library, so that a name has one
-meaning.
+derivatives) and closed-form heads (residual models with basis functions) use the same library, so
+that a name has one meaning.
 """
 
 from __future__ import annotations
@@ -140,9 +140,9 @@ def make_polynomial_terms(
 
 
 class CandidateTerm(NamedTuple):
-    """Candidate term with its degree and a complexity that sorts terms of equal degree.
+    """Candidate term with its degree, and its complexity for the order of terms of equal degree.
 
-    A function counts as one degree.
+    A function such as sin(delta) counts as degree one.
     """
 
     term: str
@@ -151,12 +151,26 @@ class CandidateTerm(NamedTuple):
 
 
 class CandidatesConfig(Config):
-    """Candidate terms of an equation, given by types.
+    """Rules that generate the candidate terms of an equation.
 
-    The candidates are all products of motions, with magnitudes of any factors, and all products of
-    inputs, multiplied by products of coupled motions and by 1 or the sine or cosine of an angle.
-    The candidates of Halvorsen 2019, eqs. (6.21)-(6.23) are inputs rpm up to degree 2, coupling u
-    up to degree 2, and angle nozzle.
+    The candidates are of two types:
+
+    - all products of motions, with magnitudes of any factors;
+    - all products of inputs, multiplied by products of coupled motions and by 1 or the sine or
+      cosine of an angle.
+
+    Halvorsen 2019, eqs. (6.21)-(6.23), corresponds to `inputs: [rpm], input_degree: 2,
+    coupling: [u], coupling_degree: 2, angles: [nozzle]`.
+
+    With neither `input_degree` nor `coupling`, the products of inputs are those of propellers and
+    rudders:
+
+    - degrees one and two with magnitudes as in `n|n|`, times u and |u|;
+    - one input times u^2 and `u|u|`, as in `u^2 delta`;
+    - the square of one input times another or its square, as in `n|n| delta` and `n^2 delta^2`;
+    - cubes, as in `delta^3`;
+    - ratios of products of motions over an input, and of one input over another. A residual model
+      uses the ratios whose divisor is not near zero in its data.
 
     Attributes:
         motions: channels of the motion; those that the model does not have are ignored.
@@ -166,12 +180,7 @@ class CandidatesConfig(Config):
         magnitudes: whether magnitudes of factors are included, as in `u|u|`.
         inputs: inputs of the products; null for all that are neither motions nor angles.
         input_degree: maximum degree of the products of inputs without magnitudes. If null, it is 1
-            with `coupling`; otherwise the products are those of propellers and rudders: degrees one
-            and two with magnitudes as in `n|n|`, times u and |u|; those of one input also times u^2
-            and `u|u|` as in `u^2 delta`; squares of one input times another or its square, as in
-            `n|n| delta` and `n^2 delta^2`; cubes as in `delta^3`; and ratios of products of motions
-            over an input and of one input over another. A head uses the ratios whose divisor is not
-            near zero in its data.
+            with `coupling`; without `coupling` the products are those of propellers and rudders.
         angles: inputs whose sine and cosine are used.
         coupling: motions by which products of inputs are multiplied.
         coupling_degree: maximum degree of these factors.
@@ -339,8 +348,8 @@ def rank_candidates(terms: Iterable[str], names: Sequence[str]) -> tuple[Candida
     for term in terms:
         factors = parse_term(term, names)
         degree = sum(abs(factor.power) for factor in factors)
-        # among terms of one degree, few different channels come first, then those without
-        # magnitudes (0.5), functions (0.75) and divisions (1)
+        # among terms of one degree, terms with few different channels come first, then terms
+        # without magnitudes (0.5), functions (0.75) and divisions (1)
         complexity = len({factor.name for factor in factors}) + sum(
             0.5 * parsed_factor.magnitude
             + 0.75 * bool(parsed_factor.function)

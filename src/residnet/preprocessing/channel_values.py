@@ -33,10 +33,14 @@ such distances.
 """
 _MAX_SPIKE_SAMPLES = 2
 """Maximum length of a spike in samples."""
-_MIN_CHANGES_FOR_SCAN = 3.0
-"""Lower bound of both minimum distances, in 99 % quantiles of the change between samples."""
+_MIN_THRESHOLD_CHANGES = 3.0
+"""Lower bound of both minimum distances, relative to the 99 % quantile of the change between
+samples.
+"""
 _MIN_RANGE_EXCESS = 0.9
-"""Alternative minimum: distance outside the range of the channel, in ranges."""
+"""Alternative minimum: distance outside the range of the channel, relative to that range (99 % of
+the values).
+"""
 _MIN_SAMPLES = 20
 """Smallest number of samples for the detection of spikes; chosen by hand."""
 CACHED_SAMPLES = 8_192
@@ -112,7 +116,8 @@ def _selection_medians(
     minima and maxima this is faster than sorting.
 
     Args:
-        get_members: returns the members of the median for a chunk of samples, an array each.
+        get_members: returns for a chunk of samples the arrays of which the element-wise median is
+            computed.
         n_samples: T.
     """
     medians = np.empty(n_samples)
@@ -163,12 +168,12 @@ def find_hampel_outliers(
         [T] bool for each column; False at missing values.
     """
     half_window = samples // 2
-    max_distance = 2 * half_window
+    max_offset = 2 * half_window
     n_neighbours = 2 * half_window + 1
     outlier_masks = [np.zeros(values.size, dtype=bool) for values in columns]
     finite_indices = [np.flatnonzero(np.isfinite(values)) for values in columns]
     usable_columns = [
-        i for i, indices in enumerate(finite_indices) if indices.size > 2 * max_distance
+        i for i, indices in enumerate(finite_indices) if indices.size > 2 * max_offset
     ]
     finite_values = [columns[i][finite_indices[i]] for i in usable_columns]
     if not finite_values:
@@ -190,21 +195,21 @@ def find_hampel_outliers(
     # distance from the median of the linear interpolations between pairs of neighbours
     padded = np.concatenate(
         [
-            np.pad(sample_slice, max_distance, mode="reflect", reflect_type="odd")
-            for sample_slice in finite_values
+            np.pad(column_values, max_offset, mode="reflect", reflect_type="odd")
+            for column_values in finite_values
         ]
     )
     interpolations = _selection_medians(
         lambda k: [
-            0.5 * (neighbours(padded, i, k) + neighbours(padded, 2 * max_distance - i, k))
-            for i in range(max_distance)
+            0.5 * (neighbours(padded, i, k) + neighbours(padded, 2 * max_offset - i, k))
+            for i in range(max_offset)
         ],
-        padded.size - 2 * max_distance,
+        padded.size - 2 * max_offset,
     )
     deviations = [
         column_values - interpolation
         for column_values, interpolation in zip(
-            finite_values, split_by_column(interpolations, max_distance), strict=True
+            finite_values, split_by_column(interpolations, max_offset), strict=True
         )
     ]
     padded = np.concatenate(
@@ -227,8 +232,8 @@ def find_hampel_outliers(
         sampled_distances = distance[
             sample_rows(column_values.size, _MAX_SUBSAMPLE, _N_SUBSAMPLE_SEGMENTS)
         ]
-        # lower bound of the deviation: flicker of a coarse channel by single steps of its
-        # resolution, and rounding errors
+        # lower bound of the deviation: a coarse channel alternates between adjacent values of its
+        # resolution, and values have rounding errors
         resolution = (
             2.0 * nan_quantiles(sampled_distances[sampled_distances > 0.0], 0.1)[0]
             if sampled_distances.any()
@@ -239,7 +244,8 @@ def find_hampel_outliers(
             resolution,
             1e-9 * float(np.abs(column_values).max()),
         )
-        # the curvature of a smooth channel is no outlier at the end of a turn
+        # where a smooth channel is curved, as at the end of a turn, the median deviation is large;
+        # it raises the threshold, so that the curvature is not taken for an outlier
         suspect_indices = np.flatnonzero(
             distance > sigmas * np.maximum(floor, np.abs(median_deviation))
         )
@@ -386,7 +392,7 @@ def _find_channel_spikes(values: np.ndarray, is_measured_motion: bool) -> np.nda
     # quick exit: without a large change there is no spike
     largest = float(changes.max())
     scan_threshold = (
-        min(_MIN_CHANGES_FOR_SCAN * high_change, _MIN_RANGE_EXCESS * value_range)
+        min(_MIN_THRESHOLD_CHANGES * high_change, _MIN_RANGE_EXCESS * value_range)
         if is_measured_motion
         else 0.5 * value_range
     )
@@ -421,7 +427,8 @@ def _find_channel_spikes(values: np.ndarray, is_measured_motion: bool) -> np.nda
             if finite_values.size > _MAX_SUBSAMPLE
             else distance
         )
-        # in a steady channel the neighbours of a spike are also a few changes from their median
+        # in a steady channel the neighbours of a spike, too, differ from their median by a few
+        # times the usual change
         min_distance = min(
             _MIN_SPIKE_CHANGES * high_change,
             _MIN_SPIKE_DISTANCES * nan_quantiles(typical_distances, 0.99)[0],
@@ -433,7 +440,7 @@ def _find_channel_spikes(values: np.ndarray, is_measured_motion: bool) -> np.nda
             & (value_range > 0.0)
         )
         is_outlier = (
-            distance > max(min_distance, _MIN_CHANGES_FOR_SCAN * high_change, 1e-6 * value_range)
+            distance > max(min_distance, _MIN_THRESHOLD_CHANGES * high_change, 1e-6 * value_range)
         ) | is_out_of_range
     else:
         # a display that flickers in its last digit exceeds its range by one step of that digit
@@ -448,7 +455,8 @@ def _find_channel_spikes(values: np.ndarray, is_measured_motion: bool) -> np.nda
     spike_mask[finite_indices] = mask_from_ranges(
         finite_values.size, starts[is_single], stops[is_single]
     )
-    # frequent spikes are a fault of the sensor instead of single samples
+    # frequent spikes indicate a faulty sensor rather than single wrong samples, so that none is
+    # marked
     return (
         spike_mask
         if spike_mask.sum() <= max(3, 0.01 * finite_values.size)
@@ -555,7 +563,11 @@ def is_implausible(values: np.ndarray, unit: str) -> np.ndarray:
 
 
 _SENSOR_GROUPS = (("x", "y"), ("u", "v"), ("psi",), ("r",))
-"""Channels of one sensor: one may be equal in two measurements, all of them rarely are."""
+"""Groups of channels that one sensor measures.
+
+One channel may have the same value in two successive measurements; rarely do all channels of a
+group.
+"""
 _MIN_INTERVALS = 20
 """Smallest number of update intervals for an estimate of their median."""
 INTERVAL_TOLERANCE = 0.25
@@ -581,11 +593,11 @@ def median_update_interval(values: np.ndarray) -> float:
 
 
 def mask_held_values(log: Log) -> Log:
-    """Replace repeated values of slow motion sensors by NaN.
+    """Replace repeated values of motion sensors with a low update rate by NaN.
 
-    A value that is repeated until the next measurement is late by up to an update interval, and its
-    derivative consists of spikes. As NaN it is estimated from the other sensors, like the values of
-    any sparse channel.
+    A sensor value that is repeated until the next measurement is delayed by up to one update
+    interval, and its derivative consists of spikes. Samples that are NaN instead are estimated from
+    the other sensors, like the missing samples of any sparse channel.
     """
     fresh_values: dict[str, np.ndarray] = {}
     for sensor_channels in _SENSOR_GROUPS:

@@ -1,7 +1,7 @@
 """Differentiate sampled channels within contiguous segments.
 
 Accelerations are rarely measured. They are computed from velocities by differentiation with a
-stated smoothing.
+configured amount of smoothing.
 """
 
 from __future__ import annotations

@@ -56,6 +56,8 @@ if TYPE_CHECKING:
 JsonObject = Mapping[str, Any]
 """A JSON object."""
 RecordT = TypeVar("RecordT", bound=StoredFile)
+_LOG_SET_NAME = "together"
+"""Name in doctor.json of the findings on the set of all logs, instead of one log."""
 _SPLIT_PRIORITY = ("test", "external", "validation", "train")
 """Splits in the order in which a report prefers them: data that no fit has seen come first."""
 
@@ -202,7 +204,10 @@ class RunFiles:
         return self.read_record(kind, name) or kind.read(self.path / name, self.path)
 
     def assessment(self, judged: tuple[str, Sequence[str]] | None = None) -> Assessment:
-        """Return verdict, data findings and log split of the run for the card of an export.
+        """Return the assessment of the run for the metadata (model card) of an export.
+
+        It consists of the verdict, the findings of the data checks, and the names of the logs for
+        training, validation and test.
 
         Args:
             judged: level and sentences of the verdict on the model; None for the verdict of the
@@ -220,7 +225,7 @@ class RunFiles:
         if self.inspection is not None:
             findings = tuple(
                 CardFinding(
-                    log=None if log == "together" else log,
+                    log=None if log == _LOG_SET_NAME else log,
                     level=finding.level,
                     code=finding.code,
                     text=finding.text,
@@ -283,7 +288,7 @@ class RunFiles:
 
     @cached_property
     def settings(self) -> RunSettings:
-        """The settings of any task that a page shows."""
+        """The settings that the page of any task shows."""
         return read_settings(self.path, RunSettings)
 
     @cached_property
@@ -293,7 +298,7 @@ class RunFiles:
 
     @cached_property
     def quality(self) -> Sequence[LogQuality]:
-        """The samples of each log (data_quality.json); empty if the file does not exist."""
+        """Number of samples and split of each log (data_quality.json); empty without the file."""
         file = self.read_record(DataQualityFile, "data_quality.json")
         return () if file is None else file.root
 
@@ -314,7 +319,11 @@ class RunFiles:
 
     @cached_property
     def limits(self) -> LimitsFile | None:
-        """Errors by horizon, class and window (limits.json); None if the file does not exist."""
+        """Limits of validity (limits.json); None if the file does not exist.
+
+        They are the errors by prediction horizon, by class of speed and wind speed, and the windows
+        with the largest errors.
+        """
         return self.read_record(LimitsFile, "limits.json")
 
     def find_limits(self, protocol: str) -> ProtocolLimits | None:
@@ -348,7 +357,8 @@ class RunFiles:
         """The kind (constant_velocity, baseline, head, plant, ...) of each model, in the order of
         metrics.json.
 
-        Reductions refer to the first baseline; the others are `further` models, judged like heads.
+        Error reductions are relative to the first baseline. Other baselines have the kind `further`
+        and are evaluated like heads (residual models).
         """
         kinds = {row.model: row.kind for row in self.rows}
         first_baseline = next((model for model, kind in kinds.items() if kind == "baseline"), None)
@@ -359,17 +369,17 @@ class RunFiles:
 
     @property
     def selected(self) -> str:
-        """The single model that was chosen on validation data."""
+        """The model that was chosen on validation data among the single models (no ensembles)."""
         return self.metrics.selected
 
     @property
     def predictor(self) -> str:
-        """The model that is reported first."""
+        """The model that is reported first, which may be an ensemble."""
         return self.metrics.predictor
 
     @cached_property
     def baseline(self) -> str | None:
-        """The model that reductions refer to."""
+        """The reference model of error reductions: the first baseline; None without a baseline."""
         return next((model for model, kind in self.model_kinds.items() if kind == "baseline"), None)
 
     @cached_property
@@ -379,8 +389,9 @@ class RunFiles:
 
     @cached_property
     def heads(self) -> list[str]:
-        """The models that are neither constant_velocity, baseline nor plant, the predictor
-        first.
+        """Heads (residual models), ensembles and further baselines, the predictor first.
+
+        These are all models but the constant-velocity model, the first baseline and the plant.
         """
         heads = [
             model
@@ -438,7 +449,10 @@ class RunFiles:
 
     @cached_property
     def horizon_text(self) -> str:
-        """Text of the horizon of the errors of the main protocol: a time, or the end."""
+        """Text for the prediction horizon of the main protocol, such as `after 30 s`.
+
+        It is `at the end` if the protocol has no windows of equal length.
+        """
         length = self._window_length(self.main_protocol)
         return f"after {length:g} s" if length else "at the end"
 

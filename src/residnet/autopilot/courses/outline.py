@@ -1,4 +1,6 @@
-"""Search the outline of a course past buoys by dynamic programming over passing poses.
+"""Find the shortest route past buoys, as straight legs and turns.
+
+The method is dynamic programming over candidate poses at the buoys.
 
 The buoys are passed in order, each on its prescribed side. Between two buoys the course may go
 round other circles. Paths between poses are turn, straight line, turn (L. E. Dubins, 1957) and are
@@ -22,9 +24,12 @@ _ANGLES = 36
 RINGS = (0.0, 0.25)
 """Distances outside its circle at which a buoy may be passed, in turning radii."""
 _MAX_CANDIDATE_PATHS = 24
-"""Number of the shortest paths to a pose that are checked for collisions first."""
+"""Number of the shortest paths to a pose that are checked for collisions; others are ignored."""
 _CUT_TOLERANCE = 0.05
-"""Distance in turning radii by which an outline may cut a circle; the fit corrects it."""
+"""Distance in turning radii by which an outline may cut a circle.
+
+The later optimisation of the route corrects this.
+"""
 _N_ENTRY_COURSES = 18
 """Number of headings, 20 degrees apart, with which a circle may be entered."""
 _FULL_TURN = 2.0 * math.pi
@@ -246,10 +251,9 @@ class Circle:
 
 @final
 class _Poses:
-    """M candidate poses at a buoy with the lowest cost of reaching them and their predecessors.
+    """M candidate poses at a buoy, each with its lowest cost from the start and its predecessor.
 
-    On an arc about a buoy a course can follow the arc from the pose where it joins it to any later
-    pose.
+    A route that joins an arc about a buoy at one pose can follow the arc to any later pose on it.
     """
 
     def __init__(self, positions: np.ndarray, headings: Array, buoy: int | None) -> None:
@@ -258,23 +262,22 @@ class _Poses:
         self.buoy = buoy
         n_poses = len(positions)
         self.cost = np.full(n_poses, np.inf)
-        self.predecessors: list[tuple[_Poses, NDArray[np.intp]] | None] = [None] * n_poses
-        self.origin = np.full((n_poses, 3), -1, dtype=np.intp)
-        """Predecessor of each pose: its group, its index there, and the type of the path."""
+        self.predecessor_indices = np.full((n_poses, 3), -1, dtype=np.intp)
+        """For each pose: index in `sources`, index of the pose there, and type of the path."""
         self.sources: list[_Poses] = []
         self.arc: slice | None = None
         self.turn_sign = 0
-        self.table = 0
+        self.turn_table_index = 0
         self.arc_radius = 0.0
-        # where an arc is left to, the pose where it was joined
+        # for each pose at which the route leaves the arc, the pose at which it joined the arc
         self.arc_entry = np.arange(n_poses)
         self.departure_cost = self.cost
 
-    def with_arc(self, turn_sign: int, table: int, arc_radius: float) -> _Poses:
+    def with_arc(self, turn_sign: int, turn_table_index: int, arc_radius: float) -> _Poses:
         """Declare the last poses to lie on an arc about the buoy."""
         self.arc = slice(len(self.positions) - _ANGLES, len(self.positions))
         self.turn_sign = turn_sign
-        self.table = table
+        self.turn_table_index = turn_table_index
         self.arc_radius = arc_radius
         return self
 
@@ -293,7 +296,7 @@ class _Poses:
         self.arc_entry[self.arc] = self.arc.start + best_entry
 
     def arc_angle(self, pose: int) -> float:
-        """Return the angle in rad that the course follows the arc before it leaves at a pose."""
+        """Return the arc angle in rad from joining the arc to leaving it at a pose."""
         if self.arc is None or pose < self.arc.start:
             return 0.0
         return (
@@ -375,11 +378,15 @@ class RouteSearch:
         circle = self.circles[number]
         if circle.turn_sign != 0:
             return self._poses_around(circle, circle.turn_sign, number, self.ring_offsets)
-        courses = np.linspace(-math.pi, math.pi, _N_ENTRY_COURSES, endpoint=False)
+        entry_headings = np.linspace(-math.pi, math.pi, _N_ENTRY_COURSES, endpoint=False)
         positions = circle.centre + circle.radius * np.array(
             [0.0, *np.exp(2j * math.pi * np.arange(8) / 8)]
         )
-        return _Poses(np.repeat(positions, len(courses)), np.tile(courses, len(positions)), number)
+        return _Poses(
+            np.repeat(positions, len(entry_headings)),
+            np.tile(entry_headings, len(positions)),
+            number,
+        )
 
     def _poses_around(
         self, circle: Circle, turn_sign: int, number: int | None, ring_offsets: Sequence[float]
@@ -417,9 +424,11 @@ class RouteSearch:
         )
 
     def _path_ends(self, poses: _Poses, is_departure: bool) -> tuple[np.ndarray, Array]:
-        """Return path starts after poses, or path ends before poses, and the distances to these.
+        """Return the points at which paths start or end, and their distances from the poses.
 
-        An arc about a buoy needs straight lengths before and after it.
+        At departure the point lies ahead of the pose, at arrival behind it. The distance is the
+        straight length that an arc about a buoy needs before and after it; it is zero for poses
+        that are not on an arc.
         """
         lead_lengths = np.zeros(len(poses.positions))
         if poses.arc is not None:
@@ -443,7 +452,7 @@ class RouteSearch:
             else np.ones(len(arrival_points), dtype=bool)
         )
         target.sources = list(sources)
-        for group, source in enumerate(sources):
+        for source_index, source in enumerate(sources):
             departure_points, departure_lengths = self._path_ends(source, is_departure=True)
             usable = np.flatnonzero(np.isfinite(source.departure_cost))
             reachable = np.flatnonzero(is_clear)
@@ -483,8 +492,8 @@ class RouteSearch:
             improved = reachable[is_cheaper]
             target.cost[improved] = best[is_cheaper]
             path_type, pose = np.divmod(path_number[is_cheaper], len(usable))
-            target.origin[improved] = np.stack(
-                (np.full(len(improved), group), usable[pose], path_type), axis=-1
+            target.predecessor_indices[improved] = np.stack(
+                (np.full(len(improved), source_index), usable[pose], path_type), axis=-1
             )
         target.update_departure_cost()
 
@@ -562,7 +571,9 @@ class RouteSearch:
             on_arc = group.arc is not None and pose >= group.arc.start
             if on_arc and arc_angle > 0.0:
                 legs[0] += self.turn_room.lead_out
-                turn_specs.insert(0, TurnSpec(group.turn_sign, arc_angle, group.table, buoy))
+                turn_specs.insert(
+                    0, TurnSpec(group.turn_sign, arc_angle, group.turn_table_index, buoy)
+                )
                 legs.insert(0, self.turn_room.lead_in)
                 passed_buoys.insert(0, ())
             else:
@@ -573,7 +584,7 @@ class RouteSearch:
                     else 0.0
                 )
             source_number, source_pose, path_type = (
-                int(value) for value in group.origin[entry_pose]
+                int(value) for value in group.predecessor_indices[entry_pose]
             )
             source = group.sources[source_number]
             departure_points, _ = self._path_ends(source, is_departure=True)

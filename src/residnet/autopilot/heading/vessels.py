@@ -36,7 +36,7 @@ _STEADY_TOLERANCE = 0.1
 _MAX_OVERSHOOT = 0.02
 """Largest relative overshoot of the yaw rate of a first-order response."""
 _MAX_DURATION_FACTOR = 8
-"""Largest multiple of the requested duration that a turn is simulated."""
+"""Largest multiple of the requested duration for which a turn is simulated."""
 _N_ZIGZAG_SWITCHES = 6
 """Number of rudder reversals of a zigzag."""
 _STEPS_TO_FIRST_SWITCH = 25
@@ -57,7 +57,8 @@ class SteeredVessel(ABC):
     """A vessel whose first command is the steering angle: the rudder, or the stern planes.
 
     Attributes:
-        axis: controlled axis.
+        axis: controlled axis; `axis.value` is the name of the controlled state, and `axis.side` the
+            sign of the angle under a positive command.
         state: names of the columns of x.
         inputs: names of the columns of w.
         rate: rudder rate in rad/s; None for a rudder without a rate limit.
@@ -74,11 +75,16 @@ class SteeredVessel(ABC):
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
         """Build the dynamics for a time step of dt seconds.
 
-        The memory starts with the variation of each row (`steering_variation.VARIATION`).
+        The memory of each row starts with the variation of its steering, see `memory`.
         """
 
     def memory(self, variation: Tensor) -> Tensor:
-        """Return the initial memory of `model` for variations [B, 3]."""
+        """Return the initial memory of `model`.
+
+        Args:
+            variation: variation of the steering [B, 3]: factor of the rudder force, factor of the
+                time constants, and rudder bias in rad (`steering_variation.VARIATION`).
+        """
         return variation
 
     @abstractmethod
@@ -96,13 +102,16 @@ class SteeredVessel(ABC):
 
     @final
     def estimate_nomoto(self, angle: float, duration: float, dt: float = 0.02) -> NomotoModel:
-        """Estimate Nomoto's K and T (and c) at the service speed from simulated responses.
+        """Estimate Nomoto's K and T at the service speed from simulated responses.
+
+        If the controlled angle has a restoring moment, as the pitch angle has, the restoring
+        coefficient c is also estimated: T r_dot + r = K (delta - c psi).
 
         First the response to a rudder step is evaluated: K is the steady yaw rate per angle, and T
         is the area between the step response and its final value, minus the contribution of the
         rudder movement. If the yaw rate overshoots or does not become steady, K, T and a delay are
-        fitted to a zigzag instead. If the heading angle becomes steady, c follows from the final
-        angle, and K and T from a zigzag.
+        fitted to a zigzag instead. If the controlled angle (pitch) becomes steady, c follows from
+        the final angle, and K and T from a zigzag.
 
         Args:
             angle: rudder angle in rad.
@@ -146,9 +155,10 @@ class SteeredVessel(ABC):
                 f" within {times[-1]:.3g} s; the vessel cannot be steered (check the sign of its"
                 " rudder and the limit)"
             )
-        first_switch_time = float(times[reached_indices[0]])
+        expected_switch_time = float(times[reached_indices[0]])
         response = fit_response(
-            [self._simulate_zigzag(angle, angle, first_switch_time, dt)[0]], 0.5 * first_switch_time
+            [self._simulate_zigzag(angle, angle, expected_switch_time, dt)[0]],
+            0.5 * expected_switch_time,
         )
         return NomotoModel(gain=response.gain, time=response.time, speed=speed)
 
@@ -159,7 +169,7 @@ class SteeredVessel(ABC):
 
         Args:
             angle: constant rudder angle in rad.
-            final_angle: steady heading angle at this rudder angle in rad.
+            final_angle: steady value of the controlled angle (pitch) at this rudder angle in rad.
             speed: speed in m/s.
             dt: initial time step in s.
         """
@@ -170,12 +180,12 @@ class SteeredVessel(ABC):
                 " command)"
             )
         restoring = angle / final_angle
-        first_switch_time = 2.0 * self._longest_step(dt)
+        expected_switch_time = 2.0 * self._longest_step(dt)
         record, headings = self._simulate_zigzag(
-            angle, min(abs(angle), 0.5 * abs(final_angle)), first_switch_time, dt
+            angle, min(abs(angle), 0.5 * abs(final_angle)), expected_switch_time, dt
         )
         corrected_record = replace(record, rudder=record.rudder - restoring * headings)
-        response = fit_response([corrected_record], _STEPS_TO_FIRST_SWITCH * first_switch_time)
+        response = fit_response([corrected_record], _STEPS_TO_FIRST_SWITCH * expected_switch_time)
         return NomotoModel(float(response.gain), response.time, speed, restoring)
 
     def _longest_step(self, dt: float) -> float:
@@ -209,20 +219,20 @@ class SteeredVessel(ABC):
                     times.append(times[-1] + dt)
                     rates.append(rate_sign * float(x[0, r]))
                     headings.append(rate_sign * (float(x[0, psi]) - initial_heading))
-                # the step doubles: the beginning of the response needs short steps, its end only
-                # long ones
+                # the step doubles: the beginning of the response needs short steps; for its end,
+                # long steps are sufficient
                 dt = min(2.0 * dt, longest_step)
         return np.array(times), np.array(rates), np.array(headings)
 
     def _simulate_zigzag(
-        self, angle: float, switch_angle: float, first_switch_time: float, dt: float
+        self, angle: float, switch_angle: float, expected_switch_time: float, dt: float
     ) -> tuple[ManoeuvreRecord, Array]:
         """Simulate a zigzag manoeuvre and return its record and its headings.
 
         Args:
             angle: rudder angle in rad.
             switch_angle: heading change in rad at which the rudder is reversed.
-            first_switch_time: time in s of the first reversal.
+            expected_switch_time: expected time in s of the first reversal; sets the time step.
             dt: time step in s.
         """
         r = self.state_column(self.axis.rate)
@@ -231,7 +241,7 @@ class SteeredVessel(ABC):
         dt = (
             dt
             if longest_step <= dt
-            else min(max(first_switch_time / _STEPS_TO_FIRST_SWITCH, dt), longest_step)
+            else min(max(expected_switch_time / _STEPS_TO_FIRST_SWITCH, dt), longest_step)
         )
         model = self.model(dt)
         (x, w, s) = self._straight_state()
@@ -264,7 +274,11 @@ class SteeredVessel(ABC):
 
 
 def _is_steady(times: Array, rates: Array) -> bool:
-    """Return whether a yaw rate is steady over the second half of the simulation."""
+    """Return whether a yaw rate is steady over the second half of the simulation.
+
+    The result is also True if the yaw rate overshoots, because a longer simulation does not change
+    that.
+    """
     last_half = rates[np.searchsorted(times, 0.5 * times[-1]) :]
     steady = rates[-1]
     overshoots = np.abs(rates).max() > (1.0 + _STEADY_TOLERANCE) * abs(steady)
@@ -310,7 +324,7 @@ class SteeredPlant(SteeredVessel):
         return x, torch.stack([command_inputs.get(name, zero_input) for name in self.inputs], dim=1)
 
     def _simulate_run_up(self) -> Tensor:
-        """Simulate the acceleration at full drive and return the final state [1, nx]."""
+        """Simulate the acceleration at full propulsion command; returns the final state [1, nx]."""
         unit_speed = torch.ones(1, dtype=torch.float64)
         column = self.state_column("u")
         (x, w) = self.straight_course(unit_speed)
@@ -329,9 +343,10 @@ class SteeredPlant(SteeredVessel):
                 f" one reaches {float(x[0, column]):.3g} m/s"
             )
         course_state = self.plant.make_initial_state(1)
-        levelled_states = () if self.plant.attitude_columns else ("phi",)
+        # only a vessel with six degrees of freedom may heel on a straight course
+        zero_angles = () if self.plant.attitude_columns else ("phi",)
         retained = [
-            i for i, name in enumerate(self.state) if name not in (*_ZERO_STATES, *levelled_states)
+            i for i, name in enumerate(self.state) if name not in (*_ZERO_STATES, *zero_angles)
         ]
         course_state[:, retained] = x[:, retained]
         return course_state
@@ -352,8 +367,9 @@ def _identify_rudder_gear(plant: Plant, axis: Axis) -> tuple[float | None, float
 
     def rudder_rate_at(angle: float) -> float:
         w[:, command] = angle
-        step = float(plant.finish_step(x, w, dt)[0, column] - x[0, column]) / dt
-        return step + float(plant.derivative(x, w)[0, column])
+        # a gear moves by its derivative or at the end of the step (`finish_step`)
+        step_rate = float(plant.finish_step(x, w, dt)[0, column] - x[0, column]) / dt
+        return step_rate + float(plant.derivative(x, w)[0, column])
 
     rate_at_large = rudder_rate_at(1.0)
     rate_at_small = rudder_rate_at(0.02)
@@ -417,7 +433,10 @@ class SteeredModel(SteeredVessel):
             self.input_indices.append(vessel.inputs.index(command))
 
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
-        """Build the varied model with its own integrator; without memory, for any time step."""
+        """Build the model with varied steering and its own integrator.
+
+        A model without memory can be built for any time step.
+        """
         return VariedModel(
             self.hull,
             dt,
@@ -429,8 +448,9 @@ class SteeredModel(SteeredVessel):
         )
 
     def memory(self, variation: Tensor) -> Tensor:
-        """Return the variation followed by the initial memory of the head."""
-        return torch.cat((variation, variation.new_zeros(len(variation), self.hull.n_state)), dim=1)
+        """Return the variation, followed by the zero memory of the head (residual model)."""
+        initial_memory = variation.new_zeros(len(variation), self.hull.n_state)
+        return torch.cat((variation, initial_memory), dim=1)
 
     def straight_course(self, speed: Tensor) -> tuple[Tensor, Tensor]:
         x, w = self.vessel.straight_course(speed)

@@ -280,9 +280,9 @@ def monitor_run(
 
     if refit_folder is not None:
         require_refit_folder(run, refit_folder, config)
-    service = FittedModelService(config, run, logs, model, settings)
-    monitored_logs = service.monitor_logs()
-    refit_result = None if refit_folder is None else run_refit(service, refit_folder)
+    monitor = FittedModelService(config, run, logs, model, settings)
+    monitored_logs = monitor.monitor_logs()
+    refit_result = None if refit_folder is None else run_refit(monitor, refit_folder)
     return monitored_logs, refit_result
 
 

@@ -1,4 +1,4 @@
-"""Services of a finished fit: monitoring of new logs, recursive refit, planning of trials."""
+"""Operations on a finished fit: monitoring of new logs, recursive refit, planning of trials."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ if TYPE_CHECKING:
 _MAX_NAMED_CAUSES = 3
 """Maximum number of hypotheses in the text output."""
 _HOLD_OUT_RATIO = 3
-"""One of this many logs, the last ones, is held out to evaluate a refit."""
+"""One log in this many is held out to evaluate a refit; the last logs are taken."""
 _MAX_SHOWN_TRIALS = 12
 """Maximum number of candidate trials in the table."""
 
@@ -155,12 +155,12 @@ class MonitoredLog:
 
 
 class FittedModelService:
-    """A model in service with its change detector and new logs.
+    """A fitted model with its change detector and the new logs to be monitored.
 
     Args:
         config: config of the fit.
         run: folder of the fit.
-        log_paths: new logs, in the order of time.
+        log_paths: new logs, in chronological order.
         model: name of the model; `selected` for the model chosen on validation data.
         settings: keys of `MonitorConfig`.
 
@@ -187,9 +187,10 @@ class FittedModelService:
         self.run = run
         self.fitted_model = store.load(name)
         self.input_paths, _, self.logs = read_external_logs(config, log_paths)
-        # reference logs over ground like the new ones: the detector removes currents from both
-        clean_splits = prepare_splits(config.load_logs(), config)
-        reference_logs = [*clean_splits["train"], *clean_splits["validation"]]
+        # the reference logs contain velocities over ground, as do the new logs; the detector
+        # removes the current from both
+        reference_splits = prepare_splits(config.load_logs(), config)
+        reference_logs = [*reference_splits["train"], *reference_splits["validation"]]
         self.detector = ChangeDetector.from_logs(
             self.fitted_model.spec, self.fitted_model.model, reference_logs, monitor_config
         )
@@ -206,8 +207,8 @@ class FittedModelService:
             windows = self.detector.make_windows(log)
             online_detector.start_new_log()
             verdicts = [
-                online_detector.update_with_sums(window_sums)
-                for window_sums in self.detector.compute_sums(windows)
+                online_detector.update_with_sums(score_sums)
+                for score_sums in self.detector.compute_sums(windows)
             ]
             alarm_windows = np.flatnonzero([verdict.is_alarm for verdict in verdicts])
             alarm_time = (
@@ -228,9 +229,9 @@ def write_monitoring_page(folder: Path, logs: Sequence[MonitoredLog]) -> Path:
 
     Args:
         folder: folder of the page.
-        logs: results in the order of time.
+        logs: results in chronological order.
     """
-    step = logs[0].window_seconds / 60.0
+    window_minutes = logs[0].window_seconds / 60.0
     logs_with_alarm = [log for log in logs if log.alarm_time is not None]
     summary = [
         f"No alarm in {format_count(len(logs), 'log')}: the innovations are as those of the"
@@ -243,11 +244,11 @@ def write_monitoring_page(folder: Path, logs: Sequence[MonitoredLog]) -> Path:
             f" {likeliest_change.description}.",
             "Other causes may have similar effects: see the scores of all causes.",
         ]
-    log_end_times = step * np.cumsum([log.n_windows for log in logs])
+    log_end_times = window_minutes * np.cumsum([log.n_windows for log in logs])
     scores = np.concatenate([log.scores for log in logs])
     threshold = logs[0].final_verdict.threshold
     score_curves = {
-        "score": (step * (1.0 + np.arange(len(scores))), scores),
+        "score": (window_minutes * (1.0 + np.arange(len(scores))), scores),
         "threshold": (np.zeros(1), np.array([threshold])),
         "logs": (log_end_times, log_end_times),
     }
@@ -321,7 +322,8 @@ class RefitResult:
         folder: folder of the new run; None if no change was identified.
         old: mean free-run error (NRMSE) of the old model on the held-out logs.
         new: mean free-run error (NRMSE) of the new model on the held-out logs.
-        worth: whether the new model is significantly better by a paired interval.
+        worth: whether the new model is significantly better, by the 95 % confidence interval of the
+            paired differences.
     """
 
     recursive_refit: RecursiveRefit
@@ -387,51 +389,51 @@ def require_refit_folder(run: RunFolder, output_folder: Path, config: FitConfig)
     RunFolder(output_folder).require_usable(dump_config(config))
 
 
-def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
+def run_refit(monitor: FittedModelService, output_folder: Path) -> RefitResult:
     """Refit a model on the first two thirds of the new logs, and evaluate it on the others.
 
     The new run contains `constant_velocity`, the old model under its name, and the new model as
     `<name>_refit`.
 
     Args:
-        service: the model, its change detector and the new logs.
+        monitor: the model, its change detector and the new logs.
         output_folder: folder of the new run.
 
     Raises:
         UsageError: if the folder may not be used, or the model has no parameters to change.
         DataError: if there are fewer than two logs, or a log is too short.
     """
-    config = service.config
-    original_model = service.fitted_model
-    if len(service.logs) < 2:
+    config = monitor.config
+    original_model = monitor.fitted_model
+    if len(monitor.logs) < 2:
         raise DataError(
             "a refit needs at least two new logs, the last of which are held out to judge it; give"
             " more --logs, or cut the log into several"
         )
-    for log in service.logs:
+    for log in monitor.logs:
         check_window_fits(log, config)
-    n_held_out = max(len(service.logs) // _HOLD_OUT_RATIO, 1)
-    training_logs = service.logs[:-n_held_out]
-    held_out_logs = service.logs[-n_held_out:]
+    n_held_out = max(len(monitor.logs) // _HOLD_OUT_RATIO, 1)
+    training_logs = monitor.logs[:-n_held_out]
+    held_out_logs = monitor.logs[-n_held_out:]
     log_message(
         f"recursive refit of {original_model.name} on {len(training_logs)} logs, {n_held_out}"
         f" held out"
     )
     recursive_result = refit_recursively(
-        service.detector, [service.detector.make_windows(log) for log in training_logs]
+        monitor.detector, [monitor.detector.make_windows(log) for log in training_logs]
     )
     if not recursive_result.identified_changes:
         return RefitResult(recursive_result)
     refitted_model = make_refitted_model(original_model, recursive_result)
     provenance = Provenance(
-        service.run.resolved_config, (), config.seed, service.input_paths, time.time()
+        monitor.run.resolved_config, (), config.seed, monitor.input_paths, time.time()
     )
     result = RefitResult(recursive_result, output_folder)
 
     def evaluate_refit(folder: RunFolder) -> TaskOutcome:
         nonlocal result
         store = RunModelStore(folder)
-        models = service.run.models
+        models = monitor.run.models
         reference_names = [
             name
             for name in dict.fromkeys((CONSTANT_VELOCITY, original_model.name))
@@ -479,8 +481,8 @@ def run_refit(service: FittedModelService, output_folder: Path) -> RefitResult:
             {EXTERNAL_SPLIT: held_out_logs},
         )
         changes = [
-            f"{candidate_model['cause']} {candidate_model['size']:+.3g}"
-            for candidate_model in refitted_model.notes["refit_changes"]
+            f"{change['cause']} {change['size']:+.3g}"
+            for change in refitted_model.notes["refit_changes"]
         ]
         sentence = (
             f"The recursive refit ({', '.join(changes)}) is {'' if is_better else 'not '}worth"
@@ -504,8 +506,8 @@ class NextTrials:
     Attributes:
         model: name of the refitted baseline.
         plan: candidate and selected trials.
-        missing_excitation: for each input or direction that the training logs do not excite, a
-            sentence on the trial that would excite it.
+        missing_excitation: for each input or combination of two inputs that the training logs do
+            not excite, a sentence on the trial that would excite it.
     """
 
     model: str
@@ -561,17 +563,21 @@ class NextTrials:
     def _write(self, folder: Path) -> list[Path]:
         trials = folder / "next_trials.yaml"
         tracks = folder / "next_tracks.csv"
-        flights = [trial.simulated_run for trial in self.plan.selected_trials]
-        chosen = [flight.manoeuvre.model_dump(mode="json") for flight in flights]
+        simulated_runs = [trial.simulated_run for trial in self.plan.selected_trials]
+        chosen = [run.manoeuvre.model_dump(mode="json") for run in simulated_runs]
         states = [
-            name for name in SIX_DOF_LAYOUT.state_names if name in flights[0].true_log.channels
+            name
+            for name in SIX_DOF_LAYOUT.state_names
+            if name in simulated_runs[0].true_log.channels
         ]
         lines = [",".join(("manoeuvre", "t", *states))]
-        for motion in (flight.true_log for flight in flights):
-            every = max(round(1.0 / float(motion.t[1] - motion.t[0])), 1)
+        for motion in (run.true_log for run in simulated_runs):
+            # one row of the file per second
+            stride = max(round(1.0 / float(motion.t[1] - motion.t[0])), 1)
             rows = np.column_stack((motion.t, motion.stack(states)))
             lines += [
-                ",".join([motion.name, *(f"{value:.6g}" for value in row)]) for row in rows[::every]
+                ",".join([motion.name, *(f"{value:.6g}" for value in row)])
+                for row in rows[::stride]
             ]
         with atomic_write(trials) as file:
             file.write_text(yaml.safe_dump({"manoeuvres": chosen}, sort_keys=False))
@@ -579,7 +585,7 @@ class NextTrials:
             file.write_text("\n".join(lines) + "\n")
         curves = {
             motion.name: (motion["y"] - motion["y"][0], motion["x"] - motion["x"][0])
-            for motion in (flight.true_log for flight in flights)
+            for motion in (run.true_log for run in simulated_runs)
         }
         panel = Panel("north [m]", "east [m]", kind="map", height=300)
         figure = Figure(
@@ -607,8 +613,10 @@ def plan_next_trials(
             f"{run.path}: no baseline of this run was refitted through rollouts, so nothing says"
             " how sure its parameters are; add `refit` to the config"
         )
-    booklet = config.booklet
-    name = model or (booklet.model if booklet is not None else refitted_names[0])
+    manoeuvring_booklet = config.booklet
+    name = model or (
+        manoeuvring_booklet.model if manoeuvring_booklet is not None else refitted_names[0]
+    )
     if name not in refitted_names:
         raise UsageError(
             f"{run.path}: no refitted baseline '{name}'{suggest_name(name, refitted_names)}"
@@ -617,9 +625,10 @@ def plan_next_trials(
     fitted_model = RunModelStore(run).load(name)
     training_logs = logs["train"]
     refit = config.refit[name]
+    # the notes of the fit contain the weight of the prior that the refit used
     refit = refit.with_prior(float(fitted_model.notes.get("prior", refit.prior)))
     scales = config.evaluation.scales.to_array()
-    open_directions = estimate_refit_covariance(
+    refit_uncertainty = estimate_refit_covariance(
         fitted_model.model.double(),
         make_samples(training_logs, config.signals.build()),
         WindowStore.from_logs(training_logs, torch.float64),
@@ -629,19 +638,20 @@ def plan_next_trials(
     )
     divergence_bounds = divergence_limit(fitted_model.spec, config)
     goal = None
-    if booklet is None:
+    # the mapping from propulsion and steering command of a manoeuvre to the inputs of the model
+    if manoeuvring_booklet is None:
         input_shares = infer_input_shares(fitted_model.spec)
     else:
-        initial = {key: float(value) for key, value in booklet.initial.items()}
+        initial = {key: float(value) for key, value in manoeuvring_booklet.initial.items()}
         # manoeuvres of one kind are simulated in one batch
-        manoeuvres = sorted(booklet.manoeuvres, key=lambda manoeuvre: manoeuvre.kind)
-        goal = PredictionGoal(manoeuvres, booklet.duration, initial)
-        input_shares = booklet.inputs
+        manoeuvres = sorted(manoeuvring_booklet.manoeuvres, key=lambda manoeuvre: manoeuvre.kind)
+        goal = PredictionGoal(manoeuvres, manoeuvring_booklet.duration, initial)
+        input_shares = manoeuvring_booklet.inputs
     return NextTrials(
         name,
         plan_trials(
             fitted_model,
-            open_directions,
+            refit_uncertainty,
             refit,
             scales,
             input_shares,
@@ -659,7 +669,7 @@ def plan_next_trials(
 def advise_excitation(
     excitation: Mapping[str, Any], steering_inputs: Sequence[str]
 ) -> tuple[str, ...]:
-    """Return a sentence for each input or direction that the training logs do not excite.
+    """Return a sentence for each input or pair of inputs that the training logs do not excite.
 
     Args:
         excitation: contents of excitation.json; may be empty.
