@@ -10,6 +10,8 @@ import pytest
 import yaml
 from tiny import Command, read_json, write_yaml
 
+import residnet
+from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.io.drafting.questions import DraftNotes
 from residnet.physics.actuators.steering_gear import simulate_gear
@@ -108,6 +110,13 @@ def test_a_wrong_option_is_one_line(
     said = command("new", tmp_path, "--out", tmp_path / "a.yaml", *options)
     assert said.code == 2
     assert message in said.err
+
+
+def test_python_refuses_an_unknown_particular(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no argument 'bem'"):
+        residnet.draft_config(tmp_path, length="3.22 m", bem=0.5)
+    with pytest.raises(UsageError, match="needs --length too"):
+        residnet.draft_config(tmp_path, scale=50.0)
 
 
 @pytest.mark.long

@@ -44,6 +44,7 @@ from residnet.preprocessing.prepare import prepare_log as prepare_log
 from residnet.quality import inspect_log as examine
 from residnet.quality import inspect_log_set
 from residnet.tasks.drafting import ConfigDraft, choose_inputs, draft_fit_config
+from residnet.tasks.naval_draft import NavalParticulars
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -220,6 +221,9 @@ def draft_config(
     folder: PathLikeArg = ".",
     answer: Callable[[Question], str] | None = None,
     progress: ProgressCallback | None = None,
+    length: str | float | None = None,
+    scale: float | None = None,
+    **particulars: str | float,
 ) -> ConfigDraft:
     """Draft a complete config of a fit from logs of any format.
 
@@ -234,6 +238,10 @@ def draft_config(
         answer: called with each question that the logs do not answer; returns the answer. None
             for the default answers.
         progress: called with the progress of the reading.
+        length: length of the vessel in the logs, such as "3.22 m", for a manoeuvring booklet and
+            hydrodynamic derivatives; None for neither.
+        scale: length of the ship divided by that of the vessel in the logs.
+        **particulars: `beam`, `draught` and `mass` in the scale of the logs.
 
     Returns:
         The draft: `config` for `residnet.run`, `guesses` as pairs of key and reason, `text` as
@@ -249,9 +257,15 @@ def draft_config(
     sources = list(logs) if isinstance(logs, list | tuple) else [logs]
     if not sources:
         raise UsageError("draft_config: no log is given; name files, folders or bags")
+    unknown = [key for key in particulars if key not in ("beam", "draught", "mass")]
+    if unknown:
+        raise UsageError(
+            f"draft_config: no argument '{unknown[0]}'; particulars are beam, draught and mass"
+        )
+    naval = NavalParticulars.from_options(length, scale, particulars)
     with forward_progress(progress):
         paths = [parse_path(log_source, "draft_config") for log_source in sources]
-        return draft_fit_config(paths, Path(folder), name, answer)
+        return draft_fit_config(paths, Path(folder), name, answer, naval=naval)
 
 
 class WindowSettings(Config):

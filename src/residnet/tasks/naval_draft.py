@@ -56,7 +56,10 @@ class NavalParticulars:
 
     @classmethod
     def from_options(
-        cls, length: str | None, scale: float | None, options: Mapping[str, str | None]
+        cls,
+        length: str | float | None,
+        scale: float | None,
+        options: Mapping[str, str | float | None],
     ) -> NavalParticulars | None:
         """Return the particulars of a command line; None without a length.
 
@@ -84,7 +87,7 @@ class NavalParticulars:
         return cls(values.pop("length"), ratio, values)
 
 
-def _to_number(text: str) -> float | str:
+def _to_number(text: str | float) -> float | str:
     try:
         return float(text)
     except ValueError:
