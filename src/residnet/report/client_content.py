@@ -400,7 +400,7 @@ def _validation_section(
         )
     )
     for file, width in (
-        ("track.svg", 0.6),
+        ("track.svg", 0.85),
         ("booklet_zigzags_1.svg", 1.0),
         ("repeated_indices.svg", 1.0),
     ):
