@@ -221,6 +221,20 @@ def test_a_field_of_px4_that_a_config_names(tmp_path: Path) -> None:
     ]
 
 
+def test_text_log_of_ardurover_2_46(tmp_path: Path) -> None:
+    pytest.importorskip("pymavlink")
+    log = trial(60.0)
+    path = written_recorders.ardurover_246(log, tmp_path)
+    reader = residnet.draft_config(path).config["data"]["reader"]
+    assert {"cmd_delta", "cmd_throttle", "servo_1"} <= set(reader["channels"])
+    (got,) = residnet.read_logs([path])
+    for name, tolerance in {"x": 1e-4, "y": 1e-4, "psi": 1e-4, "u": 2e-4, "v": 2e-4}.items():
+        np.testing.assert_allclose(got[name], log[name], atol=tolerance, err_msg=name)
+    # 2000 hundredths of a degree are 20 deg
+    assert np.degrees(np.abs(got["cmd_delta"]).max()) == pytest.approx(20.0, abs=0.1)
+    assert got["cmd_throttle"].max() == pytest.approx(0.49, abs=0.01)
+
+
 def test_ardupilot_of_2014_counts_milliseconds(tmp_path: Path) -> None:
     log = trial(20.0)
     got = reader_for(path := written_recorders.ardupilot_2014(log, tmp_path)).read(path)

@@ -174,6 +174,34 @@ def ardupilot_2014(log: Log, folder: Path) -> Path:
     return path
 
 
+def ardurover_246(log: Log, folder: Path) -> Path:
+    """ArduRover 2.46 as text: the filter EKF1, steering and throttle of CTUN, pulses of RCOU."""
+    north, east = _over_ground(log)
+    lines = [
+        "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns",
+        "FMT, 150, 13, ATT, IccC, TimeMS,Roll,Pitch,Yaw",
+        "FMT, 151, 31, IMU, Iffffff, TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ",
+        "FMT, 152, 49, EKF1, IccCffffffccc, TimeMS,Roll,Pitch,Yaw,VN,VE,VD,PN,PE,PD,GX,GY,GZ",
+        "FMT, 153, 23, RCOU, Ihhhhhhhh, TimeMS,Ch1,Ch2,Ch3,Ch4,Ch5,Ch6,Ch7,Ch8",
+        "FMT, 154, 19, CTUN, Ihcchf, TimeMS,Steer,Roll,Pitch,ThrOut,AccY",
+    ]
+    for i, t in enumerate(log.t.tolist()):
+        ms = BOOT // 1000 + round(1000 * t)
+        yaw = np.degrees(log["psi"][i]) % 360.0
+        steer = np.sin(0.3 * t)
+        lines += [
+            f"ATT, {ms}, 0.0, 0.0, {yaw:.2f}",
+            f"IMU, {ms}, 0.0, 0.0, {log['r'][i]:.6f}, 0.0, 0.0, -9.8",
+            f"EKF1, {ms}, 0.0, 0.0, {yaw:.2f}, {north[i]:.4f}, {east[i]:.4f}, 0.0,"
+            f" {log['x'][i]:.4f}, {log['y'][i]:.4f}, 0.0, 0.0, 0.0, 0.0",
+            f"RCOU, {ms}, {round(1500 + 100 * steer)}, 1500, 1600, 0, 0, 0, 0, 0",
+            f"CTUN, {ms}, {round(2000 * steer)}, 0.0, 0.0, {40 + round(9 * np.cos(t))}, 0.0",
+        ]
+    path = folder / "12.log"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
 def _over_ground(log: Log) -> tuple[np.ndarray, np.ndarray]:
     """Velocities along north and east."""
     c, s = np.cos(log["psi"]), np.sin(log["psi"])

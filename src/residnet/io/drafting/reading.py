@@ -184,9 +184,11 @@ def draft_recordings(
         if name in known_channels or name in channels:
             continue
         if (known := _known_command(aligned[0], topic, field)) is not None:
-            text = f"the format defines {field} in {known[1]}"
+            settings_of_format = known[1]
+            scale_text = f"{settings_of_format.get('scale', 1.0):g} " * ("scale" in known[1])
+            text = f"the format defines {field} in {scale_text}{settings_of_format['unit']}"
             draft_notes.add_note((*CHANNELS_KEY, name), text)
-            channels[name] = {"topic": topic, "field": field, "unit": known[1], "hold": True}
+            channels[name] = {"topic": topic, "field": field, **settings_of_format, "hold": True}
             continue
         values = _concatenate_field(aligned, topic, field)
         scaling = guess_scaling(name, field, values) or infer_unit(name, field, values)
@@ -875,8 +877,10 @@ def _find_actuator_fields(
             yield f"{channel}_{number}" if len(numbered_fields) > 1 else channel, topic_field
 
 
-def _known_command(recording: Recording, topic: str, field: str) -> tuple[str, str] | None:
-    """Return channel and unit of a command that the format of the recording defines, or None."""
+def _known_command(
+    recording: Recording, topic: str, field: str
+) -> tuple[str, dict[str, Any]] | None:
+    """Return channel and settings of a command that the format defines, or None."""
     series = recording.series.get(topic)
     message_type = series.message_type.rsplit("/", 1)[-1] if series is not None else ""
     return KNOWN_COMMANDS.get((message_type, field))

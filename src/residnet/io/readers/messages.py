@@ -363,13 +363,16 @@ def _make_field_plan(
     return make_plan
 
 
-KNOWN_COMMANDS: dict[tuple[str, str], tuple[str, str]] = {
-    ("Variables", "DESIRED_THRUST"): ("cmd_throttle", "%"),
-    ("Variables", "DESIRED_THRUST_L"): ("cmd_throttle_port", "%"),
-    ("Variables", "DESIRED_THRUST_R"): ("cmd_throttle_stbd", "%"),
+KNOWN_COMMANDS: dict[tuple[str, str], tuple[str, dict[str, Any]]] = {
+    ("Variables", "DESIRED_THRUST"): ("cmd_throttle", {"unit": "%"}),
+    ("Variables", "DESIRED_THRUST_L"): ("cmd_throttle_port", {"unit": "%"}),
+    ("Variables", "DESIRED_THRUST_R"): ("cmd_throttle_stbd", {"unit": "%"}),
+    ("CTUN", "Steer"): ("cmd_delta", {"unit": "deg", "scale": 0.01}),
+    ("CTUN", "ThrOut"): ("cmd_throttle", {"unit": "%"}),
 }
-"""Message type without package and field of a command whose unit the format defines -> channel,
-unit. MOOS-IvP: thrust from -100 to 100 per cent (documentation of pMarinePID and uSimMarine)."""
+"""Message type without package and field of a command whose unit the format defines -> channel and
+settings. MOOS-IvP: thrust from -100 to 100 per cent (documentation of pMarinePID and uSimMarine).
+ArduRover to 3.x: steering from -4500 to 4500 (hundredths of a degree), throttle in per cent."""
 
 
 MESSAGE_KINDS = (
