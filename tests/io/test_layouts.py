@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
-from residnet.core.errors import ConfigError, DataError, UsageError
+import residnet
+from residnet.core.errors import ConfigError, DataError, ResidnetError, UsageError
 from residnet.core.log import Log
 from residnet.core.units import to_si
 from residnet.io.drafting.problems import (
@@ -179,6 +181,23 @@ def test_forces_by_their_units_and_speed_by_its_letter() -> None:
     }
     speed = match_channels(["X", "Y", "Heading", "V [m/s]", "Drift angle", "Rudder"], DraftNotes())
     assert "V [m/s]" not in speed.values()
+
+
+@pytest.mark.parametrize(
+    ("arrays", "advice"),
+    [
+        ({"a": np.arange(50.0), "b": np.arange(50.0)}, "name the vector of times t "),
+        ({"t": np.arange(50.0), "b": np.sin(np.arange(50.0))}, "rename the fields, for example"),
+    ],
+)
+def test_advice_on_files_alone_needs_no_config(
+    arrays: dict[str, np.ndarray], advice: str, tmp_path: Path
+) -> None:
+    savemat(tmp_path / "run.mat", arrays)
+    with pytest.raises(ResidnetError, match=advice) as refused:
+        residnet.read_logs([tmp_path / "run.mat"])
+    assert str(refused.value).startswith(f"{tmp_path / 'run.mat'}: ")
+    assert "set " not in str(refused.value)
 
 
 STEERING = {

@@ -38,14 +38,27 @@ def raise_unreadable(errors: Mapping[Path, ResidnetError]) -> NoReturn:
 def without_channel_map(error: ResidnetError) -> ResidnetError:
     """Return an error of a drafted reader with advice that needs no channel map.
 
-    A user who gives only files has no channel map to correct.
+    A user who gives only files has no channel map to correct, and no keys of a config.
     """
-    message = re.sub(
+    message = str(error)
+    for advice, advice_for_files in _ADVICE_FOR_FILES:
+        message = re.sub(advice, advice_for_files, message)
+    return error if message == str(error) else DataError(message)
+
+
+_ADVICE_FOR_FILES = (
+    (
         r"remove (it|them) from the channel map(, or leave the file out)?",
         r"fill \1 with values, or leave the file out",
-        str(error),
-    )
-    return error if message == str(error) else DataError(message)
+    ),
+    (
+        r"no channel is mapped; set `channels`, `position` and `heading`",
+        "no field has the name of a channel; rename the fields, for example to x, y, psi, u, v, r,"
+        " delta, n",
+    ),
+    (r"set time: \{column: \.\.\.\}", "name the vector of times t"),
+)
+"""Advice for users of a config, as a pattern -> advice for users of files alone."""
 
 
 def strip_file_name(paths: Iterable[Path], message: str) -> str:

@@ -1034,7 +1034,10 @@ def read_drafted(
     elif log_kind == "table":
         result.reader, result.errors = draft_tables(paths, draft_notes)
     elif log_kind != "canonical":
-        result.reader, recordings = draft_recordings(paths, draft_notes)
+        try:
+            result.reader, recordings = draft_recordings(paths, draft_notes)
+        except ResidnetError as error:
+            raise without_channel_map(error) from None
     settings = {key: value for key, value in result.reader.items() if is_gridded or key != "clock"}
     reader = validate_config(settings, ReaderConfig, "draft").build()
     names = assign_log_names(paths)
