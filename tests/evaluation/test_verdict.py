@@ -182,6 +182,21 @@ def test_the_first_sentence_compares_with_zero_and_the_baseline() -> None:
     )
 
 
+def test_logs_that_trained_the_model_are_not_external_data() -> None:
+    known = evidence(split="external", n_logs=2, n_logs_of_fit=2)
+    sentences = write_verdict(known)
+    assert sentences[0].startswith("On data of the fit model mlp is 60 % better")
+    assert sentences[1].startswith(
+        "The rating is at most limited, because 2 of 2 logs trained the model (same SHA-256)"
+    )
+    assert "external" not in " ".join(sentences)
+    partly_known = write_verdict(evidence(split="external", n_logs=3, n_logs_of_fit=1))
+    assert partly_known[0].startswith("On external data")
+    assert "1 of 3 logs trained the model" in partly_known[1]
+    new = write_verdict(evidence(split="external", n_logs=3))
+    assert "trained the model" not in " ".join(new)
+
+
 def test_what_is_worse_than_zero_or_the_baseline_is_objected_to() -> None:
     assert list_model_objections(evidence(0.2)) == []
     assert list_model_objections(evidence(0.3)) == [

@@ -67,6 +67,8 @@ class VerdictEvidence:
         one_sided_text: finding of the data checks on logs without turns to both sides; free runs on
             such logs cannot validate the turning motion.
         excitation: contents of excitation.json; None for runs of earlier versions.
+        n_logs: number of logs of the free runs; 0 if unknown.
+        n_logs_of_fit: number of them that are among the data of the fit, by their SHA-256.
     """
 
     selected: str
@@ -79,6 +81,25 @@ class VerdictEvidence:
     protocol: str = ""
     one_sided_text: str = ""
     excitation: ExcitationFile | None = None
+    n_logs: int = 0
+    n_logs_of_fit: int = 0
+
+    @property
+    def data_name(self) -> str:
+        """Name of the data in sentences; logs that trained the model are not external."""
+        if self.n_logs_of_fit and self.n_logs_of_fit == self.n_logs:
+            return "data of the fit"
+        return f"{self.split} data"
+
+    @property
+    def logs_of_fit_text(self) -> str:
+        """Limitation by logs that trained the model; empty if there are none."""
+        if not self.n_logs_of_fit:
+            return ""
+        return (
+            f"{self.n_logs_of_fit} of {format_count(self.n_logs, 'log')} trained the model (same"
+            " SHA-256), so that the errors do not show how well it predicts new data"
+        )
 
 
 LEVEL_TEXTS = {
@@ -121,7 +142,11 @@ def write_verdict(evidence: VerdictEvidence) -> list[str]:
     lead_sentence, *horizon_sentences = (
         [compare_velocity_errors(evidence)] if is_useless(evidence) else describe_horizons(evidence)
     )
-    limitations = [evidence.one_sided_text, *list_unidentifiable_inputs(evidence)]
+    limitations = [
+        evidence.logs_of_fit_text,
+        evidence.one_sided_text,
+        *list_unidentifiable_inputs(evidence),
+    ]
     sentences = [
         lead_sentence,
         *(
@@ -149,7 +174,11 @@ def rate_model(evidence: VerdictEvidence) -> str:
     horizons = known_horizons(evidence)
     if horizons and not any(_has_enough_data(evidence, horizon.row) for horizon in horizons):
         return TOO_FEW_WINDOWS
-    has_limitation = bool(evidence.one_sided_text) or bool(list_unidentifiable_inputs(evidence))
+    has_limitation = (
+        bool(evidence.logs_of_fit_text)
+        or bool(evidence.one_sided_text)
+        or bool(list_unidentifiable_inputs(evidence))
+    )
     return GOOD_LEVEL if longest_good_horizon(evidence) and not has_limitation else LIMITED_LEVEL
 
 
@@ -308,7 +337,7 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
         lead_sentence = (
             f"{format_count(main_row.windows, 'window')} of"
             f" {format_count(main_row.logs, 'log')} on"
-            f" {evidence.split} data cannot say how good {evidence.selected} is ({_MIN_WINDOWS} of"
+            f" {evidence.data_name} cannot say how good {evidence.selected} is ({_MIN_WINDOWS} of"
             f" {MIN_LOGS_FOR_INTERVAL} logs are needed); {horizon_text} it is off by {error_text}."
         )
     elif longest_horizon:
@@ -421,7 +450,7 @@ def list_model_objections(evidence: VerdictEvidence) -> list[str]:
     if selected_row is None:
         return []
     return [
-        f"on {evidence.split} data its NRMSE is {format_number(selected_row.mean_nrmse)}, that"
+        f"on {evidence.data_name} its NRMSE is {format_number(selected_row.mean_nrmse)}, that"
         f" of {reference_name}"
         f" {format_number(reference_row.mean_nrmse)}"
         for reference_name in dict.fromkeys((CONSTANT_VELOCITY, evidence.baseline))
@@ -448,7 +477,7 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
     baseline.
     """
     model_name = evidence.selected
-    split = evidence.split
+    data_name = evidence.data_name
     if model_name == CONSTANT_VELOCITY:
         return (
             "NOTHING BEATS CONSTANT VELOCITY, which keeps the initial velocities of each free"
@@ -457,14 +486,14 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
     selected_row = evidence.rows_by_model.get(model_name)
     constant_velocity_row = evidence.rows_by_model.get(CONSTANT_VELOCITY)
     if selected_row is None:
-        return f"The run holds no free runs of its selected model on {split} data."
+        return f"The run holds no free runs of its selected model on {data_name}."
     selected_nrmse = selected_row.mean_nrmse
     if constant_velocity_row is not None and is_useless(evidence):
         comparison_text = (
             "NO BETTER" if selected_row.mean_nrmse <= constant_velocity_row.mean_nrmse else "WORSE"
         )
         return (
-            f"{comparison_text} THAN CONSTANT VELOCITY: on {split} data the selected model"
+            f"{comparison_text} THAN CONSTANT VELOCITY: on {data_name} the selected model"
             f" {model_name} has an NRMSE of"
             f" {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}, and the"
             " constant-velocity model"
@@ -494,7 +523,7 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
         )
     comparison_clause = f" is {' and '.join(comparisons)};" if comparisons else ""
     return (
-        f"On {split} data model {model_name}{comparison_clause} its NRMSE is"
+        f"On {data_name} model {model_name}{comparison_clause} its NRMSE is"
         f" {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}."
     )
 
@@ -524,13 +553,13 @@ def describe_extrapolation(evidence: VerdictEvidence) -> str:
         return ""
     outside_share = limits.outside.share
     if outside_share == 0:
-        return f"All {evidence.split} data lie inside the range of the training data."
+        return f"All {evidence.data_name} lie inside the range of the training data."
     channels = sorted(limits.outside.channels.items(), key=lambda pair: -pair[1])[:3]
     channel_texts = ", ".join(
         f"{name} {_format_percent(channel_share)}" for name, channel_share in channels
     )
     return (
-        f"Of the {evidence.split} data, {_format_percent(outside_share)} lies outside the range"
+        f"Of the {evidence.data_name}, {_format_percent(outside_share)} lies outside the range"
         f" of the training"
         f" data ({channel_texts}); these runs are the only evidence on the model there."
     )

@@ -81,6 +81,11 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
         for finding in (() if inspection is None else inspection.together)
         if finding.code == "one_side" and finding.level != "note"
     )
+    # only the evaluation on other logs names those of the fit
+    fit_marks = [
+        any(finding.code == "log_of_fit" for finding in log.findings)
+        for log in (() if inspection is None or split != "external" else inspection.logs)
+    ]
     return VerdictEvidence(
         selected,
         split,
@@ -92,6 +97,8 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
         protocol,
         next(one_sided_texts, ""),
         run.read_record(ExcitationFile, "excitation.json"),
+        len(fit_marks),
+        sum(fit_marks),
     )
 
 
