@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from residnet.core.config import dump_config
 from residnet.core.errors import DataError, UsageError
+from residnet.core.files import read_json
 from residnet.core.model_names import CONSTANT_VELOCITY, PLANT
 from residnet.core.names import suggest_name
 from residnet.core.progress import begin_stage, log_message
@@ -222,29 +223,29 @@ def export_model(config: FitConfig, request: ExportRequest) -> Path:
     )
     is_ensemble = model_name == metrics.selected_ensemble and model_name != metrics.selected
     if is_ensemble and get_exporter(request.file_format).is_for_microcontrollers:
-        log_message(f"  {describe_single_model(run, model_name, metrics.selected)}")
+        card = read_json(file.with_suffix(".card.json"))
+        ensemble_bytes = int(card["size"]["code_bytes"])
+        text = describe_single_model(run, model_name, metrics.selected, ensemble_bytes)
+        log_message(f"  {text}")
     return file
 
 
-def describe_single_model(run: RunFolder, ensemble: str, single: str) -> str:
+def describe_single_model(run: RunFolder, ensemble: str, single: str, ensemble_bytes: int) -> str:
     """Compare code size and validation error of the selected single model with the ensemble.
 
     Args:
         run: the finished run.
         ensemble: name of the ensemble that is exported.
         single: name of the selected single model.
+        ensemble_bytes: bytes of code and constants of the exported ensemble.
 
     Returns:
         A sentence with the command that exports the single model.
     """
     from residnet.export.c import measure_c_export
 
-    sizes = {
-        name: measure_c_export(ExportedVessel(*load_model(run.models / name)))
-        for name in (single, ensemble)
-    }
-    size = sizes[single]
-    share = sizes[ensemble]["code_bytes"] / max(size["code_bytes"], 1)
+    size = measure_c_export(ExportedVessel(*load_model(run.models / single)))
+    share = ensemble_bytes / max(size["code_bytes"], 1)
     selection = RunFiles(run.path).selection
     rows = {row.model: row for row in selection.models} if selection is not None else {}
     error_text = ""
