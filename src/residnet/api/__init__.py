@@ -1,1 +1,1 @@
-"""What `import residnet` offers, in plain Python values; a name is loaded when it is first used."""
+"""Public interface of residnet in plain Python values; names are loaded when first used."""

@@ -1,4 +1,4 @@
-"""Fit in Python: baselines, heads and ensembles by name, evaluated in free run along logs."""
+"""Fit baselines, heads (residual models) and ensembles by name, evaluated in free run."""
 
 from __future__ import annotations
 

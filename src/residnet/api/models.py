@@ -423,8 +423,8 @@ def export_model(
         model: the model.
         file: file to write.
         format: one of `list_available("formats")`.
-        metrics: rows of `FreeRuns.rows`. The rows of this model are copied to the card; the rows of
-            `constant_velocity` and of a baseline under the same protocol are its reference.
+        metrics: rows of `FreeRuns.rows`. The rows of this model are copied to the model card; the
+            rows of `constant_velocity` and of a baseline under the same protocol are its reference.
         allows_objections: export the model even if it is worse than its reference; the card
             states this.
 
@@ -543,7 +543,7 @@ class Monitor:
         `residnet.free_run`, before the new one goes into service.
 
         Args:
-            new_data: logs of the changed vessel in the order of time, from
+            new_data: logs of the changed vessel in chronological order, from
                 `residnet.prepare(logs, settings_from=data)`.
 
         Returns:

@@ -1,4 +1,4 @@
-"""Training of a network head by the user's own `lightning.Trainer`."""
+"""Training of a neural network (head: residual model) by the user's own `lightning.Trainer`."""
 
 from __future__ import annotations
 

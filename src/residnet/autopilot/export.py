@@ -404,8 +404,8 @@ class ExportedController(Exportable):
         name: name of the policy.
         policy: policy with its final time step.
         fallback: command for invalid inputs.
-        description: description of vessel, training or course for the card.
-        metrics: rows of metrics.json of this policy for the card.
+        description: description of vessel, training or course for the model card.
+        metrics: rows of metrics.json of this policy for the model card.
     """
 
     schema: str
@@ -454,7 +454,7 @@ class ExportedController(Exportable):
 
     @abstractmethod
     def describe_for_card(self, module: Any) -> dict[str, Any]:
-        """Return the fields of the card that depend on the type of policy."""
+        """Return the fields of the model card that depend on the type of policy."""
 
     def build_module(self, dtype: torch.dtype) -> nn.Module:
         inner = self.build_controller(dtype)

@@ -76,7 +76,8 @@ class ChannelRoles(NamedTuple):
             subject: name of the set in the error message.
 
         Raises:
-            ConfigError: if an input has no role, or no channel has the role of drive or steer.
+            ConfigError: if an input has no role, or no channel has the role of propulsion or
+                steering.
         """
         if self.unassigned:
             raise ConfigError(

@@ -80,7 +80,7 @@ class SteeringBaselineConfig(IdentifiedConfig, ABC):
             ConfigError: if a required channel is missing.
         """
         velocities = get_dof(names).velocities
-        # a model of surge only needs no steering channel, and one without surge no drive
+        # a model of surge only needs no steering channel, and one without surge no propulsion
         driving = (
             [self.drive] if velocities == ("u",) else [self.steer] if "u" not in velocities else []
         )
@@ -125,8 +125,8 @@ class NomotoLagConfig(SteeringBaselineConfig, ABC):
 class NomotoBaselineConfig(NomotoLagConfig):
     """Nomoto model of first order, T r_dot + r = K steer + b.
 
-    Surge is a first-order lag of the drive. Sway, which the model does not describe, decays with T.
-    If the model has only surge or only yaw, only its lag is identified.
+    Surge is a first-order lag of the propulsion command. Sway, which the model does not describe,
+    decays with T. If the model has only surge or only yaw, only its lag is identified.
     """
 
     required_velocities = ()

@@ -1,8 +1,8 @@
 """Types of the values in the JSON files of a run that are read without a typed record.
 
 These are metrics.json, where a model is looked up by its alias, and fit.json, whose notes depend on
-the head. Other keys are not checked. A value of a wrong type raises an error that names the file
-and the key.
+the head (residual model). Other keys are not checked. A value of a wrong type raises an error that
+names the file and the key.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ MAX_TABLE_BYTES: Final = 16_384
 
 
 class InputRelation(Config):
-    """What an input follows in the logs: offset + sum of gains times channels, within a tolerance.
+    """Relation of an input to channels of the logs: offset + sum of gains times channels.
 
     Attributes:
         input: name of the input.

@@ -1,9 +1,10 @@
 """The hybrid model, nu_dot = baseline + residual (Woo et al. 2018, eq. (19)), and its innovations.
 
-A residual in force space acts through the head's mass. A head may receive the filtered one-step
-prediction error (innovation) of the measured past, from which it can infer unmeasured wind: the
-velocities at each step are compared with the prediction of the previous step. In a free run the
-state is the prediction, so that the innovation is zero. One step therefore serves both cases.
+A residual in force space acts through the mass of the head (residual model). A head may receive the
+filtered one-step prediction error (innovation) of the measured past, from which it can infer
+unmeasured wind: the velocities at each step are compared with the prediction of the previous step.
+In a free run the state is the prediction, so that the innovation is zero. One step therefore serves
+both cases.
 """
 
 from __future__ import annotations

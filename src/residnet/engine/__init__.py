@@ -1,1 +1,1 @@
-"""What follows from one trace of the step: compiled rollouts, adjoints and Jacobians."""
+"""Results of one trace of the step: compiled rollouts, adjoints and Jacobians."""

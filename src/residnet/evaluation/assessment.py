@@ -1,4 +1,4 @@
-"""Assessment of a model and its logs, for the card of every export."""
+"""Assessment of a model and its logs, for the metadata (model card) of every export."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from residnet.core.records import Record
 
 SPLIT_NAMES = {"train": "identification"}
-"""Names of splits in cards, where they differ from those in the run."""
+"""Names of splits in model cards, where they differ from those in the run."""
 
 
 class CardFinding(Record):
@@ -45,7 +45,7 @@ class Assessment(Record):
 
 
 def name_splits(logs: Sequence[tuple[str, str]]) -> dict[str, tuple[str, ...]] | None:
-    """Return the logs of each split under the names of cards; None without logs.
+    """Return the logs of each split under the names of model cards; None without logs.
 
     Args:
         logs: split and name of each log.

@@ -45,7 +45,8 @@ class BookletConfig(Config):
         model: name of the baseline.
         length: length of the hull in the scale of the logs, m.
         scale: scale ratio of ship and logs (Froude's law); 1 for full-scale logs.
-        inputs: inputs of the model with their shares of drive and steer, limits and rates.
+        inputs: inputs of the model with their shares of propulsion command and steering command,
+            limits and rates.
         initial: initial states by name.
         manoeuvres: standard manoeuvres.
         duration: duration of manoeuvres that define none, and time limit of the others.

@@ -382,7 +382,7 @@ def _find_operating_point(
     input_names: Sequence[str],
     speed: float,
 ) -> _OperatingPoint:
-    """Find the common share of the drives' training range at which surge is in equilibrium."""
+    """Find the common share of the propulsion inputs' training ranges with surge in equilibrium."""
     lower = torch.tensor(spec.low[3 : 3 + len(input_names)], dtype=torch.float64)
     upper = torch.tensor(spec.high[3 : 3 + len(input_names)], dtype=torch.float64)
     drive_mask = torch.tensor([is_drive(name) for name in input_names], dtype=torch.float64)

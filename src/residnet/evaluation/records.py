@@ -430,7 +430,7 @@ class ProtocolLimits(Record):
 
 
 class RepeatTolerance(Record):
-    """How much two repeated runs may differ.
+    """Largest differences of two runs that count as repeated.
 
     Attributes:
         command_share_of_range: root mean square difference of each command over its range.
@@ -526,7 +526,7 @@ class LimitsFile(FileRecord):
 
 
 class Activity(Record):
-    """How the width of a prediction interval depends on the motion of the run.
+    """Dependence of the width of a prediction interval on the motion of the run.
 
     Attributes:
         measures: velocities and accelerations whose mean squares measure the motion.
@@ -544,7 +544,7 @@ class Activity(Record):
 
 
 class DistanceEffect(Record):
-    """How the width of a prediction interval grows with the distance to the training data.
+    """Growth of the width of a prediction interval with the distance to the training data.
 
     The distance is the running mean of half the logarithm of the inverse Christoffel function over
     its mean in the training data.
@@ -744,7 +744,7 @@ class SanityFile(FileRecord):
 
 
 class InputExcitationRow(Record):
-    """How the training logs excite one input that is a regressor of the model.
+    """Excitation in the training logs of one input that is a regressor of the model.
 
     Attributes:
         name: name of the input.

@@ -386,9 +386,9 @@ class OperatingPoint:
 def find_operating_points(spec: ModelSpec, model: HybridDynamics) -> list[OperatingPoint]:
     """Return operating points of straight motion from zero to 1.5 times the training speed.
 
-    The drive of each point holds its speed approximately. All inputs that do not steer move
-    together from the lower to the upper end of their ranges; rudders are amidships and there is no
-    wind, as far as the ranges allow.
+    The propulsion command of each point holds its speed approximately. All inputs that do not steer
+    move together from the lower to the upper end of their ranges; rudders are amidships and there
+    is no wind, as far as the ranges allow.
     """
     input_names = spec.signals.input_columns
     dof = spec.signals.dof

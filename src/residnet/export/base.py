@@ -1,4 +1,4 @@
-"""Interfaces shared by all export formats: exported step, card, writer and parity check.
+"""Interfaces shared by all export formats: exported step, model card, writer and parity.
 
 A vessel model, a heading policy, a course policy and a feed-forward are all exported as a step with
 fixed arguments that is called once per `dt` and receives and returns the memory. In every format a
@@ -13,8 +13,8 @@ The methods of an exported vessel model, with batch size B in all tensors:
 - `rollout(x0, w, s) -> (x, s, outside)`: states [B, T+1, nx] from x0 under inputs w [B, T, m],
   memory after the last step, and flag of each step [B, T].
 - `band(k) -> half widths` of the prediction bands of u, v, r, heading and position (and p, phi for
-  a vessel with roll) k steps after a measured state. Formats without methods have the table in the
-  card as `band`.
+  a vessel with roll) k steps after a measured state. Formats without methods have the table in
+  the metadata (model card) as `band`.
 
 A controller has `initial_state(y) -> s` for the first measurement y, and `step`, which returns the
 command, the memory and the flag `fault`. In a format without methods the memory is initialised with
@@ -89,7 +89,7 @@ class LoadedExport(ABC):
 
 
 class Exportable(ABC):
-    """An exportable step with its card and the parity check of an exported file.
+    """An exportable step with its model card and the parity check of an exported file.
 
     Attributes:
         name: name of the model or policy.
@@ -100,7 +100,7 @@ class Exportable(ABC):
         flags: names of the Boolean results, which are last.
         precisions: precisions to try, in this order.
         methods: methods of the module of `build_module` in addition to `forward`.
-        objections: reasons against its use, written into the card; see `require_releasable`.
+        objections: reasons against its use, written into the model card; see `require_releasable`.
         assessment: verdict, data findings and log split of its run for the card; None if it is
             exported without a run folder.
     """
@@ -143,16 +143,16 @@ class Exportable(ABC):
 
     @abstractmethod
     def card_contents(self) -> dict[str, Any]:
-        """Return the card entries of this kind of exportable."""
+        """Return the model card entries of this kind of exportable."""
 
     @final
     def build_card(self) -> dict[str, Any]:
-        """Return the card, without format, precision and parity."""
+        """Return the model card, without format, precision and parity."""
         return {**self.card_contents(), **self.provenance()}
 
     @final
     def provenance(self) -> dict[str, Any]:
-        """Return the card entries common to all formats: build, objections and assessment."""
+        """Return the model card entries common to all formats: build, objections and assessment."""
         assessment = Assessment() if self.assessment is None else self.assessment
         return {
             "build": self.build(),
@@ -225,7 +225,7 @@ class Exporter(ABC):
 
     @abstractmethod
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
-        """Write a model or a policy after a parity check and return its card.
+        """Write a model or a policy after a parity check and return its model card.
 
         Args:
             exported: for example a `residnet.export.vessel.ExportedVessel`.
@@ -243,7 +243,7 @@ Made = TypeVar("Made", bound=Exportable)
 def require_releasable(
     exported: Made, objections: Sequence[str], *, allows_objections: bool
 ) -> Made:
-    """Return the exportable with all objections in its card, if it may be released.
+    """Return the exportable with all objections in its model card, if it may be released.
 
     Args:
         objections: reasons against its use, without full stops: it is worse than constant velocity,
@@ -275,7 +275,7 @@ def run_in_sufficient_precision(
 
 
 def get_dtype_name(dtype: torch.dtype) -> str:
-    """Return the name of a precision in cards."""
+    """Return the name of a precision in model cards."""
     return "float64" if dtype == torch.float64 else "float32"
 
 
@@ -292,6 +292,6 @@ def render_template(template: str, **values: Any) -> str:
 
 
 def write_card(file: Path, card: Mapping[str, Any]) -> None:
-    """Write the card of an exported file; its folder is created if necessary."""
+    """Write the model card of an exported file; its folder is created if necessary."""
     file.parent.mkdir(parents=True, exist_ok=True)
     file.with_suffix(".card.json").write_text(json.dumps(card, indent=1) + "\n")

@@ -422,7 +422,7 @@ def generate_c_source(
     """Return source and header.
 
     Args:
-        card: card, written as a comment into the header.
+        card: model card, written as a comment into the header.
         header: name of the header.
         prefix: prefix of all names, see `file_prefix`.
         is_double_only: whether single precision is not offered.
@@ -605,7 +605,7 @@ class CExporter(Exporter):
     is_for_microcontrollers: ClassVar[bool] = True
 
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
-        """Write source, header and card, checked in single and in double precision.
+        """Write source, header and model card, checked in single and in double precision.
 
         If rounding in single precision changes the track, the file has double precision only.
         """

@@ -229,7 +229,7 @@ class ExportedForce(Exportable):
         name: name of the model.
         model: the believed force and its correction.
         ranges: ranges of nu_dot and nu in the identification data (six).
-        thruster_lag: lag of the thrusters, for the card; None if it was not fitted.
+        thruster_lag: lag of the thrusters, for the model card; None if it was not fitted.
     """
 
     dt = None

@@ -39,7 +39,7 @@ _VALUE_REFERENCES = (
     ("states", "", 101, "output"),
     ("states", "_start", 201, "parameter"),
 )
-"""Entry of the card, suffix of the variable names, first value reference, and causality. The value
+"""Model card entry, suffix of the variable names, first value reference, and causality. The value
 references are the same in `instance.h`.
 """
 LIBRARY_NAME = "model"
@@ -64,7 +64,7 @@ class FmuExporter(Exporter):
     suffix: ClassVar[str] = ".fmu"
 
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
-        """Write the FMU with its card under `resources`."""
+        """Write the FMU with its model card under `resources`."""
         if not isinstance(exported, ExportedVessel):
             raise UsageError(f"{exported.label}: an FMU holds a vessel model; export it as c")
         exported.require_finite_numbers()

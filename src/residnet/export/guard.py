@@ -9,8 +9,8 @@ All formats follow these rules, so that a bad sample never yields a non-finite r
 - NaN is replaced by the middle of the training range, and by zero for position and heading. Any
   other entry beyond the accepted range, including infinity, is replaced by the nearest value of the
   training range (of the accepted range for position and heading).
-- A memory with a non-finite entry, or an entry beyond the limits of its head, is replaced by the
-  initial memory.
+- A memory with a non-finite entry, or an entry beyond the limits of its head (residual model), is
+  replaced by the initial memory.
 - If the result of a step is NaN or leaves the accepted range, velocities are clamped to the
   accepted range (NaN is replaced by the previous value), and the pose is integrated with the
   velocities before the step.

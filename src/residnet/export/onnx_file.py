@@ -100,7 +100,7 @@ class OnnxExporter(Exporter):
     about: ClassVar[str] = "The model's step as ONNX, memory in and out, any number of rows."
 
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
-        """Write the graph, its card under the key `card` of the metadata.
+        """Write the graph, its model card under the key `card` of the metadata.
 
         It is in float64 if rounding in float32 changes the track.
         """

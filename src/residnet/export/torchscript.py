@@ -196,7 +196,7 @@ class TorchScriptExporter(Exporter):
                     passes._jit_pass_peephole(graph)
                     passes._jit_pass_cse(graph)
                     passes._jit_pass_dce(graph)
-            # the parity check uses a saved and reloaded module; the file differs only by its card
+            # the parity check uses a saved and reloaded module; the file also has a model card
             reloaded = ScriptedModel(torch.jit.load(io.BytesIO(_serialise(scripted))), dtype)
             with optimized_execution(False):
                 parity_entry = {

@@ -1,4 +1,4 @@
-"""Exported vessel model: guarded step, card and parity check of every file.
+"""Exported vessel model: guarded step, model card and parity check of every file.
 
 The file of a format is loaded and compared with the model: 2,000 steps from a warmed-up memory,
 tracks with step changes of the inputs, and invalid inputs, states and memories.
@@ -72,14 +72,14 @@ _DOMAIN_TEXT = (
 
 
 def _input_role(signals: SignalsConfig, name: str) -> str:
-    """Return the role of an input of a model in its card."""
+    """Return the role of an input of a model in its model card."""
     if name in signals.unexcited:
         return "unexcited"
     return "command" if name in signals.inputs else "exogenous"
 
 
 def _describe_domain(spec: ModelSpec) -> dict[str, Any] | None:
-    """Return the entry of the card on relations and density; None for models without them."""
+    """Return the model card entry on relations and density; None for models without them."""
     domain = spec.domain
     if domain is None:
         return None
@@ -240,7 +240,7 @@ class ExportedVessel(Exportable):
     Args:
         spec: description of the model.
         model: the model.
-        metrics: rows of metrics.json of this model, for the card.
+        metrics: rows of metrics.json of this model, for the model card.
     """
 
     results = ("x_after", "s_after", "outside")

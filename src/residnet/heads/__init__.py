@@ -1,4 +1,4 @@
-"""Residual heads, which learn what the baseline does not explain: one config class per kind."""
+"""Heads (residual models), which learn what the baseline does not explain: one class per kind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Interface of residual heads, and the scaling and clamping that they share."""
+"""Interface of heads (residual models), and the scaling and clamping that they share."""
 
 from __future__ import annotations
 

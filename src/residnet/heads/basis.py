@@ -1,4 +1,4 @@
-"""Heads that are linear in basis functions of the channels, with a choice of estimators."""
+"""Heads (residual models) that are linear in basis functions, with a choice of estimators."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configuration of heads that are linear in basis functions."""
+"""Configuration of heads (residual models) that are linear in basis functions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configuration that all heads share."""
+"""Configuration that all heads (residual models) share."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Heads that correct the force model of a hull, with the residual eps = tau - F(nu_dot, nu).
+"""Heads (residual models) that correct the force model of a hull.
 
+The residual is eps = tau - F(nu_dot, nu).
 The residual is affine in nu_dot, so that the model can be solved for nu_dot in a free run
 (Jervan 2020, eqs. (3.19)-(3.24)).
 """

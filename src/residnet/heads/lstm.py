@@ -1,4 +1,4 @@
-"""Residual head with long short-term memory (LSTM).
+"""Head (residual model) with long short-term memory (LSTM).
 
 Source: Woo et al. 2018, eqs. (17) and following. The printed cell candidate of eq. (17) lacks the
 recurrent term W_hc h, which the number of parameters requires (`docs/documents/corrections.md`,

@@ -1,4 +1,4 @@
-"""Configuration of the LSTM head (Woo et al. 2018, eq. (17); see `heads.lstm`)."""
+"""Configuration of the LSTM residual model (Woo et al. 2018, eq. (17); see `heads.lstm`)."""
 
 from __future__ import annotations
 

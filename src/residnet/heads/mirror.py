@@ -1,4 +1,4 @@
-"""Heads that are mirror-symmetric by construction, and a fast hyperbolic tangent.
+"""Heads (residual models) that are mirror-symmetric by construction, and a fast hyperbolic tangent.
 
 Hulls are symmetric between port and starboard within the accuracy of the data. Building in this
 symmetry halves the range of states that a network has to learn.

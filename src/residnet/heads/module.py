@@ -1,4 +1,4 @@
-"""Heads from `torch.nn.Module` objects of the user, without a package or an entry point."""
+"""Heads (residual models) from `torch.nn.Module` objects of the user, without a package."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Regressors of scikit-learn as residual heads.
+"""Regressors of scikit-learn as heads (residual models).
 
 The fitted state of the estimators in `residnet.heads.scikit_state.FITTED` is stored as arrays and
 restored without a fit and without a pickle. Other classes of scikit-learn need `--trust`: a config

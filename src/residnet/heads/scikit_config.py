@@ -1,4 +1,4 @@
-"""Configuration of regressors of scikit-learn as residual heads."""
+"""Configuration of regressors of scikit-learn as heads (residual models)."""
 
 from __future__ import annotations
 

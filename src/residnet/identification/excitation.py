@@ -1,4 +1,4 @@
-"""Assess which inputs and directions the training logs excite, for verdict, card and trial plans.
+"""Assess which inputs and directions the training logs excite, for verdict, model card and trials.
 
 The parametric model of the motion is linear in an input that no other regressor replaces. Its
 information about an input is the part of the input that velocities, their products and the other

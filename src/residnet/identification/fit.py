@@ -1,4 +1,4 @@
-"""Fits baselines, heads and ensembles on prepared logs; models are compared in free run."""
+"""Fit baselines, heads (residual models) and ensembles on logs; compare them in free run."""
 
 from __future__ import annotations
 

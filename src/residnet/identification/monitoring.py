@@ -3,8 +3,8 @@
 Windows are free-run as a whole and in parts, each from its measured start. The bias of the model on
 clean logs is subtracted from the innovations, which are whitened by their covariance over clean
 logs. For each possible change the score test evaluates whether a small change of this kind explains
-the recent windows, after wind and current are marginalised. The variation of clean logs sets the
-scale of the scores. The joint scores of all changes rank the explanations.
+the recent windows, after wind and current are marginalised. The scatter of the scores over clean
+logs sets the scale of the scores. The joint scores of all changes rank the explanations.
 """
 
 from __future__ import annotations

@@ -117,7 +117,7 @@ class TrialLimits(Config):
         time: duration of each candidate, in s.
         area: largest distance from the start, in m; null for no limit.
         speed: largest speed in m/s; null for no limit.
-        rudder: largest share of full steer.
+        rudder: largest fraction of the full steering command.
         count: number of trials to choose.
     """
 
@@ -131,10 +131,10 @@ class TrialLimits(Config):
 def propose_manoeuvres(
     trial_limits: TrialLimits, dof: DegreesOfFreedom = SURGE_SWAY_YAW
 ) -> list[Manoeuvre]:
-    """Return zigzags, turns, 3-2-1-1, multi-sines and speed changes at several drives.
+    """Return zigzags, turns, 3-2-1-1, multi-sines and speed changes at several propulsion commands.
 
-    Zigzags and turns, which depend on the heading, require a model of the heading; several drives
-    and speed changes require a model with a position.
+    Zigzags and turns, which depend on the heading, require a model of the heading; several
+    propulsion commands and speed changes require a model with a position.
     """
     manoeuvres: list[Manoeuvre] = []
     duration = trial_limits.time
@@ -199,7 +199,7 @@ def propose_manoeuvres(
 
 
 def infer_input_shares(spec: ModelSpec) -> Mapping[str, InputShare]:
-    """Return shares of drive and steer of the inputs, within their training ranges.
+    """Return the shares of the inputs in propulsion and steering, within their training ranges.
 
     Raises:
         UsageError: if no input steers.
@@ -221,7 +221,7 @@ def infer_input_shares(spec: ModelSpec) -> Mapping[str, InputShare]:
             shares[name] = InputShare(steer=max_input, limit=max_input)
         elif steer_sign:
             shares[name] = InputShare(
-                # differential thrust: at full drive and full steer the sum is limited to max_input
+                # differential thrust: the sum of both full commands is limited to max_input
                 drive=0.6 * max_input,
                 steer=0.6 * steer_sign * max_input,
                 limit=max_input,
@@ -239,7 +239,7 @@ def infer_input_shares(spec: ModelSpec) -> Mapping[str, InputShare]:
 
 @dataclass(frozen=True)
 class PredictionGoal:
-    """Manoeuvres whose prediction intervals are to be reduced, for example in a booklet.
+    """Manoeuvres whose prediction intervals are to be reduced, as in a manoeuvring booklet.
 
     Attributes:
         manoeuvres: the manoeuvres.
@@ -310,7 +310,7 @@ def plan_trials(
         refit_uncertainty: uncertainty of the refitted parameters.
         refit_config: settings of the refit, whose horizon and correlation time are used.
         state_scales_array: scales of the velocities [n].
-        input_shares: shares of the inputs in drive and steer.
+        input_shares: shares of the inputs in propulsion command and steering command.
         velocity_limits: velocities [n] above which a simulation has diverged.
         trial_limits: limits and number of the trials.
         prediction_goal: manoeuvres to predict; None for all candidates.

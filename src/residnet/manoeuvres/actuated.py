@@ -42,7 +42,7 @@ class Actuators(nn.Module, ABC):
 
     @abstractmethod
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
+        """Return commands [..., c] from normalised propulsion and steering commands [...]."""
 
     @abstractmethod
     def step_states(self, a: Tensor, w: Tensor) -> Tensor:

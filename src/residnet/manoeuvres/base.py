@@ -1,9 +1,10 @@
 """The interface of manoeuvres.
 
-A manoeuvre demands a normalised drive (mean thrust or revolutions) and steer (difference, or
-rudder) over time, open loop or by the motion that it sees. The vessel turns the two into its own
-commands, so one manoeuvre drives any plant and any learned model that has actuators. A manoeuvre
-with a stop condition ends its row of the rollout there.
+A manoeuvre demands a normalised propulsion command (`drive`: mean thrust or revolutions) and a
+normalised steering command (`steer`: difference of these, or rudder) over time, in open loop or as
+a function of the motion. The vessel converts the two into its own commands, so that one manoeuvre
+works with any plant and any learned model that has actuators. A manoeuvre with a stop condition
+ends its row of the rollout there.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from residnet.physics.plant import Plant
 
     DemandFunction = Callable[[Tensor, Tensor], Tensor]
-    """Turns drive [...] and steer [...] into commands [..., c], the first columns of the inputs."""
+    """Converts propulsion and steering command [...] to commands [..., c] of the vessel."""
     BatchParameters = dict[str, Tensor]
     """Parameters, or the observed motion, of the rows of a batch by name, [B] or [B, n] each."""
 
@@ -60,7 +61,9 @@ class Helm:
     dive_commands: Tensor | None = None
 
     def commands_for(self, drive: Tensor, steer: Tensor, *dive: Tensor) -> Tensor:
-        """Return the commands [..., c] for drive, steer and, for a diving manoeuvre, dive [...].
+        """Return the commands [..., c] of the vessel for normalised demands [...].
+
+        The demands are propulsion, steering and, for a diving manoeuvre, diving.
 
         Raises:
             UsageError: if dive is demanded of a vessel that cannot dive.
@@ -111,7 +114,7 @@ class Helm:
 
     @property
     def max_rudder(self) -> float | None:
-        """Rudder angle of full steer in rad; None for a vessel without rudder."""
+        """Rudder angle of the full steering command in rad; None for a vessel without rudder."""
         import torch
 
         name = next((name for name in RUDDER_INPUTS if name in self.inputs), None)
@@ -128,7 +131,7 @@ class RudderRange(Protocol):
 
     @property
     def max_rudder(self) -> float | None:
-        """Rudder angle of full steer in rad; None for a vessel without rudder."""
+        """Rudder angle of the full steering command in rad; None for a vessel without rudder."""
 
 
 def require_state(name: str, state_names: Sequence[str]) -> None:
@@ -242,7 +245,10 @@ class ScheduledManoeuvre(Manoeuvre):
 
     @abstractmethod
     def demands_at(self, t: Tensor) -> tuple[Tensor, ...]:
-        """Return drive, steer and, for a diving manoeuvre, dive, [T] each at times t [T] in s."""
+        """Return the propulsion and steering commands, [T] each, at times t [T] in s.
+
+        A diving manoeuvre also returns the dive command [T].
+        """
 
     @classmethod
     def build_source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
@@ -259,7 +265,7 @@ class ScheduledManoeuvre(Manoeuvre):
 
 
 class ClosedLoopManoeuvre(Manoeuvre):
-    """A manoeuvre that computes drive and steer from the motion.
+    """A manoeuvre that computes propulsion and steering commands from the motion.
 
     Its class methods evaluate all rows of a batch at once. `motion` contains the `observed_states`
     of the kind, [B] each; `parameters` are those of the rows, and the time step `dt` in s.
@@ -288,9 +294,11 @@ class ClosedLoopManoeuvre(Manoeuvre):
     def step_law(
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, ...]:
-        """Return drive [B], steer [B] and the memory [B, k] for the step that begins at `time`.
+        """Return propulsion and steering commands [B], and the memory [B, k].
 
-        For a diving vessel, dive [B] precedes the memory.
+        They are those of the step that begins at `time`.
+
+        For a diving vessel, the dive command [B] precedes the memory.
         """
 
     @classmethod
@@ -335,11 +343,11 @@ def sample_uniform(generator: np.random.Generator, limits: Range) -> float:
 
 
 class SteeringConfig(Config):
-    """Common settings of manoeuvres that steer by a share of full steer or by a rudder angle.
+    """Common settings of manoeuvres with a constant steering command or rudder angle.
 
     Attributes:
-        drive: constant share of full drive, also in the approach.
-        steer: share of full steer; positive turns to starboard.
+        drive: constant fraction of the full propulsion command, also in the approach.
+        steer: fraction of the full steering command; positive turns to starboard.
         rudder: rudder angle instead of `steer`, for vessels with a rudder.
         start: time at which the steering begins.
     """
@@ -360,11 +368,11 @@ class SteeringConfig(Config):
 
     @property
     def side(self) -> float:
-        """Sign of the demanded steer or rudder, +1 or -1."""
+        """Sign of the demanded steering command or rudder angle, +1 or -1."""
         return -1.0 if (self.steer if self.steer is not None else self.rudder or 0.0) < 0 else 1.0
 
     def steer_share(self, helm: RudderRange) -> float:
-        """Return the share of full steer on a vessel.
+        """Return the fraction of the full steering command on a vessel.
 
         Raises:
             UsageError: if an angle is demanded of a vessel without rudder, or an angle above its
@@ -374,7 +382,7 @@ class SteeringConfig(Config):
 
 
 def rudder_share(angle: float, helm: RudderRange) -> float:
-    """Return the share of full steer that commands a rudder angle [rad].
+    """Return the fraction of the full steering command that corresponds to a rudder angle [rad].
 
     Raises:
         UsageError: if the vessel has no rudder, or the angle exceeds its limit.

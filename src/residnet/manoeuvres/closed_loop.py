@@ -1,5 +1,7 @@
-"""Manoeuvres that steer by the motion: zigzag, turning circle, stopping trial, spiral, and those
-in depth: helix, vertical zigzag and step.
+"""Manoeuvres whose commands depend on the motion.
+
+They are zigzag, turning circle, stopping trial and spiral, and in depth helix, vertical zigzag and
+step.
 """
 
 from __future__ import annotations
@@ -49,7 +51,7 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
 
     Attributes:
         heading: change of heading at which the steering is reversed.
-        first: side of the first execute for a positive steer or rudder.
+        first: side of the first execute for a positive steering command or rudder angle.
         reversals: number of reversals after which the manoeuvre ends, as soon as the heading
             returns to the initial course; None for the full duration.
     """
@@ -140,11 +142,11 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
 
 
 class SteeringFamily(ManoeuvreFamily, ABC):
-    """Manoeuvres whose steer and drive are drawn from uniform distributions.
+    """Manoeuvres whose steering and propulsion commands are drawn from uniform distributions.
 
     Attributes:
-        steer: range of the share of full steer.
-        drive: range of the share of full drive.
+        steer: range of the fraction of the full steering command.
+        drive: range of the fraction of the full propulsion command.
         start: time of the first helm order in s.
     """
 
@@ -336,11 +338,11 @@ class TurningCircleFamily(SteeringFamily):
 class Stopping(ClosedLoopManoeuvre):
     """Stopping trial: `drive` until `start`, then `astern` until the surge velocity is zero.
 
-    Steer is zero, and there is no memory.
+    The steering command is zero, and there is no memory.
 
     Attributes:
-        drive: share of full drive of the approach.
-        astern: share of full drive after the order, negative.
+        drive: fraction of the full propulsion command in the approach.
+        astern: fraction of the full propulsion command after the order, negative.
         start: time of the order in s.
     """
 
@@ -370,7 +372,7 @@ class Stopping(ClosedLoopManoeuvre):
     def step_law(
         cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Command astern drive after the order."""
+        """Command the astern propulsion command after the order."""
         import torch
 
         # a sudden order: the lag of the propulsion is part of the vessel
@@ -396,9 +398,9 @@ class Spiral(ClosedLoopManoeuvre):
     The memory is the number of the current angle, and the state of the steady-turn test.
 
     Attributes:
-        drive: constant share of full drive.
-        steers: shares of full steer in order; without these and `rudders`, from one side to the
-            other and back.
+        drive: constant fraction of the full propulsion command.
+        steers: fractions of the full steering command in order; without these and `rudders`, from
+            one side to the other and back.
         rudders: rudder angles instead of `steers`, for vessels with a rudder.
         start: time of the first helm order, after an approach straight ahead.
         steady: condition for the next angle.
@@ -422,7 +424,7 @@ class Spiral(ClosedLoopManoeuvre):
 
     @property
     def helm_angles(self) -> tuple[float, ...]:
-        """Rudder angles in rad, or shares of full steer."""
+        """Rudder angles in rad, or fractions of the full steering command."""
         return self.rudders or self.steers or _SPIRAL_STEERS + _SPIRAL_STEERS[-2::-1]
 
     @property
@@ -433,7 +435,8 @@ class Spiral(ClosedLoopManoeuvre):
         """Return the steady yaw rate at each completed angle, and the height of the loop.
 
         The height is the largest difference of the yaw rates at the angle nearest to zero. `steers`
-        are rudder angles in rad if the manoeuvre has `rudders`, otherwise shares of full steer.
+        are rudder angles in rad if the manoeuvre has `rudders`, otherwise fractions of the full
+        steering command.
         """
         # changes of the commands in the log show when each angle was ordered
         commands = [name for name in log.channels if name.startswith("cmd_")]
@@ -496,13 +499,13 @@ class Spiral(ClosedLoopManoeuvre):
 
 
 class Helix(ScheduledManoeuvre):
-    """Helix: constant drive, steer and dive, a turn in which the vessel descends or climbs.
+    """Helix with constant commands: a turn in which the vessel descends or climbs.
 
     Attributes:
-        drive: share of full drive, -1 to 1.
-        steer: share of full steer; positive turns to starboard.
+        drive: fraction of the full propulsion command, -1 to 1.
+        steer: fraction of the full steering command; positive turns to starboard.
         dive: share of full dive; positive descends.
-        start: time at which steer and dive begin.
+        start: time at which the steering and dive commands begin.
     """
 
     kind: Literal["helix"] = "helix"
@@ -525,7 +528,7 @@ class DivingFamily(ManoeuvreFamily, ABC):
     """Random manoeuvres in depth, which begin downwards or upwards.
 
     Attributes:
-        drive: range of the share of full drive.
+        drive: range of the fraction of the full propulsion command.
         dive: range of the share of full dive.
         start: time at which the dive begins.
     """
@@ -535,7 +538,7 @@ class DivingFamily(ManoeuvreFamily, ABC):
     start: Seconds = 5.0
 
     def sample_common(self, generator: np.random.Generator) -> dict[str, Any]:
-        """Draw drive and signed dive; returns them with the start."""
+        """Draw propulsion command and signed dive command; returns them with the start."""
         dive_sign = 1.0 if generator.random() < 0.5 else -1.0
         drive = sample_uniform(generator, self.drive)
         dive = sample_uniform(generator, self.dive)
@@ -546,7 +549,7 @@ class HelixFamily(DivingFamily):
     """Random helices.
 
     Attributes:
-        steer: range of the share of full steer.
+        steer: range of the fraction of the full steering command.
     """
 
     kind: Literal["helix"] = "helix"
@@ -565,7 +568,7 @@ class VerticalZigzag(ClosedLoopManoeuvre):
     The memory is the sign of the demand (+1 down) and the depth at the start.
 
     Attributes:
-        drive: constant share of full drive.
+        drive: constant fraction of the full propulsion command.
         dive: share of full dive; a negative value climbs first.
         depth: change of depth at which the dive is reversed.
         start: time at which the dive begins.
@@ -635,10 +638,10 @@ class VerticalZigzagFamily(DivingFamily):
 class DepthStep(ClosedLoopManoeuvre):
     """Step of the depth setpoint with a controller of depth, depth rate and pitch rate.
 
-    Steer is zero. The memory is the depth at the start.
+    The steering command is zero. The memory is the depth at the start.
 
     Attributes:
-        drive: constant share of full drive.
+        drive: constant fraction of the full propulsion command.
         dive: largest share of full dive.
         depth: change of the setpoint; positive is deeper.
         start: time of the step.

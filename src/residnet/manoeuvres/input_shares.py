@@ -1,4 +1,4 @@
-"""Shares of drive and steer of the inputs of a learned model."""
+"""Shares of the inputs of a learned model in propulsion and steering commands."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ _RATE_UNITS = {"rad": "rad/s", "1/s": "1/s^2", "m": "m/s", "-": "1/s"}
 
 
 class InputShare(Config):
-    """The mapping from drive and steer of a manoeuvre to one input of a learned model.
+    """The mapping from the commands of a manoeuvre to one input of a learned model.
+
+    The commands are the normalised propulsion command and steering command.
 
     Values are numbers in the SI unit of the input, or texts with a unit.
 
     Attributes:
-        drive: value at full drive.
-        steer: value at full steer to starboard.
+        drive: value at the full propulsion command.
+        steer: value at the full steering command to starboard.
         centre: value without demand.
-        limit: largest deviation from `centre` to both sides; None for the sum of drive and steer.
+        limit: largest deviation from `centre` to both sides; None for the sum of propulsion command
+            and steering command.
         rate: largest change per second; None for no rate limit.
         lag: time constant of the first-order response to a command; 0 for an immediate response.
         delay: time between a command and its first effect.

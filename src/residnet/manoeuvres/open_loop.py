@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 
 
 class ConstantInput(ScheduledManoeuvre):
-    """Constant drive and steer, for steady speeds and turns.
+    """Constant propulsion and steering commands, for steady speeds and turns.
 
     Attributes:
-        drive: share of full drive, -1 to 1.
-        steer: share of full steer, -1 to 1; positive turns to starboard.
+        drive: fraction of the full propulsion command, -1 to 1.
+        steer: fraction of the full steering command, -1 to 1; positive turns to starboard.
     """
 
     kind: Literal["constant"] = "constant"
@@ -54,11 +54,11 @@ class ConstantInput(ScheduledManoeuvre):
 
 
 class ConstantFamily(Config):
-    """All combinations of several drives and steers.
+    """All combinations of several propulsion and steering commands.
 
     Attributes:
-        drive: shares of full drive, -1 to 1.
-        steer: shares of full steer, -1 to 1.
+        drive: fractions of the full propulsion command, -1 to 1.
+        steer: fractions of the full steering command, -1 to 1.
     """
 
     kind: Literal["constant"] = "constant"
@@ -71,11 +71,11 @@ class ConstantFamily(Config):
 
 
 class AccelerationDeceleration(ScheduledManoeuvre):
-    """Steps of the drive straight ahead, with zero steer.
+    """Steps of the propulsion command straight ahead.
 
     Attributes:
         times: start of each level in s, ascending.
-        levels: share of full drive of each level, -1 to 1.
+        levels: fraction of the full propulsion command of each level, -1 to 1.
     """
 
     kind: Literal["acceleration_deceleration"] = "acceleration_deceleration"
@@ -89,7 +89,10 @@ class AccelerationDeceleration(ScheduledManoeuvre):
         return self
 
     def demands_at(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the stepped drive [T], zero before the first time; zero steer [T]."""
+        """Return the stepped propulsion command [T] and a zero steering command [T].
+
+        The propulsion command is zero before the first time.
+        """
         import torch
 
         index = torch.searchsorted(torch.tensor(self.times, dtype=t.dtype), t, right=True)
@@ -102,8 +105,8 @@ class AccelerationDecelerationFamily(ManoeuvreFamily):
     Successive high levels are 1, 3/4 and 1/2 of the drawn one.
 
     Attributes:
-        high: range of the high level of the drive.
-        low: range of the low level of the drive.
+        high: range of the high level of the propulsion command.
+        low: range of the low level of the propulsion command.
         hold: range of the time for which a level is held in s.
     """
 
@@ -133,11 +136,11 @@ _STEP_PATTERN = (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, -1.0)
 class ThreeTwoOneOne(ScheduledManoeuvre):
     """The 3-2-1-1 pattern: steering steps of 3, 2, 1 and 1 units to alternating sides.
 
-    The pattern excites a broad band of frequencies. The steer is zero afterwards.
+    The pattern excites a broad band of frequencies. The steering command is zero afterwards.
 
     Attributes:
-        drive: share of full drive, -1 to 1.
-        steer: share of full steer, -1 to 1; positive turns to starboard first.
+        drive: fraction of the full propulsion command, -1 to 1.
+        steer: fraction of the full steering command, -1 to 1; positive turns to starboard first.
         start: time at which the steering begins in s, after an approach straight ahead.
         unit: duration of the shortest step in s.
         repeat: whether the pattern is repeated until the end.
@@ -162,12 +165,12 @@ class ThreeTwoOneOne(ScheduledManoeuvre):
 
 
 class ThreeTwoOneOneFamily(ManoeuvreFamily):
-    """3-2-1-1 manoeuvres with unit, steer and drive uniform in their ranges, repeated.
+    """Repeated 3-2-1-1 manoeuvres with unit and commands uniform in their ranges.
 
     Attributes:
         unit: range of the shortest step in s.
-        steer: range of the share of full steer.
-        drive: range of the share of full drive.
+        steer: range of the fraction of the full steering command.
+        drive: range of the fraction of the full propulsion command.
         start: time at which the steering begins in s.
     """
 
@@ -203,17 +206,17 @@ class Excitation(ScheduledManoeuvre, ABC):
     """Random demands over a band of frequencies.
 
     Attributes:
-        drive: mean drive.
-        drive_amplitude: largest deviation of the drive from its mean.
-        steer_amplitude: largest steer to either side.
+        drive: mean propulsion command.
+        drive_amplitude: largest deviation of the propulsion command from its mean.
+        steer_amplitude: largest steering command to either side.
         sway_amplitude: largest sway force to either side as a share of its limit, for vessels whose
             commands are forces.
         dive_amplitude: largest dive to either side, for vessels that dive.
         own_amplitude: amplitude of an additional independent wave of each command, as a share of
-            full steer, which makes the effects of several thrusters distinguishable.
+            the full steering command, which makes the effects of several thrusters distinguishable.
         band: frequencies that are excited.
         seed: seed of the random waves.
-        start: time at which the waves begin, after an approach with the mean drive.
+        start: time at which the waves begin, after an approach with the mean propulsion command.
     """
 
     drive: float = Field(ge=-1, le=1)
@@ -272,7 +275,7 @@ class Excitation(ScheduledManoeuvre, ABC):
             ).abs()
             if helm.dive_commands is not None:
                 full_commands = torch.maximum(full_commands, helm.dive_commands.abs())
-            # the amplitude is relative to the command of full steer or full dive
+            # the amplitude is relative to the full steering command or full dive command
             for i in range(commands.shape[-1]):
                 waves = [
                     m.own_amplitude * m._delayed_wave(t, _FIRST_COMMAND_WAVE + i)
@@ -297,7 +300,7 @@ def _require_side_force(max_side_force: float | None, input_names: Sequence[str]
 
 
 class RandomSteps(Excitation):
-    """Steps of drive and steer to random levels.
+    """Steps of propulsion and steering commands to random levels.
 
     Levels are uniform within their amplitudes and last for half a period of a random frequency in
     the band.
@@ -368,9 +371,9 @@ class ExcitationFamily(ManoeuvreFamily):
     """Random excitations, whose means and amplitudes are uniform in their ranges.
 
     Attributes:
-        drive: range of the mean drive.
-        drive_amplitude: range of the amplitude of the drive.
-        steer_amplitude: range of the amplitude of the steer.
+        drive: range of the mean propulsion command.
+        drive_amplitude: range of the amplitude of the propulsion command.
+        steer_amplitude: range of the amplitude of the steering command.
         sway_amplitude: range of the amplitude of the sway force as a share of its limit, for
             vessels whose commands are forces.
         dive_amplitude: range of the amplitude of the dive, for vessels that dive.

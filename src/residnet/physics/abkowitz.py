@@ -51,7 +51,7 @@ class AbkowitzForces(ActuatorSystem):
         self.moment_arms = nn.Buffer(moment_arms, persistent=False)
 
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the rudder command from steer, and revolutions from drive with terms in dn."""
+        """Return the rudder command and, with terms in dn, the revolutions."""
         return commands_from_demand(self.command_specs, drive, steer)
 
     def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ class NomotoVessel(Plant):
         self.b = nn.Buffer(torch.from_numpy(b), persistent=False)
 
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the rudder command [..., 1] for a normalised steer [...]; drive has no effect."""
+        """Return the rudder command [..., 1] for a normalised steering command [...]."""
         return (steer.clamp(-1.0, 1.0) * self.delta_max).unsqueeze(-1)
 
     def rudder_angle(self, x: Tensor, w: Tensor) -> Tensor:

@@ -42,7 +42,7 @@ class Plant(nn.Module, ABC):
 
     @abstractmethod
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return commands [..., c] for normalised drive and steer [...] of a manoeuvre."""
+        """Return commands [..., c] for normalised propulsion and steering commands [...]."""
 
     @abstractmethod
     def derivative(self, x: Tensor, w: Tensor) -> Tensor:

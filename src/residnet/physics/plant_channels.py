@@ -28,7 +28,7 @@ class PlantChannels:
         state_names: names of the states; those that are not measured begin with `_`.
         command_names: names of the commands, the first inputs.
         exogenous_names: names of the other inputs.
-        max_rudder: rudder angle of full steer in rad; None without a rudder.
+        max_rudder: rudder angle of the full steering command in rad; None without a rudder.
         can_dive: whether a command forces the vessel downwards.
         has_force_commands: whether the vessel can produce any force in surge, sway and yaw.
         max_side_force: largest commanded sway force in N; None if commands are no forces.

@@ -1,7 +1,8 @@
-"""Input channels of baselines and heads: velocities, commands, forces and relative wind.
+"""Input channels of baselines and heads (residual models).
 
-Position and heading are not channels, because the dynamics in body axes do not depend on them. The
-true wind is transformed to wind relative to the vessel with the predicted heading and velocity.
+They are velocities, commands, forces and relative wind. Position and heading are not channels,
+because the dynamics in body axes do not depend on them. The true wind is transformed to wind
+relative to the vessel with the predicted heading and velocity.
 """
 
 from __future__ import annotations

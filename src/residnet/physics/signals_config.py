@@ -1,4 +1,4 @@
-"""Configuration of the input channels of baselines and heads."""
+"""Configuration of the input channels of baselines and heads (residual models)."""
 
 from __future__ import annotations
 

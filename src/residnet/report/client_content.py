@@ -279,7 +279,7 @@ def _vessel_section(
 
 
 def _describe_gear(run: RunFiles) -> str:
-    """Return the steering gear of the booklet's config as text; empty without one."""
+    """Return the steering gear of the manoeuvring booklet as text; empty without one."""
     booklet = run.resolved_config.get("booklet")
     inputs = booklet.get("inputs", {}) if isinstance(booklet, dict) else {}
     parts = []

@@ -204,7 +204,7 @@ class RefitRow(Record):
 
 
 class MonitorFile(FileRows[MonitoredLogRow | RefitRow]):
-    """monitor.json: the change detection over logs in the order of time, and the refit."""
+    """monitor.json: the change detection over logs in chronological order, and the refit."""
 
 
 class RunFigure(Record):

@@ -72,7 +72,7 @@ class RunFolder:
         residuals: residual targets and predictions.
         limits: errors of the models by horizon and condition.
         goodness: goodness of fit of the regressions.
-        booklet: standard manoeuvres of the identified model.
+        booklet: manoeuvring booklet, the standard manoeuvres of the identified model.
         selection: the selected model and the reason.
         sanity: findings of the physical checks of each model.
         bands: prediction intervals of free runs.

@@ -20,7 +20,7 @@ from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 
 _SETTLING_STEPS = 600
-"""Number of steps to reach the speed of half drive, which is the cruise speed."""
+"""Number of steps to reach the cruise speed, at half of the full propulsion command."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class _UnflaggedStep(Dynamics):
 def build_plant_vehicle(name: str, plant: Plant, dt: float) -> Vehicle:
     """Return a vessel as a vehicle in calm water.
 
-    The limits are the commands of full drive and full steering.
+    The limits are the commands of full propulsion and full steering.
 
     Raises:
         UsageError: if it has other degrees of freedom than surge, sway and yaw.
@@ -166,12 +166,12 @@ def build_plant_vehicle(name: str, plant: Plant, dt: float) -> Vehicle:
 
 
 def _with_cruise_speed(base_vehicle: Vehicle) -> Vehicle:
-    """Return a vehicle with its cruise speed: the steady speed at half drive."""
+    """Return a vehicle with its cruise speed, the steady speed at half of full propulsion."""
     partial_drive = base_vehicle.lower_commands + 0.75 * (
         base_vehicle.upper_commands - base_vehicle.lower_commands
     )
     # commands with a symmetric range are rudders, which stay amidships, or reversible propellers,
-    # which drive: both cases are simulated and the faster one is used
+    # which propulsion command: both cases are simulated and the faster one is used
     balanced_drive = torch.where(
         (base_vehicle.lower_commands + base_vehicle.upper_commands).abs()
         < 1e-9 * base_vehicle.upper_commands.abs(),

@@ -124,7 +124,7 @@ def write_new_config(
         answer_question: asks the user; None for the default answers.
         overwrite: replace an earlier config.
         answers: answers given in advance, by key of the config.
-        naval: length and scale, for a booklet and derivatives; None for neither.
+        naval: length and scale, for a manoeuvring booklet and derivatives; None for neither.
 
     Raises:
         UsageError: if the file exists already, or a path does not.
@@ -218,7 +218,7 @@ def draft_fit_config(
         name: name of the run.
         answer_question: answers questions; None for the default answers, marked as guesses.
         answers: answers given in advance, by key of the config.
-        naval: length and scale, for a booklet and derivatives; None for neither.
+        naval: length and scale, for a manoeuvring booklet and derivatives; None for neither.
 
     Raises:
         UsageError: if a path does not exist.

@@ -1,8 +1,8 @@
 """Draft of a manoeuvring booklet and of derivatives for `residnet new --length L --scale S`.
 
-The booklet has the standard manoeuvres of IMO resolution MSC.137(76) within the tested rudder
-angles: turning circles, 10/10 and 20/20 zigzags, pull-outs, and a stopping trial where the logs
-contain astern revolutions. The steering gear follows from the logs.
+The manoeuvring booklet has the standard manoeuvres of IMO resolution MSC.137(76) within the tested
+rudder angles: turning circles, 10/10 and 20/20 zigzags, pull-outs, and a stopping trial where the
+logs contain astern revolutions. The steering gear follows from the logs.
 """
 
 from __future__ import annotations
@@ -254,7 +254,7 @@ def _gear_settings(gear: SteeringGear) -> dict[str, str | float]:
 
 
 def _draft_manoeuvres(angle_deg: float, time_unit: float) -> list[dict[str, Any]]:
-    """Return the standard manoeuvres up to a rudder angle, in the order of a booklet."""
+    """Return the standard manoeuvres of a booklet, up to a rudder angle, in its order."""
     common = {"drive": 1.0, "start": "0 s"}
     sides = {"starboard": 1.0, "port": -1.0}
     manoeuvres: list[dict[str, Any]] = [

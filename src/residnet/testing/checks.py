@@ -1,4 +1,4 @@
-"""Contract checks of heads, baselines, vessels, manoeuvres, readers and export formats.
+"""Contract checks of heads (residual models), baselines, vessels and other parts.
 
 Every error message is one line with the part, the actual and the expected behaviour.
 """
@@ -610,8 +610,8 @@ def _check_baseline_config(
 def check_vessel(name: str, time_step: float = 0.1) -> None:
     """Check the contracts of a vessel file.
 
-    The description is one line, the length is positive, and the simulated motion at half drive is
-    finite and does not depend on other rows of the batch.
+    The description is one line, the length is positive, and the simulated motion at half of the
+    full propulsion command is finite and does not depend on other rows of the batch.
 
     Args:
         name: name of the vessel, or path of its file.
@@ -826,8 +826,8 @@ def _check_error_messages(reader: LogReader, folder: Path, file: Path, subject: 
 def check_exporter(exporter: Exporter) -> None:
     """Check the contracts of an export format.
 
-    The exporter creates the file and its folder, returns a card, does not change the model, and
-    rejects unsupported models with a one-line error.
+    The exporter creates the file and its folder, returns a model card, does not change the model,
+    and rejects unsupported models with a one-line error.
 
     Args:
         exporter: the export format.

@@ -316,7 +316,7 @@ class HeadingStepBatch:
     Attributes:
         target: new reference [B] in rad, or in m of depth.
         step_index: time step [B] at which the reference changes.
-        vessel_variation: variation of the vessel [B, 3], see `steering_variation.VARIATION`.
+        vessel_variation: variation of the steering [B, 3], see `steering_variation.VARIATION`.
         delay_steps: delay of the command [B] in time steps.
         push: disturbance [B, T] as a rudder angle in rad.
         noise: measurement noise of the states in `Axis.measured`, [B, T, 2 or 3], SI.
@@ -564,7 +564,7 @@ def simulate_heading_steps(
         vessel: vessel in its reference condition.
         policy: controller of the rudder.
         target: new headings [B] in rad.
-        variation: variations of the vessel [B, 3].
+        variation: variation of the steering of each vessel [B, 3].
         dt: time step in s.
         duration: duration in s.
         weather: environmental inputs by name, SI, for all rows or [B].

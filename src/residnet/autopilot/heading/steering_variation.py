@@ -25,7 +25,7 @@ class Axis(NamedTuple):
         name: name of the axis.
         command: name of the input that steers, an angle in rad.
         gear: name of the state that follows the command, if the vessel has one.
-        slowed: velocities whose time constant a variation scales.
+        slowed: velocities whose time constant a variation of the steering scales.
         value: name of the controlled state: heading [rad] or depth [m].
         angle: name of the angle that the command changes, rad.
         rate: name of its angular velocity, rad/s.
@@ -50,13 +50,15 @@ class Axis(NamedTuple):
 HEADING = Axis("heading", "cmd_delta", "delta", ("v", "r"), "psi", "psi", "r", 1.0)
 DEPTH = Axis("depth", "cmd_delta_s", "delta_s", ("w", "q"), "z", "theta", "q", -1.0)
 VARIATION = ("effect", "time", "bias")
-"""Columns of a variation: a factor of the rudder force, a factor of the time constants of sway and
-yaw (heave and pitch), and a constant angle [rad] that is added to the rudder angle.
+"""Columns of a variation of the steering.
+
+They are a factor of the rudder force, a factor of the time constants of sway and yaw (heave and
+pitch), and a constant angle [rad] that is added to the rudder angle.
 """
 
 
 class Vessels(NamedTuple):
-    """The variations of B vessels and their ambient currents.
+    """The varied steering of B vessels and their ambient currents.
 
     Attributes:
         variation: variations of the steering [B, 3], see `VARIATION`.
@@ -79,10 +81,10 @@ class VariedPlant(Dynamics):
 
     It is integrated with RK4 or Heun's method. Actuators that do not move within a step are held.
 
-    Its memory s [B, 3] is the variation, constant over a rollout; `effect` = `time` = 1 and a zero
-    `bias` are the plant itself. For Nomoto's model of first order, T r_dot + r = K delta, `effect`
-    multiplies K and `time` multiplies T; for other hulls `effect` multiplies the effective rudder
-    angle, and `time` divides the accelerations in sway and yaw.
+    Its memory s [B, 3] is the variation of the steering, constant over a rollout; `effect` = `time`
+    = 1 and a zero `bias` are the plant itself. For Nomoto's model of first order, T r_dot + r = K
+    delta, `effect` multiplies K and `time` multiplies T; for other hulls `effect` multiplies the
+    effective rudder angle, and `time` divides the accelerations in sway and yaw.
 
     The first input is the command of the axis: the rudder for the heading, the stern planes for the
     depth. The other inputs of the plant follow in their order.
@@ -176,9 +178,9 @@ class VariedModel(Dynamics):
     """A learned hull with a rudder of limited rate or with a lag, varied from row to row.
 
     The state x [B, 3 + n (+ 1)] is that of the model, followed by the rudder angle if the rudder
-    has a rate or a lag. The memory s [B, 3 + k] is the variation, followed by that of the model.
-    `effect` multiplies the rudder angle that the model receives, `time` divides the changes of the
-    velocities `axis.slowed` over a step.
+    has a rate or a lag. The memory s [B, 3 + k] is the variation of the steering, followed by that
+    of the model. `effect` multiplies the rudder angle that the model receives, `time` divides the
+    changes of the velocities `axis.slowed` over a step.
 
     Args:
         model: the hull.
@@ -266,7 +268,7 @@ class PushedSteering(Dynamics):
     added to the constant rudder bias. Further columns are ignored.
 
     Args:
-        inner: a varied vessel, whose memory begins with the variation.
+        inner: vessel with varied steering, whose memory begins with that variation.
         n_inputs: number m of the vessel's inputs.
     """
 

@@ -112,7 +112,7 @@ class ActuatorSystem(nn.Module, ABC):
 
     @abstractmethod
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return commands [..., c] for drive and steer [...] of a manoeuvre, each within +-1."""
+        """Return commands [..., c] for propulsion and steering commands [...] within +-1."""
 
     @abstractmethod
     def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:
@@ -175,7 +175,7 @@ class ForceActuators(ActuatorSystem, ABC):
 
 
 def commands_from_demand(specs: Sequence[CommandSpec], drive: Tensor, steer: Tensor) -> Tensor:
-    """Return commands [..., c] for normalised drive and steer [...]."""
+    """Return commands [..., c] for normalised propulsion and steering commands [...]."""
     no_demand = torch.zeros_like(steer)
     demand = {"drive": drive, "steer": steer, "dive": no_demand, "roll": no_demand}
     shares = [

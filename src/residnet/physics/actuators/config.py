@@ -262,7 +262,7 @@ class ActuatorConfig(Config, ABC):
 
     @property
     def max_rudder(self) -> float | None:
-        """Rudder angle of full steer in rad; None without a rudder."""
+        """Rudder angle of the full steering command in rad; None without a rudder."""
         return None
 
     @abstractmethod
@@ -293,7 +293,7 @@ RUDDER_INPUTS = ("cmd_delta", "delta")
 
 
 def find_max_rudder(commands: Sequence[CommandSpec]) -> float | None:
-    """Return the rudder angle of full steer in rad; None if no command is a rudder angle."""
+    """Return the rudder angle in rad of the full steering command; None without a rudder angle."""
     return next((c.max_value for c in commands if c.name in RUDDER_INPUTS), None)
 
 

@@ -108,7 +108,7 @@ class RudderPropellerConfig(SteeredConfig):
     density: Density = Field(default=1025.0, gt=0)
 
     def command_specs(self) -> tuple[CommandSpec, ...]:
-        """Return the commands: rudder angle from steer and revolutions from drive."""
+        """Return the commands: rudder angle (steering) and revolutions (propulsion)."""
         return (
             CommandSpec("cmd_delta", "steer", self.rudder.limit),
             CommandSpec("cmd_n", "drive", self.propeller.n_max),
@@ -416,7 +416,7 @@ class WaterJetsConfig(SteeredConfig):
     nozzle: SteeringGearConfig
 
     def command_specs(self) -> tuple[CommandSpec, ...]:
-        """Return the commands: nonnegative revolutions from drive and nozzle angle from steer."""
+        """Return the commands: nonnegative revolutions (propulsion) and nozzle angle (steering)."""
         # jets aft of the origin turn the bow to starboard by a force to port
         max_nozzle_angle = self.nozzle.limit if self.x > 0 else -self.nozzle.limit
         return (

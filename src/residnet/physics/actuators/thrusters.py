@@ -85,10 +85,10 @@ class Thrusters(ActuatorSystem):
         self.n_max = nn.Buffer(n_max, persistent=False)
 
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the revolutions [..., c] for drive and steer, limited to n_max.
+        """Return the revolutions [..., c] for propulsion and steering commands, limited to n_max.
 
-        With differential thrust, drive is the mean and steer the difference of the revolutions
-        (Woo et al. 2018, eqs. (30), (31)).
+        With differential thrust, the propulsion command is the mean and the steering command the
+        difference of the revolutions (Woo et al. 2018, eqs. (30), (31)).
         """
         shares = torch.stack((drive, steer), dim=-1) @ self.demand_map.to(drive.dtype)
         return shares.clamp(-1.0, 1.0) * self.n_max.to(drive.dtype)
@@ -173,10 +173,10 @@ class AzimuthThrusters(ForceActuators):
         )
 
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the commands [..., 2k] for drive and steer, each within +-1.
+        """Return the commands [..., 2k] for the propulsion and steering commands, each within +-1.
 
-        Drive is the surge force and steer the yaw moment relative to their maximum values; each
-        thruster saturates.
+        The propulsion command is the surge force and the steering command the yaw moment, relative
+        to their maximum values; each thruster saturates.
         """
         lever = self.thrust_configuration[2].abs().sum() / 2.0
         surge_share = drive.clamp(-1, 1) * self.n_thrusters
@@ -219,7 +219,7 @@ class ForceCommands(ForceActuators):
         self.limit = nn.Buffer(limit, persistent=False)
 
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return commands [..., 3] for drive (surge force) and steer (yaw moment) within +-1."""
+        """Return commands [..., 3] for propulsion (surge force) and steering (yaw moment)."""
         shares = torch.stack((drive, torch.zeros_like(drive), steer), dim=-1)
         return shares.clamp(-1.0, 1.0) * self.limit.to(drive.dtype)
 
@@ -270,7 +270,7 @@ class VectoredThrusters(ActuatorSystem):
         self.dive_commands = demand_rows[2]
 
     def commands_for_demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the commanded thrust [..., c] for drive and steer, before the limits."""
+        """Return the commanded thrust [..., c] for both commands, before the limits."""
         return torch.stack((drive, steer), dim=-1) @ self.demand_map.to(drive.dtype)
 
     def force(self, states: Tensor, command: Tensor, nu: Tensor) -> Tensor:

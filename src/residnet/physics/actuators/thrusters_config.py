@@ -78,8 +78,8 @@ class ThrusterConfig(ThrusterPositionConfig, ShaftConfig, ThrustConfig):
 class ThrustersConfig(ActuatorConfig):
     """Fixed thrusters at any positions of the hull.
 
-    Drive acts on each thruster in proportion to the surge component of its direction. Steer acts on
-    it with the sign of its lever about the origin.
+    The propulsion command acts on each thruster in proportion to the surge component of its
+    direction. The steering command acts on it with the sign of its lever about the origin.
 
     Attributes:
         thrusters: the thrusters, in the order of the commands.

@@ -566,7 +566,7 @@ def _repeated_trial_table(content: BookletFile, pages: Sequence[BookletRow]) -> 
 
 
 def booklet_figures(run: RunFiles) -> Iterator[Figure]:
-    """Draw the turning circles with all draws and the repeated zigzags of a booklet."""
+    """Draw the turning circles with all draws and the repeated zigzags of a manoeuvring booklet."""
     content = run.read_record(BookletFile, "booklet.json")
     frame = run.read_parquet("booklet.parquet")
     if content is None or frame is None:

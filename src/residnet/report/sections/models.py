@@ -1,4 +1,4 @@
-"""Section on the models: coefficients, heads, equations, training and goodness of fit."""
+"""Section on the models: coefficients, equations, training and goodness of fit."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Task `fit`: from logs to baselines, heads, a comparison in free run, report and exports."""
+"""Task `fit`: from logs to baselines, heads (residual models), comparison, report and exports."""

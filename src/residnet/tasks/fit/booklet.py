@@ -46,11 +46,11 @@ def write_booklet(
     logs: Mapping[str, Sequence[PreparedLog]],
     limit: np.ndarray,
 ) -> str:
-    """Simulate the booklet; write booklet.json and booklet.parquet; returns a line for the log.
+    """Simulate the manoeuvring booklet and write its two files; returns a line for the log.
 
     Args:
         folder: run folder.
-        config: settings of the booklet.
+        config: settings of the manoeuvring booklet.
         fitted_model: the refitted baseline.
         logs: prepared logs by split.
         limit: velocities [n] beyond which a simulated run has diverged.
@@ -126,10 +126,10 @@ def write_booklet(
 
 
 def require_flyable(config: BookletConfig, logs: PreparedSplits, settings: FitSettings) -> None:
-    """Check that a model has the inputs and states of the booklet, without a simulation.
+    """Check without a simulation that a model has the inputs and states of the booklet.
 
     Args:
-        config: settings of the booklet.
+        config: settings of the manoeuvring booklet.
         logs: prepared logs by split.
         settings: settings of the fit, with the parts of a recipe.
 
@@ -312,7 +312,7 @@ def _identify_circle(log: Log, split: str, rudder: str) -> MeasuredTrial:
 def _input_shares_from_trials(
     config: BookletConfig, trials: Sequence[MeasuredTrial]
 ) -> dict[str, InputShare]:
-    """Return the input shares; full drive and steer are the largest inputs in the trials."""
+    """Return the input shares; the full commands are the largest inputs in the trials."""
     rudder = config.steering_input()
     max_rudder = max(trial.angle for trial in trials)
     return {

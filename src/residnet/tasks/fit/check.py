@@ -42,7 +42,7 @@ def check(config: FitConfig) -> None:
         prepared = prepare_splits(logs, settings)
     checked_settings = check_fit(prepared, config)
     if config.booklet is not None:
-        # the booklet is simulated by a model, which only PyTorch can build
+        # the manoeuvring booklet is simulated by a model, which only PyTorch can build
         from residnet.tasks.fit.booklet import require_flyable
 
         require_flyable(config.booklet, prepared, checked_settings)

@@ -188,7 +188,7 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
 
         Args:
             run: folder of the fit.
-            logs: new logs, in the order of time.
+            logs: new logs, in chronological order.
             model: name of the model; `selected` for the model chosen on validation data.
             settings: keys of `MonitorConfig`.
             refit_folder: run folder of the refitted model; None for no refit.
@@ -207,8 +207,8 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
 
         Args:
             run: folder of the fit.
-            model: name of the baseline; empty for the baseline of the booklet, else the first
-                refitted baseline.
+            model: name of the baseline; empty for the baseline of the manoeuvring booklet, else the
+                first refitted baseline.
             trial_limits: keys of `TrialLimits`.
 
         Raises:

@@ -216,7 +216,10 @@ def scale_fit_config(
 
 
 def scale_booklet(config: BookletConfig, scaling: FroudeScaling) -> BookletConfig:
-    """Return a booklet at the target scale, whose `scale` is what remains to the ship."""
+    """Return the manoeuvring booklet at the target scale.
+
+    Its `scale` is the remaining factor to the size of the ship.
+    """
 
     scaled = scaling.scale_config(config)
 
@@ -253,7 +256,7 @@ def _evaluate(
     models: Sequence[FittedModel],
     scaling: FroudeScaling,
 ) -> TaskOutcome:
-    """Evaluate scaled models on the scaled logs, and write the results and the booklet."""
+    """Evaluate scaled models on the scaled logs; write results and manoeuvring booklet."""
     begin_stage("free runs")
     logs = prepare_splits(config.load_logs(), config)
     logs, _ = convert_to_motion_through_water(logs, config)

@@ -44,8 +44,8 @@ class ModelChoice(Config):
         name: name of the model; `selected` is the model chosen on validation data.
         actuators: vessel (name or file) whose actuators convert commands to the inputs of the
             model; null for the vessel of the programme.
-        inputs: instead of the actuators of a vessel: drive and steer shares, limits and rates of
-            each input of the model.
+        inputs: instead of the actuators of a vessel: shares of propulsion command and steering
+            command, limits and rates of each input of the model.
     """
 
     run: ExistingPath

@@ -481,7 +481,7 @@ def _describe_linear_scope(config: AutopilotConfig) -> str:
 
 
 def export_model(config: AutopilotConfig, request: ExportRequest) -> Path:
-    """Write a policy of a run, with its rows of metrics.json in the card; returns the file.
+    """Write a policy of a run, with its rows of metrics.json in the model card; returns the file.
 
     Raises:
         UsageError: if the run has no policy of this name.

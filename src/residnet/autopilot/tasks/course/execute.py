@@ -375,7 +375,7 @@ def simulate_course(
         planned_course: course to which cross-track errors refer.
         lookahead: look-ahead distance of the guidance in m.
         duration: time limit of a simulation in s.
-        vessels: variations of the vessel and their currents.
+        vessels: variations of the steering, and the currents.
     """
     vessel = steering.vessel
     n_vessels = len(vessels.variation)
