@@ -62,6 +62,31 @@ def test_load_kinds_finds_parts_of_packages() -> None:
 
 
 @pytest.mark.usefixtures("installed")
+def test_unknown_kind_suggests_to_install_its_package() -> None:
+    with pytest.raises(ConfigError, match=r"or install the package that registers it"):
+        validate_config({"kind": "tidal_drag"}, HeadConfig, "here")
+
+
+def test_part_without_docstring_is_listed(installed: Path) -> None:
+    (installed / "site" / "made_bare.py").write_text(
+        "from typing import Literal\n"
+        "from residnet_sample.slow_water import SlowWaterConfig\n"
+        "class BareConfig(SlowWaterConfig):\n"
+        "    kind: Literal['bare'] = 'bare'\n"
+    )
+    declare(installed / "site", "residnet.heads", bare="made_bare:BareConfig")
+    assert dict(registry.list_parts(HeadConfig))["bare"] == "(no description)"
+
+
+@pytest.mark.usefixtures("installed")
+def test_packages_of_parts_have_their_versions() -> None:
+    head = validate_config({"kind": "slow_water"}, HeadConfig, "here")
+    ridge = validate_config({"kind": "plsr"}, HeadConfig, "here")
+    assert registry.find_part_packages({"a": [head], "b": ridge}) == {"residnet-sample": "0.1.0"}
+    assert registry.find_part_packages(ridge) == {}
+
+
+@pytest.mark.usefixtures("installed")
 def test_broken_part_raises_only_where_it_is_used() -> None:
     with pytest.raises(ConfigError, match=r"residnet-sample 0\.1\.0 cannot be used: ModuleNotF"):
         validate_config({"kind": "absent", "anything": 1}, HeadConfig, "here")

@@ -625,9 +625,8 @@ def _parse_fault(details: ErrorDetails, model: Any) -> ConfigFault:
         case "union_tag_invalid":
             path += _discriminator_path(error_context)
             tag = str(error_context["tag"])
-            hint = format_renaming_hint(path, tag) or suggest_name(
-                tag, _find_quoted(error_context["expected_tags"])
-            )
+            expected_tags = _find_quoted(error_context["expected_tags"])
+            hint = format_renaming_hint(path, tag) or _suggest_kind(tag, expected_tags, value_types)
             fault_text = f"unknown value '{truncate(tag)}'{hint}"
         case "union_tag_not_found":
             path += _discriminator_path(error_context)
@@ -666,6 +665,14 @@ def _parse_fault(details: ErrorDetails, model: Any) -> ConfigFault:
             fault_text = f"{bound_text} {format_given(value)}"
     code = _FAULT_CODES.get(error_type, "config.out_of_range")
     return ConfigFault(code, path, fault_text)
+
+
+def _suggest_kind(kind: str, valid_kinds: Sequence[str], value_types: tuple[Any, ...]) -> str:
+    """Return a hint at a similar kind and, for parts of other packages, at their installation."""
+    hint = suggest_name(kind, valid_kinds)
+    if not any(isinstance(value_type, PluginUnion) for value_type in value_types):
+        return hint
+    return f"{hint}{'' if hint.endswith('?') else ';'} or install the package that registers it"
 
 
 def format_given(value: Any) -> str:

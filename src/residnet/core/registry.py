@@ -68,6 +68,8 @@ class EntryPointPart:
 _loading_groups: list[str] = []
 _broken: dict[tuple[str, str, str], EntryPointPart] = {}
 """Entry points that raised an error on loading, by group, name and package."""
+_package_of_class: dict[type[Any], str] = {}
+"""Name and version of the package that registered a class by an entry point."""
 
 
 @functools.cache
@@ -109,7 +111,10 @@ def _load_entry_point(entry_point: importlib.metadata.EntryPoint) -> EntryPointP
         else f"{entry_point.dist.name} {entry_point.dist.version}"
     )
     try:
-        return EntryPointPart(entry_point.name, package, entry_point.load())
+        part = entry_point.load()
+        if inspect.isclass(part):
+            _package_of_class[part] = package
+        return EntryPointPart(entry_point.name, package, part)
     except (KeyboardInterrupt, Terminated):
         raise
     # a third-party package may raise anything, SystemExit included, and must not stop the others
@@ -131,6 +136,38 @@ def load_faults() -> list[str]:
     ]
 
 
+def get_part_package(part_class: type[Any]) -> str | None:
+    """Return name and version of the package that registered a class; None without one."""
+    return _package_of_class.get(part_class)
+
+
+def is_external_part(config: BaseModel) -> bool:
+    """Return whether the code of a part comes from a user or from another package."""
+    return type(config).__module__.partition(".")[0] != "residnet"
+
+
+def find_part_packages(config: Any) -> dict[str, str]:
+    """Return the version of each package that registered a part of a config, by its name.
+
+    Args:
+        config: config, or a mapping or sequence of configs, which is searched recursively.
+    """
+    versions: dict[str, str] = {}
+    pending_values = [config]
+    while pending_values:
+        value = pending_values.pop()
+        if isinstance(value, BaseModel):
+            if (package := get_part_package(type(value))) is not None:
+                name, _, version = package.rpartition(" ")
+                versions[name] = version
+            pending_values += [getattr(value, name) for name in type(value).model_fields]
+        elif isinstance(value, Mapping):
+            pending_values += value.values()
+        elif isinstance(value, list | tuple):
+            pending_values += value
+    return dict(sorted(versions.items()))
+
+
 @functools.cache
 def type_adapter(model: Any) -> TypeAdapter[Any]:
     """Return a cached pydantic adapter: building one for the union of vessels takes 35 ms."""
@@ -142,6 +179,7 @@ def clear_caches() -> None:
     _installed_entry_points.cache_clear()
     load_entry_points.cache_clear()
     _broken.clear()
+    _package_of_class.clear()
     type_adapter.cache_clear()
 
 
@@ -392,11 +430,10 @@ def describe_broken_part(part: EntryPointPart) -> str:
 def _summary_line(object_or_path: Any) -> str:
     """Return the attribute `about` of a class if it has one, else the first docstring line."""
     if not isinstance(object_or_path, str):
-        summary: str = (
-            getattr(object_or_path, "about", "")
-            or (object_or_path.__doc__ or "").strip().splitlines()[0]
-        )
-        return summary
+        # the docstring of the class itself: an inherited one describes the base class
+        docstring = (object_or_path.__doc__ or "").strip()
+        summary: str = getattr(object_or_path, "about", "") or docstring.partition("\n")[0]
+        return summary or "(no description)"
     module, _, name = object_or_path.partition(":")
     module_path = Path(residnet.__file__).parent.joinpath(*module.split(".")[1:])
     file = module_path / "__init__.py" if module_path.is_dir() else module_path.with_suffix(".py")

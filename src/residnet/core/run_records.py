@@ -54,6 +54,8 @@ class ProvenanceFile(FileRecord):
         python: version of Python.
         machine: operating system and processor.
         packages: versions of packages; None if a package is not installed.
+        part_packages: versions of the packages that registered parts of the config, such as a
+            reader, a baseline or a head.
         started: time of the start, UTC.
         seconds: duration in s.
         inputs: SHA-256 of each input file.
@@ -68,6 +70,7 @@ class ProvenanceFile(FileRecord):
     python: str
     machine: str
     packages: dict[str, str | None]
+    part_packages: dict[str, str] = Field(default_factory=dict)
     started: str
     seconds: float
     inputs: dict[str, str]

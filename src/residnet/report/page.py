@@ -186,6 +186,9 @@ def provenance_facts(provenance: ProvenanceFile) -> list[tuple[str, str]]:
         "started (UTC)": provenance.started,
         "duration": f"{provenance.seconds:.0f} s",
         "packages": ", ".join(f"{name} {version}" for name, version in packages if version),
+        "packages of parts": ", ".join(
+            f"{name} {version}" for name, version in provenance.part_packages.items()
+        ),
         "configuration": provenance.config or "",
         "overrides": " ".join(provenance.overrides),
     }

@@ -439,8 +439,13 @@ class Provenance:
                 " an input; add it again, or restart with --overwrite"
             )
 
-    def write(self, folder: RunFolder) -> None:
-        """Write provenance.json, including the time since the start."""
+    def write(self, folder: RunFolder, part_packages: Mapping[str, str]) -> None:
+        """Write provenance.json, including the time since the start.
+
+        Args:
+            folder: the run folder.
+            part_packages: versions of the packages that registered parts of the config.
+        """
         provenance = ProvenanceFile(
             residnet=__version__,
             command=tuple(sys.argv),
@@ -451,6 +456,7 @@ class Provenance:
             python=platform.python_version(),
             machine=f"{platform.system()} {platform.machine()}",
             packages={name: _package_version(name) for name in _RECORDED_PACKAGES},
+            part_packages=dict(part_packages),
             started=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.start_time)),
             seconds=round(time.time() - self.start_time, 1),
             inputs={str(path): sha256(path) for path in self.input_paths},

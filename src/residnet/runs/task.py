@@ -22,6 +22,7 @@ from residnet.core.errors import DataError, ExportError, ResidnetError, UsageErr
 from residnet.core.files import stage_files
 from residnet.core.names import suggest_name
 from residnet.core.processes import retain_freed_memory
+from residnet.core.registry import find_part_packages
 from residnet.core.run_records import ExportRow, ExportsFile, MainFigure
 from residnet.runs.folder import Provenance, RunFolder, require_apart, write_checksums
 
@@ -315,7 +316,8 @@ class Task(Config):
             ExportError: if the run is complete, but a model could not be exported.
         """
 
-        provenance.write(folder)
+        part_packages = find_part_packages(self)
+        provenance.write(folder, part_packages)
         # exports of an earlier run in this folder must not appear in the new report
         folder.manifest.remove_if_owned(folder.exports)
         with self.reserve_resources():
@@ -330,7 +332,7 @@ class Task(Config):
             )
             write_summary(outcome.verdict, is_finished=False)
             # final version: the report shows it and must be reproducible
-            provenance.write(folder)
+            provenance.write(folder, part_packages)
             verdict = list(outcome.verdict)
             files = list[Path]()
             export_errors = list[ResidnetError]()

@@ -143,6 +143,15 @@ class Series:
 
 _MAX_LISTED_SERIES = 20
 """Largest number of series that a message lists."""
+_MAX_LISTED_FIELDS = 12
+"""Largest number of fields of a series that a message lists."""
+
+
+def _list_fields(series: Series) -> str:
+    """Return the names of the fields of a series for a message, truncated with `...`."""
+    names = list(series.fields)
+    shown_names = names[:_MAX_LISTED_FIELDS]
+    return ", ".join([*shown_names, *(["..."] if len(names) > _MAX_LISTED_FIELDS else [])])
 
 
 @dataclass(frozen=True)
@@ -169,7 +178,7 @@ class Recording:
     def contents_description(self) -> str:
         """Text with the name of each series and its message type, or its fields without a type."""
         descriptions = [
-            f"{name} ({short_type or ', '.join(list(series.fields)[:6])})"
+            f"{name} ({short_type or _list_fields(series)})"
             for name, series in self.series.items()
             for short_type in [series.message_type.rsplit("/", 1)[-1]]
         ]
