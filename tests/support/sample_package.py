@@ -29,3 +29,20 @@ def install(site: Path, package: Path = SAMPLE) -> Path:
     ]
     (info / "entry_points.txt").write_text("\n".join(groups))
     return site
+
+
+def write_package(site: Path, name: str, code: str, **entry_points: str) -> None:
+    """Write a package of one module with entry points into the folder `site`.
+
+    Args:
+        site: folder on the import path.
+        name: name of the module and of the package, whose version is 1.0.
+        code: source of the module.
+        entry_points: group without `residnet.` -> lines `kind = class` of the module.
+    """
+    (site / f"{name}.py").write_text(code)
+    info = site / f"{name}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    lines = [f"[residnet.{group}]\n{text}\n" for group, text in entry_points.items()]
+    (info / "entry_points.txt").write_text("\n".join(lines))

@@ -101,10 +101,11 @@ def read_logs(
     if reader is not None and channels is not None:
         raise UsageError("read_logs: give channels or a reader, not both")
     with forward_progress(progress):
+        # before the search for logs, which uses the endings of all registered readers
+        settings: Any = None if reader is None else parse_part(reader, "reader", ReaderConfig)
         files = find_log_files(
             [file for source_entry in entries for file in _expand_glob(source_entry)]
         )
-        settings: Any = None if reader is None else parse_part(reader, "reader")
         if channels is not None:
             settings = {
                 "kind": "parquet" if files[0].suffix == ".parquet" else "csv",

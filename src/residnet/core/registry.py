@@ -141,9 +141,12 @@ def get_part_package(part_class: type[Any]) -> str | None:
     return _package_of_class.get(part_class)
 
 
-def is_external_part(config: BaseModel) -> bool:
-    """Return whether the code of a part comes from a user or from another package."""
-    return type(config).__module__.partition(".")[0] != "residnet"
+def find_registered_package(module_name: str) -> str | None:
+    """Return the package that registered a class in the same top-level module; None without one."""
+    for part_class, package in _package_of_class.items():
+        if part_class.__module__.partition(".")[0] == module_name.partition(".")[0]:
+            return package
+    return None
 
 
 def find_part_packages(config: Any) -> dict[str, str]:
@@ -343,6 +346,22 @@ def register_kind(union: Any, config_class: type[BaseModel]) -> None:
     if fault or name is None:
         raise UsageError(f"the config class {config_class.__name__} cannot be used: {fault}")
     _registered_kinds[plugin_union.group, name] = config_class
+
+
+def list_external_classes(union: Any) -> list[Any]:
+    """Return the usable classes of entry points and of Python arguments, without built-in ones.
+
+    Args:
+        union: for example `residnet.io.readers.ReaderConfig`.
+    """
+    plugin_union = get_plugin_union(union)
+    installed_classes = [part.part for part in plugin_union.entry_point_parts() if not part.fault]
+    python_classes = [
+        config_class
+        for (group, _), config_class in _registered_kinds.items()
+        if group == plugin_union.group
+    ]
+    return [*installed_classes, *python_classes]
 
 
 def import_object(object_path: str) -> Any:

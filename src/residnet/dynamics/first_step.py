@@ -6,9 +6,7 @@ residnet.
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,8 +15,7 @@ from torch import Tensor
 from residnet.baselines.base import Baseline
 from residnet.baselines.config import IdentifiedConfig
 from residnet.core.errors import ConfigError, ResidnetError
-from residnet.core.names import truncate
-from residnet.core.registry import get_part_package
+from residnet.core.external_parts import describe_part_class, describe_part_error
 from residnet.heads.base import ClosedFormHead, ResidualHead
 from residnet.heads.config import BaseHeadConfig
 from residnet.physics.symmetry import get_dof
@@ -50,10 +47,10 @@ def check_first_step(config: BaseHeadConfig | IdentifiedConfig, names: Sequence[
             raise
         except Exception as error:  # the code of a user may raise anything
             raise ConfigError(
-                f"{subject} {_describe_class(type(config), config)}:"
-                f" {_describe_error(error, type(config), 'build')}"
+                f"{subject} {describe_part_class(type(config), config)}:"
+                f" {describe_part_error(error, type(config), 'build')}"
             ) from error
-        subject = f"{subject} {_describe_class(type(part), config)}"
+        subject = f"{subject} {describe_part_class(type(part), config)}"
         if not isinstance(part, expected_class):
             raise ConfigError(
                 f"{subject}: build returned {type(part).__name__}, expected a"
@@ -71,7 +68,7 @@ def check_first_step(config: BaseHeadConfig | IdentifiedConfig, names: Sequence[
             raise
         except Exception as error:
             raise ConfigError(
-                f"{subject}: {_describe_error(error, type(part), 'forward')}"
+                f"{subject}: {describe_part_error(error, type(part), 'forward')}"
             ) from error
 
 
@@ -107,12 +104,6 @@ def _check_baseline_step(baseline: Baseline, names: Sequence[str], subject: str)
         raise ConfigError(f"{subject}: forward returned {shape}, {expected}")
 
 
-def _describe_class(part_class: type[Any], config: Any) -> str:
-    """Return class and package of a part for messages, such as `(class X of package Y 1.0)`."""
-    package = get_part_package(type(config)) or part_class.__module__.partition(".")[0]
-    return f"(class {part_class.__name__} of package {package})"
-
-
 def _describe_result(result: Any) -> str:
     """Return the type of a result for messages; of a tuple the types of its items."""
     if isinstance(result, tuple):
@@ -124,20 +115,3 @@ def _describe_shape(tensor: Tensor, n_rows: int) -> str:
     """Return the shape of a tensor for messages, with the batch size as `B`."""
     sizes = ["B" if size == n_rows else str(size) for size in tensor.shape]
     return f"[{', '.join(sizes)}]"
-
-
-def _describe_error(error: Exception, part_class: type[Any], method: str) -> str:
-    """Return type, message and place of an error in a method of a part.
-
-    The place is the innermost frame in the file of the class.
-    """
-    function = getattr(part_class, method)
-    file = getattr(getattr(function, "__code__", None), "co_filename", "")
-    lines = [
-        frame.lineno
-        for frame in traceback.extract_tb(error.__traceback__)
-        if frame.filename == file
-    ]
-    place = f" ({Path(file).name}, line {lines[-1]})" if lines else ""
-    text = truncate(" ".join(str(error).split()), 200)
-    return f"{type(error).__name__} in {method} of {part_class.__name__}{place}: {text}"

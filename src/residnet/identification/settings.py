@@ -11,9 +11,9 @@ from residnet.baselines import BaselineConfig
 from residnet.baselines.given_config import ZeroBaselineConfig
 from residnet.core.config import Config, validate_config
 from residnet.core.errors import ConfigError
+from residnet.core.external_parts import is_external_part
 from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY, PLANT
 from residnet.core.names import suggest_name
-from residnet.core.registry import is_external_part
 from residnet.dynamics.time_steps import Integrator
 from residnet.evaluation.band import BandsConfig
 from residnet.evaluation.protocol import EvaluationConfig

@@ -520,10 +520,15 @@ def find_logs(folder: Path) -> list[Path]:
 
     Files with unknown extensions are tested by content if there are no others.
     """
-    from residnet.io.readers.detect import LOG_ENDINGS, detect_recording_format, is_text_table
+    from residnet.io.readers.detect import (
+        detect_recording_format,
+        is_text_table,
+        list_log_endings,
+    )
 
+    log_endings = list_log_endings()
     return _find_logs_recursively(
-        folder, lambda path: path.suffix.lower() in LOG_ENDINGS
+        folder, lambda path: path.suffix.lower() in log_endings
     ) or _find_logs_recursively(
         folder, lambda path: detect_recording_format(path) is not None or is_text_table(path)
     )

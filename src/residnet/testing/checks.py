@@ -25,11 +25,13 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.config import Config, validate_config
 from residnet.core.errors import ExportError, ResidnetError, UsageError
+from residnet.core.external_parts import describe_part_error
 from residnet.core.layout import PLANAR_LAYOUT, ROLL_LAYOUT, SIX_DOF_LAYOUT
 from residnet.core.log import Log
-from residnet.core.names import si_unit
+from residnet.core.names import si_unit, suggest_name
 from residnet.core.registry import get_kind
 from residnet.core.samples import Samples
+from residnet.dynamics.first_step import check_first_step
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.dynamics.store import ModelSpec, load_model, save_model
@@ -100,8 +102,12 @@ def make_example_samples(
             a torpedo-shaped vehicle for six degrees of freedom.
         signals: inputs of the model, which are channels of the logs of the vessel.
         duration: duration of each manoeuvre in s.
+
+    Raises:
+        ConfigError: if the vessel does not exist.
+        UsageError: if its logs lack an input of `signals`.
     """
-    trial_settings = SimulatedTrials.model_validate(
+    trial_settings = validate_config(
         {
             "vessel": vessel or _VESSEL_OF_LAYOUT[signals.dof.layout],
             "step": EXAMPLE_TIME_STEP,
@@ -119,7 +125,9 @@ def make_example_samples(
             "identification": {"zigzag": 3},
             "validation": {"zigzag": 1},
             "seed": 4,
-        }
+        },
+        SimulatedTrials,
+        "make_example_samples",
     )
     config = PrepareConfig.model_validate(
         {"grid": {"step": EXAMPLE_TIME_STEP}, "derivative": _DERIVATIVE_SETTINGS}
@@ -128,6 +136,14 @@ def make_example_samples(
         flight.measured_log
         for flight in simulate_trials(trial_settings.draw_manoeuvres(), trial_settings)
     ]
+    available_channels = list(logs[0].channels)
+    for name in signals.inputs:
+        if name not in available_channels:
+            raise UsageError(
+                f"make_example_samples: the logs of the vessel '{trial_settings.vessel}' have no"
+                f" input '{name}'{suggest_name(name, available_channels)}; choose another vessel or"
+                " SignalsConfig(inputs=...)"
+            )
     prepared = [
         prepare_log(log, "train", signals.input_columns, config, signals.dof) for log in logs
     ]
@@ -262,6 +278,24 @@ def _check_round_trip(config: Config, config_union: Any, subject: str) -> None:
     )
 
 
+def _check_first_step(
+    config: BaseHeadConfig | IdentifiedConfig, names: Sequence[str], subject: str
+) -> None:
+    """Check that a part can be built and that one step returns the expected types and shapes."""
+    try:
+        check_first_step(config, names)
+    except ResidnetError as error:
+        message = str(error)
+        is_named = message.replace("'", "").startswith(subject)
+        named_message = message if is_named else f"{subject}: {message}"
+        hint = (
+            "; check it with `samples` or `signals` that have its channels"
+            if "needs the channel" in message
+            else ""
+        )
+        raise AssertionError(f"{named_message}{hint}") from error
+
+
 def check_head(config: BaseHeadConfig, signals: SignalsConfig = EXAMPLE_SIGNALS) -> None:
     """Check the contracts of a residual head.
 
@@ -277,6 +311,7 @@ def check_head(config: BaseHeadConfig, signals: SignalsConfig = EXAMPLE_SIGNALS)
         AssertionError: if a contract is violated; the message names it in one line.
     """
     subject = f"head {get_kind(type(config))}"
+    _check_first_step(config, signals.channel_names(), subject)
     # an example model with this head, fitted and stored below
     spec = make_example_spec(config, signals)
     _check_round_trip(config, HeadConfig, subject)
@@ -530,6 +565,7 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
     subject = f"baseline {get_kind(type(config))}"
     training_samples = make_example_samples() if samples is None else samples
     resolved = config.without_file_references()
+    _check_first_step(resolved, training_samples.names, subject)
     n_dynamic = get_dof(training_samples.names).n_dynamic
     # two fits: a random start or an order of a set would give different coefficients
     baseline, refitted = (resolved.build(training_samples.names) for _ in range(2))
@@ -761,8 +797,17 @@ def check_reader(config: Config, file: Path) -> Log:
     reader: LogReader = getattr(config, "build")()  # noqa: B009  readers have no common base
     assert_true(isinstance(reader, LogReader), f"{subject}: build does not return a LogReader")
     file = Path(file)
-    log = reader.read(file)
-    reread = reader.read(file)
+    try:
+        log: Any = reader.read(file)
+        reread: Any = reader.read(file)
+    except ResidnetError as error:
+        raise AssertionError(f"{subject}: cannot read the file ({error})") from error
+    except Exception as error:  # the code of a user may raise anything
+        place = describe_part_error(error, type(reader), "read")
+        raise AssertionError(f"{subject}: {place}") from error
+    assert_true(
+        isinstance(log, Log), f"{subject}: read returned {type(log).__name__}, expected a Log"
+    )
     assert_true(log.name == file.stem, f"{subject}: names the log '{log.name}', not '{file.stem}'")
     assert_true(bool(log.channels), f"{subject}: the log has no channels")
     assert_true(log.t.dtype == np.float64, f"{subject}: time is {log.t.dtype}, not float64")
@@ -815,9 +860,10 @@ def _check_error_messages(reader: LogReader, folder: Path, file: Path, subject: 
             is_file_named = "\n" not in message and str(path) in message
             assert_true(is_file_named, f"{subject}: its error does not name the file")
         except Exception as error:
+            helper = "require_file" if error_type is UsageError else "wrap_read_errors"
             raise AssertionError(
                 f"{subject}: a file that is {description} raises {type(error).__name__},"
-                f" expected {error_type.__name__}"
+                f" expected {error_type.__name__}; use {helper} of residnet.io.readers.base"
             ) from error
         else:
             raise AssertionError(f"{subject}: reads a file that is {description}")

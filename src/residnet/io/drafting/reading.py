@@ -67,7 +67,13 @@ from residnet.io.header_vocabulary import (
 )
 from residnet.io.readers import ReaderConfig
 from residnet.io.readers.compose import extract_heading, extract_position
-from residnet.io.readers.detect import AutoConfig, detect_log_kind, suggest_conversion
+from residnet.io.readers.detect import (
+    AutoConfig,
+    detect_external_kind,
+    detect_log_kind,
+    is_channel_reader,
+    suggest_conversion,
+)
 from residnet.io.readers.joined_files import group_trip_files
 from residnet.io.readers.manoeuvre_kinds import UNKNOWN, resolve_manoeuvre
 from residnet.io.readers.messages import (
@@ -144,7 +150,11 @@ def draft_recordings(
     auto = AutoConfig()
     recordings = {path: auto.load(path, ALL_FIELDS) for path in (paths[0], *paths[::stride])}
     aligned = [align_clocks(recording, {}, None) for recording in recordings.values()]
-    settings: dict[str, Any] = {"kind": "auto", **draft_manoeuvre_setting(paths, draft_notes)}
+    external_kind = detect_external_kind(paths[0])
+    settings: dict[str, Any] = {
+        "kind": external_kind or "auto",
+        **draft_manoeuvre_setting(paths, draft_notes),
+    }
     try:
         log = auto.build().to_log(recordings[paths[0]])
     except ResidnetError:
@@ -1033,6 +1043,9 @@ def read_drafted(
         paths = [*trip_files[next(iter(result.reader["parts"]))]]
     elif log_kind == "table":
         result.reader, result.errors = draft_tables(paths, draft_notes)
+    elif is_channel_reader(log_kind):
+        # a registered reader that returns channels in SI units needs no channel map
+        result.reader = {"kind": log_kind}
     elif log_kind != "canonical":
         try:
             result.reader, recordings = draft_recordings(paths, draft_notes)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, Self, final
+from typing import Any, ClassVar, Literal, Self, final
 
 import numpy as np
 
@@ -58,6 +58,10 @@ class ReaderKind(Config, ABC):
     """
 
     kind: str
+    formats: ClassVar[Mapping[str, Callable[[Path, bytes], bool]]] = {}
+    """Name of a format -> test of a path and its first bytes for this format."""
+    endings: ClassVar[tuple[str, ...]] = ()
+    """Extensions of the files in lower case, for example `.ulg`."""
 
     @abstractmethod
     def build(self) -> LogReader:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal, final
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from residnet.core.config import Seconds
-from residnet.core.errors import DataError, UsageError
+from residnet.core.errors import DataError, ResidnetError, UsageError
+from residnet.core.external_parts import (
+    describe_part_class,
+    describe_part_error,
+    is_external_part,
+)
 from residnet.core.frames import rotate, unwrap_angle
 from residnet.core.layout import ROLL_LAYOUT, SIX_DOF_LAYOUT, DegreesOfFreedom
 from residnet.core.log import Log, Remark, make_remark
@@ -90,10 +95,6 @@ class RecordingConfig(ConfiguredReader, ABC):
     delays: dict[str, Seconds | Literal["estimated"]] = Field(default_factory=dict)
     recorder_utc_offset: Seconds | None = None
     manoeuvre: str | None = None
-    formats: ClassVar[Mapping[str, Callable[[Path, bytes], bool]]] = {}
-    """Name of a format -> test of a path and its first bytes for this format."""
-    endings: ClassVar[tuple[str, ...]] = ()
-    """Extensions of the files."""
 
     @model_validator(mode="before")
     @classmethod
@@ -136,7 +137,43 @@ class RecordingConfig(ConfiguredReader, ABC):
 
         `meta["findings"]` has a remark on each problem and each correction.
         """
-        return self.to_log(self.load(path, self._build_field_filter()))
+        return self.to_log(self.load_checked(path, self._build_field_filter()))
+
+    @final
+    def load_checked(self, path: Path, field_filter: FieldFilter) -> Recording:
+        """Load a recording; an error in the code of another package becomes one line.
+
+        Raises:
+            ResidnetError: if the recording cannot be read, or `load` of a reader of another package
+                raises an error or returns no valid recording.
+        """
+        if not is_external_part(self):
+            return self.load(path, field_filter)
+        subject = f"{path}: reader '{self.kind}' {describe_part_class(type(self), self)}"
+        try:
+            recording: Any = self.load(path, field_filter)
+        except ResidnetError:
+            raise
+        except Exception as error:  # the code of a user may raise anything
+            raise DataError(
+                f"{subject}: {describe_part_error(error, type(self), 'load')}; raise a DataError"
+                " that names the file and the row, or use wrap_read_errors"
+            ) from error
+        if not isinstance(recording, Recording):
+            raise DataError(
+                f"{subject}: load returned {type(recording).__name__}, expected a Recording"
+            )
+        for series in recording.series.values():
+            times: Any = series.stamp if series.stamp is not None else series.arrival
+            columns: dict[str, Any] = {"time": times, **series.fields}
+            n_rows = np.size(times)
+            for name, values in columns.items():
+                if not isinstance(values, np.ndarray) or values.shape != (n_rows,):
+                    raise DataError(
+                        f"{subject}: '{name}' of series '{series.name}' is {type(values).__name__}"
+                        f" of shape {list(np.shape(values))}, expected a NumPy array [{n_rows}]"
+                    )
+        return recording
 
     def to_log(self, recording: Recording) -> Log:
         """Convert a loaded recording to a log; see `read`."""

@@ -8,7 +8,9 @@ from typing import Literal, final
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.io.readers.base import require_file
+from residnet.core.registry import get_kind, list_external_classes
+from residnet.io.readers import ReaderConfig
+from residnet.io.readers.base import ReaderKind, require_file
 from residnet.io.readers.compose import RecordingConfig
 from residnet.io.readers.formats.ardupilot import ArduPilotConfig
 from residnet.io.readers.formats.matlab_hdf5 import Hdf5Config, MatConfig
@@ -36,11 +38,12 @@ _RECORDING_CONFIGS: tuple[type[RecordingConfig], ...] = (
     MatConfig,
     Hdf5Config,
 )
-LOG_ENDINGS = (
+_BUILTIN_ENDINGS = (
     *(ending for ending in TABLE_KINDS if ending != ".json"),
     *(ending for config in _RECORDING_CONFIGS for ending in config.endings),
 )
 """Extensions of files that may be logs; .json files usually hold metadata."""
+_RESERVED_ENDINGS = {*_BUILTIN_ENDINGS, ".json"}
 _PANDAS_READERS = {
     **dict.fromkeys((".gz", ".zip", ".bz2", ".xz"), "pandas.read_csv(file)"),
     **dict.fromkeys((".xls", ".ods"), "pandas.read_excel(file)"),
@@ -62,11 +65,30 @@ class RecordingFormat:
 
     Attributes:
         name: name of the format for messages.
-        config: reader, which maps standard messages without further settings.
+        config: reader; one of residnet maps standard messages without further settings.
     """
 
     name: str
-    config: type[RecordingConfig]
+    config: type[ReaderKind]
+
+
+def list_external_readers() -> list[type[ReaderKind]]:
+    """Return the readers that other packages or Python arguments have registered."""
+    return list_external_classes(ReaderConfig)
+
+
+def list_log_endings() -> tuple[str, ...]:
+    """Return the extensions of files that may be logs, including those of registered readers."""
+    return (
+        *_BUILTIN_ENDINGS,
+        *(ending for reader in list_external_readers() for ending in _external_endings(reader)),
+    )
+
+
+def _external_endings(reader: type[ReaderKind]) -> list[str]:
+    """Return the endings of a registered reader in lower case, without those of residnet."""
+    # a package must not take over the tables and recordings that residnet reads
+    return [ending.lower() for ending in reader.endings if ending.lower() not in _RESERVED_ENDINGS]
 
 
 def suggest_conversion(ending: str) -> str:
@@ -76,9 +98,15 @@ def suggest_conversion(ending: str) -> str:
         ending: extension of the file, with its dot.
     """
     pandas_call = _PANDAS_READERS.get(ending, "pandas.DataFrame(rows, columns=[...])")
+    endings_text = ", ".join(
+        f"{ending} ({get_kind(reader)})"
+        for reader in list_external_readers()
+        for ending in _external_endings(reader)
+    )
     return (
         "convert it to csv with a line of column names, in Python"
         f" {pandas_call}.to_csv('log.csv', index=False)"
+        + (f"; installed readers of other packages accept {endings_text}" if endings_text else "")
     )
 
 
@@ -109,10 +137,17 @@ class AutoConfig(RecordingConfig):
         if recording_format is None:
             names = ", ".join(name for config in _RECORDING_CONFIGS for name in config.formats)
             raise UsageError(
-                f"{path}: the format does not describe its columns; give a channel map with"
-                f" --config (formats that need none: {names}, canonical Parquet)"
+                f"{path}: the format does not describe its columns; set `kind` of the reader (csv,"
+                " parquet, excel or json_lines) and `channels`, which `residnet new FOLDER` drafts"
+                f" (kind auto reads: {names})"
             )
-        return recording_format.config.model_validate({}).load(path, field_filter)
+        reader = recording_format.config
+        if not issubclass(reader, RecordingConfig):
+            raise UsageError(
+                f"{path}: kind auto reads recordings, and the reader of this file returns"
+                f" channels; set `kind: {get_kind(reader)}`"
+            )
+        return reader.model_validate({}).load_checked(path, field_filter)
 
 
 def detect_recording_format(path: Path) -> RecordingFormat | None:
@@ -133,7 +168,37 @@ def detect_recording_format(path: Path) -> RecordingFormat | None:
         for name, matches in config.formats.items():
             if matches(path, head):
                 return RecordingFormat(name, config)
+    return _detect_external_format(path, head)
+
+
+def _detect_external_format(path: Path, head: bytes) -> RecordingFormat | None:
+    """Return the format of a registered reader that accepts a log; None without one.
+
+    Args:
+        path: file or folder.
+        head: first bytes of the file; empty for a folder.
+    """
+    for reader in list_external_readers():
+        has_ending = path.suffix.lower() in _external_endings(reader) and not path.is_dir()
+        if has_ending or any(matches(path, head) for matches in reader.formats.values()):
+            return RecordingFormat(str(get_kind(reader)), reader)
     return None
+
+
+def detect_external_kind(path: Path) -> str:
+    """Return the kind of the registered reader that reads a log; empty for one of residnet."""
+    recording_format = detect_recording_format(path)
+    if recording_format is None or recording_format.config in _RECORDING_CONFIGS:
+        return ""
+    return recording_format.name
+
+
+def is_channel_reader(kind: str) -> bool:
+    """Return whether a registered reader returns channels itself, so that it needs no map."""
+    return any(
+        get_kind(reader) == kind and not issubclass(reader, RecordingConfig)
+        for reader in list_external_readers()
+    )
 
 
 def detect_log_kind(path: Path) -> str:
