@@ -37,7 +37,8 @@ CODE = textwrap.dedent(
     from residnet.baselines.config import IdentifiedConfig
     from residnet.heads.base import Features, ResidualHead
     from residnet.heads.config import BaseHeadConfig
-    from residnet.io.readers.base import require_file, wrap_read_errors
+    from residnet.core.log import Log
+    from residnet.io.readers.base import ConfiguredReader, require_file, wrap_read_errors
     from residnet.io.readers.compose import RecordingConfig
     from residnet.io.readers.recording import ALL_FIELDS, Recording, Series
 
@@ -52,6 +53,16 @@ CODE = textwrap.dedent(
                 t, *columns = np.loadtxt(path, delimiter=";", ndmin=2).T
                 fields = dict(zip(("spd", "rot", "rud"), columns, strict=True))
             return Recording(path, {"nav": Series("nav", "", fields, stamp=t)}, files=(path,))
+
+    class DirectConfig(ConfiguredReader):
+        "Reader that returns channels in SI units."
+        kind: Literal["direct"] = "direct"
+        endings: ClassVar[tuple[str, ...]] = (".direct",)
+
+        def read(self, path):
+            t, u = np.loadtxt(path, delimiter=";").T
+            meta = {"source": str(path), "sha256": ""}
+            return Log(path.stem, t, {"u": u, "r": 0.1 * np.sin(t)}, meta=meta)
 
     class CrudeConfig(PlumbConfig):
         "Reader whose load raises a plain error."
@@ -144,7 +155,7 @@ def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     site.mkdir()
     kinds = {
         "heads": ("narrow", "single", "transposed", "void"),
-        "readers": ("plumb", "crude", "short"),
+        "readers": ("plumb", "direct", "crude", "short"),
         "baselines": ("flat",),
     }
     entry_points = {
@@ -182,6 +193,16 @@ def test_endings_of_a_registered_reader_are_logs(logs: Path) -> None:
         assert np.allclose(read[0]["r"], np.deg2rad(2.0 * np.sin(0.3 * read[0].t)))
 
 
+def test_reader_of_channels_needs_no_channel_map(logs: Path) -> None:
+    file = logs / "three.direct"
+    file.write_text("".join(f"{0.1 * k:.1f};{1.0 + 0.01 * k:.2f}\n" for k in range(50)))
+    drafted = read_drafted([file], DraftNotes())
+    assert drafted.reader == {"kind": "direct"}
+    assert drafted.logs[file]["u"][1] == 1.01
+    with pytest.raises(UsageError, match="set `kind: direct`"):
+        AutoConfig().read(file)
+
+
 def test_registered_reader_takes_no_ending_of_residnet(logs: Path) -> None:
     (logs / "table.csv").write_text("t [s],u [m/s]\n0,1\n1,2\n2,3\n")
     assert detect_log_kind(logs / "table.csv") == "table"
@@ -195,7 +216,7 @@ def test_message_on_unknown_files_names_endings_of_readers(tmp_path: Path, logs:
     folder = tmp_path / "unknown"
     folder.mkdir()
     (folder / "a.abc").write_bytes(bytes(range(256)))
-    with pytest.raises(UsageError, match=r"readers of other packages accept \.plumb \(plumb\)$"):
+    with pytest.raises(UsageError, match=r"accept .*\.plumb \(plumb\)"):
         find_log_files([folder])
 
 

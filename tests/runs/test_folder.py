@@ -168,7 +168,9 @@ def test_provenance_names_every_input_by_its_hash(
         file.write_bytes(contents[file.name])
     monkeypatch.setattr("sys.argv", ["residnet", "run", "x.yaml"])
     started = time.time() - 12.0
-    Provenance(tmp_path / "x.yaml", ["seed=3"], 3, files, started).write(folder)
+    Provenance(tmp_path / "x.yaml", ["seed=3"], 3, files, started).write(
+        folder, {"made-parts": "1.0"}
+    )
     content = json.loads((folder.path / "provenance.json").read_text())
     hashes = [hashlib.sha256(data).hexdigest() for data in contents.values()]
     assert content["inputs"] == dict(zip(map(str, files), hashes, strict=True))
@@ -179,6 +181,7 @@ def test_provenance_names_every_input_by_its_hash(
     told |= {"started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started))}
     assert {key: content[key] for key in told} == told
     assert 12.0 <= content["seconds"] < 60.0
+    assert content["part_packages"] == {"made-parts": "1.0"}
     assert content["packages"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
 
 
