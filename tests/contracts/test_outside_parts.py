@@ -19,6 +19,7 @@ from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.external_parts import describe_external_error
 from residnet.dynamics.first_step import check_first_step
 from residnet.heads import HeadConfig
+from residnet.heads.module import register_module
 from residnet.identification.settings import FitSettings
 from residnet.io.drafting.questions import DraftNotes
 from residnet.io.drafting.reading import find_log_files, read_drafted
@@ -264,6 +265,9 @@ def test_fit_settings_check_the_first_step_of_external_parts() -> None:
     }
     with pytest.raises(ConfigError, match="forward returned Tensor"):
         validate_config({**settings, "heads": {"mine": {"kind": "single"}}}, FitSettings, "here")
+    head = validate_config({"kind": "single"}, HeadConfig, "here").build(("u", "v", "r", "delta"))
+    with pytest.raises(ConfigError, match=r"class Single of package outside\): forward returned"):
+        validate_config({**settings, "heads": {"mine": register_module(head)}}, FitSettings, "here")
     with pytest.raises(ConfigError, match=r"returned \[B, 1\], expected accelerations"):
         validate_config({**settings, "baseline": {"kind": "flat"}}, FitSettings, "here")
 

@@ -14,6 +14,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.external_parts import is_external_part
 from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY, PLANT
 from residnet.core.names import suggest_name
+from residnet.core.registry import is_python_part
 from residnet.dynamics.time_steps import Integrator
 from residnet.evaluation.band import BandsConfig
 from residnet.evaluation.protocol import EvaluationConfig
@@ -170,8 +171,8 @@ class FitSettings(ModelPartsConfig):
         part_configs: dict[str, Any] = {**baselines, **self.heads}
         for part_name, part_config in part_configs.items():
             try:
-                if is_external_part(part_config):
-                    # only parts of other packages, because this imports PyTorch
+                if is_external_part(part_config) or is_python_part(part_config):
+                    # only parts of other packages and of Python, because this imports PyTorch
                     from residnet.dynamics.first_step import check_first_step
 
                     check_first_step(part_config, names)
