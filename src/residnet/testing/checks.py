@@ -798,8 +798,8 @@ def check_reader(config: Config, file: Path) -> Log:
     assert_true(isinstance(reader, LogReader), f"{subject}: build does not return a LogReader")
     file = Path(file)
     try:
-        log: Any = reader.read(file)
-        reread: Any = reader.read(file)
+        log = reader.read(file)
+        reread = reader.read(file)
     except ResidnetError as error:
         raise AssertionError(f"{subject}: cannot read the file ({error})") from error
     except Exception as error:  # the code of a user may raise anything
