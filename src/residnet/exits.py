@@ -128,20 +128,19 @@ def _error_message(error: Exception) -> tuple[str, int]:
     if isinstance(error, ModuleNotFoundError) and "residnet" not in str(error.name):
         problem = f"{sys.executable} has no package '{error.name}'"
         return f"{problem}; install residnet for this Python, or take that of its .venv", 2
-    # a command that uses no plug-ins never imports the registry
-    if "residnet.core.registry" in sys.modules and not os.environ.get(TRACEBACK_VARIABLE):
-        from residnet.core.external_parts import describe_external_error
-
-        if message := describe_external_error(error):
-            hint = f"for its traceback repeat the command with {TRACEBACK_VARIABLE}=1"
-            return f"{message} ({hint} in the environment)", 1
-    first_line = next(iter(str(error).splitlines()), "")
     hint = f"for its traceback repeat the command with {TRACEBACK_VARIABLE}=1 in the environment"
     if os.environ.get(TRACEBACK_VARIABLE):
         import traceback
 
         traceback.print_exception(error)
         hint = "attach the traceback above to an issue"
+    # a command that uses no plug-ins never imports the registry
+    if "residnet.core.registry" in sys.modules:
+        from residnet.core.external_parts import describe_external_error
+
+        if message := describe_external_error(error):
+            return f"{message}; {hint}", 1
+    first_line = next(iter(str(error).splitlines()), "")
     return f"this is a defect of residnet, {type(error).__name__}: {first_line[:200]}; {hint}", 1
 
 

@@ -52,6 +52,6 @@ def describe_external_error(error: BaseException) -> str:
             message = (
                 f"{type(error).__name__} in {frame.f_code.co_qualname}"
                 f" ({Path(frame.f_code.co_filename).name}, line {line}) of the package {package}:"
-                f" {text}; correct that package"
+                f" {text}; correct it there"
             )
     return message

@@ -37,7 +37,7 @@ def check_first_step(config: BaseHeadConfig | IdentifiedConfig, names: Sequence[
         ConfigError: if `build` or `forward` raises an error, or returns another type or shape.
     """
     is_head = isinstance(config, BaseHeadConfig)
-    expected_class = ResidualHead if is_head else Baseline
+    expected_class: type[Any] = ResidualHead if is_head else Baseline
     subject = f"{'head' if is_head else 'baseline'} '{config.kind}'"
     # the generator is restored, so that the check changes no initial weights
     with torch.random.fork_rng(devices=[]), torch.no_grad():
