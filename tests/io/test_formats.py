@@ -177,5 +177,5 @@ def test_formats_by_content(write: Writer, name: str, tmp_path: Path) -> None:
     assert found.name == name
     (table := tmp_path / "table.csv").write_text("a,b\n1,2\n")
     assert detect_recording_format(table) is None
-    with pytest.raises(UsageError, match="give a channel map"):
+    with pytest.raises(UsageError, match="`channels`, which `residnet new FOLDER` drafts"):
         reader_for(table).read(table)
