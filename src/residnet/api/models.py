@@ -425,7 +425,7 @@ def export_model(
         format: one of `list_available("formats")`.
         metrics: rows of `FreeRuns.rows`. The rows of this model are copied to the model card; the
             rows of `constant_velocity` and of a baseline under the same protocol are its reference.
-        allows_objections: export the model even if it is worse than its reference; the card
+        allows_objections: export the model even if it is worse than its reference; the model card
             states this.
 
     Raises:

@@ -333,9 +333,9 @@ def required_force(
 class LagCompensatedPID(Policy):
     """PID with feed-forward of the required force, which compensates the lag of the actuators.
 
-    Reference [B, 18]: eta_d, nu_d, nu_dot_d, then `required_force`. Memory [B, 15]: the integral of
-    the PID, then of each axis the predicted force of the actuators, its rate, and the integral and
-    double integral of the difference from the required force.
+    The reference [B, 18] is eta_d, nu_d, nu_dot_d, then `required_force`. The memory [B, 15] is
+    the integral of the PID, then of each axis the predicted force of the actuators, its rate, and
+    the integral and double integral of the difference from the required force.
 
     The command is tau_p + 2 zeta / omega tau_p' + (tau'' + k1 e' + k2 e + k3 I + k4 II) / omega^2,
     with the error e of the force. At a jump of the desired jerk the required force has a corner

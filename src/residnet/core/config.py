@@ -352,7 +352,7 @@ def _resolve_element(container: Any, name: str, label: str, path: KeyPath) -> st
 class Quantity:
     """Marker of a float field that accepts an SI number or text with a unit.
 
-    Used in an annotation: `Annotated[float, Quantity("kg")]`.
+    It is used in an annotation: `Annotated[float, Quantity("kg")]`.
 
     Attributes:
         si: SI unit of the dimension; the validated value is in this unit.
@@ -412,7 +412,7 @@ class Quantity:
 class PolynomialOf:
     """Marker of the coefficients c_0, c_1, ... of a polynomial with dimensions.
 
-    Used in an annotation: `Annotated[tuple[float, float, float], PolynomialOf("N", "1/s")]`.
+    It is used in an annotation: `Annotated[tuple[float, float, float], PolynomialOf("N", "1/s")]`.
 
     Attributes:
         value: SI unit of the polynomial.

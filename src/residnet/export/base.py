@@ -101,8 +101,8 @@ class Exportable(ABC):
         precisions: precisions to try, in this order.
         methods: methods of the module of `build_module` in addition to `forward`.
         objections: reasons against its use, written into the model card; see `require_releasable`.
-        assessment: verdict, data findings and log split of its run for the card; None if it is
-            exported without a run folder.
+        assessment: verdict, data findings and log split of its run for the model card; None if it
+            is exported without a run folder.
     """
 
     name: str
@@ -191,7 +191,7 @@ class Exportable(ABC):
     def check_parity(
         self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float | None = None
     ) -> dict[str, Any]:
-        """Check the parity of an exported file and return the card entries on parity.
+        """Check the parity of an exported file and return the entries of the model card on it.
 
         Args:
             tolerance: largest allowed difference; None for the default of the precision.

@@ -356,7 +356,7 @@ class ExportedVessel(Exportable):
     def check_parity(
         self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float | None = None
     ) -> dict[str, Any]:
-        """Check the parity of a file for good and bad inputs and return the card entries on parity.
+        """Check the parity of a file for good and bad inputs; returns the model card entries on it.
 
         Raises:
             RoundingError: if the track depends on rounding in this precision.

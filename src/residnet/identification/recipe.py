@@ -207,7 +207,8 @@ def make_hull_terms(data_summary: TrainingDataSummary) -> list[str] | dict[str, 
     """Return the terms of a manoeuvring model: hull, propellers, rudders and wind.
 
     Rudders are recognised by name. Every other input is treated as a propeller with a force that is
-    linear and quadratic in it and decreases with the inflow. Forces enter directly.
+    linear and quadratic in it and decreases with the inflow. Inputs that are forces are terms
+    themselves.
 
     For short logs each axis has only the terms of a mirror-symmetric vessel and the asymmetry of a
     single propeller: half of the coefficients of all terms in all axes.

@@ -46,8 +46,8 @@ class InputShare(Config):
         """Return drive, steer, centre, limit and rate of the input `name` in SI.
 
         Raises:
-            ConfigError: if a value has a wrong unit, or the input does not depend on drive and
-                steer.
+            ConfigError: if a value has a wrong unit, or the input does not depend on the
+                propulsion and steering commands.
         """
         unit = CHANNEL_UNITS.get(name, "-")
         value = Quantity(unit)

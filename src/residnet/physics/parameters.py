@@ -83,7 +83,8 @@ _BASE_DIMENSIONS = {
 def parse_dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
     """Return the exponents of metre and second in an SI unit with `mass` as that of kilogram.
 
-    For example (2, -1) for `kg m^2/s` or `N m s/rad`; None for any other unit.
+    For example, the result is (2, -1) for `kg m^2/s` or `N m s/rad`. It is None for any other
+    unit.
     """
     metre_power = second_power = mass_power = 0
     # factors are separated by a space (multiplied) or a slash (divided), such as `kg m^2/s`

@@ -1,8 +1,8 @@
 """Gymnasium environments (single and vectorised) for vessels and learned models.
 
-Needs the extra `gymnasium`. An action in [-1, 1] covers each command's range; an observation holds
-the velocities, the goal observation of the task and the last action. Observations and rewards of
-the reference tasks are scaled by the cruise speed of the vehicle and by its look-ahead distance,
+It needs the extra `gymnasium`. An action in [-1, 1] covers each command's range; an observation
+holds the velocities, the goal observation of the task and the last action. Observations and rewards
+of the reference tasks are scaled by the cruise speed of the vehicle and by its look-ahead distance,
 the distance travelled in ten seconds at cruise speed.
 """
 

@@ -93,7 +93,7 @@ class SteeringPolicy(AnglePolicy, ABC):
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """Return the structure of the policy, which exports store in their metadata (card)."""
+        """Return the structure of the policy, which exports store in their model card."""
 
 
 @final

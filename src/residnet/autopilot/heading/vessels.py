@@ -448,7 +448,7 @@ class SteeredModel(SteeredVessel):
         )
 
     def memory(self, variation: Tensor) -> Tensor:
-        """Return the variation, followed by the zero memory of the head (residual model)."""
+        """Return the variation of the steering and the zero memory of the head (residual model)."""
         initial_memory = variation.new_zeros(len(variation), self.hull.n_state)
         return torch.cat((variation, initial_memory), dim=1)
 

@@ -264,7 +264,7 @@ class VectoredThrusterConfig(ThrusterPositionConfig):
 class VectoredThrustersConfig(ActuatorConfig):
     """Equal thrusters of a vessel in six degrees of freedom.
 
-    The command is the thrust, because the motor drives invert the thrust curve.
+    The command is the thrust, because the motor controllers invert the thrust curve.
 
     Attributes:
         thrusters: the thrusters, in the order of the commands.

@@ -766,7 +766,7 @@ def model_figures(
 ) -> list[Figure]:
     """Return figures of the weights of a model, and of the errors for the choice of its order.
 
-    Figures 4.6, 4.20, 4.22 and 4.25 of the document.
+    They correspond to Figures 4.6, 4.20, 4.22 and 4.25 of Jervan 2020.
 
     Args:
         unmodelled: mean square of the believed model's residual by axis.

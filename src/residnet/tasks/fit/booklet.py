@@ -126,7 +126,9 @@ def write_booklet(
 
 
 def require_flyable(config: BookletConfig, logs: PreparedSplits, settings: FitSettings) -> None:
-    """Check without a simulation that a model has the inputs and states of the booklet.
+    """Check that a model has the inputs and states of the manoeuvring booklet.
+
+    Nothing is simulated.
 
     Args:
         config: settings of the manoeuvring booklet.

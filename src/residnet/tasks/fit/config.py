@@ -43,8 +43,8 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
     Attributes:
         study: a published experiment whose figures the report shows too; null for none.
         data: logs and splits.
-        booklet: standard manoeuvres simulated by one of the refitted baselines, with intervals;
-            null for none.
+        booklet: manoeuvring booklet, the standard manoeuvres simulated by one of the refitted
+            baselines, with intervals; null for none.
         derivatives: main particulars, for the hydrodynamic derivatives of a baseline; null for
             none.
         export: models that are exported when the run ends.

@@ -428,7 +428,7 @@ _TRACK_INTERVAL = 0.1
 
 
 def tabulate_spread(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFrame:
-    """Return one line for each flight of the spread."""
+    """Return one line for each simulation of the varied vessels."""
     columns = (
         "model",
         "guidance",

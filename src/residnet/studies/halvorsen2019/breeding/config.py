@@ -29,7 +29,7 @@ TRUE_COEFFICIENTS = {"tau_x": 1.0 / MASS, "u": -DAMPING / MASS, "x": -STIFFNESS 
 class RecordConfig(Config):
     """A record of the mass-spring-damper under a square wave of a force of 1 N, from rest.
 
-    Section 5.3.1 and Figure 5.3 of Halvorsen 2019.
+    Source: Halvorsen 2019, section 5.3.1 and Figure 5.3.
 
     Attributes:
         length: length of the record in s.

@@ -113,7 +113,7 @@ def exports(config: FerryStudyConfig, folder: RunFolder) -> ExportWriters:
 
 
 def export_model(config: FerryStudyConfig, request: ExportRequest) -> Path:
-    """Write the feed-forward of a model; `selected` has the smallest error in judging flights.
+    """Write the feed-forward of a model; `selected` has the smallest error in judging runs.
 
     Raises:
         UsageError: if the run has no such model or no judging flights.
@@ -675,7 +675,7 @@ def _run_figures(runs: Mapping[str, FerryRun], run_kind: str) -> list[Figure]:
 
 
 def _summarize_judging(metrics: Mapping[str, TrackingMetrics | None]) -> dict[str, Any]:
-    """Return the mean errors over the judging courses; None if a flight is unstable."""
+    """Return the mean errors over the judging courses; None if a simulation is unstable."""
     stable_runs = [run for run in metrics.values() if run is not None]
     is_stable = len(stable_runs) == len(metrics)
     position_errors = [run.position_mae for run in stable_runs]
@@ -688,7 +688,7 @@ def _summarize_judging(metrics: Mapping[str, TrackingMetrics | None]) -> dict[st
 
 
 def _error_text(judging: StudyResults) -> str:
-    """Return the mean position error of the judging flights with its unit."""
+    """Return the mean position error of the judging simulations with its unit."""
     error = judging["position_mae"]
     return "unstable" if error is None else f"{format_number(error)} m"
 
@@ -696,7 +696,7 @@ def _error_text(judging: StudyResults) -> str:
 def list_feed_forward_objections(name: str, results: StudyResults) -> list[str]:
     """Return objections to a feed-forward instead of the believed one.
 
-    The criterion is the mean position error of simulated flights: on the judging courses, and in
+    The criterion is the mean position error of simulations: on the judging courses, and in
     the operational crossing if there is one. The residual force is no criterion, because a model
     with a larger residual may track courses better.
     """
@@ -821,7 +821,7 @@ def _tracking_tables(
 ) -> list[Block]:
     """Return tables of tracking errors and forces on a course.
 
-    Tables 4.4, 4.8, 4.10, 4.12 and 4.13 of the document; Tables 4.3 and 4.9.
+    They correspond to Tables 4.3, 4.4, 4.8, 4.9, 4.10, 4.12 and 4.13 of Jervan 2020.
     """
     rows = []
     for name, metrics in runs.items():

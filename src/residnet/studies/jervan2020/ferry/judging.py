@@ -1,8 +1,8 @@
-"""Judging courses of the ferry study, and the exported feed-forwards that are flown on them.
+"""Judging courses of the ferry study, and the exported feed-forwards that are simulated on them.
 
 The residual force on a record does not determine how well a feed-forward tracks a course: on drawn
 ferries, the model with the smallest position error had the larger residual. Models are therefore
-compared by simulated flights on courses that were not used for identification.
+compared by simulations on courses that were not used for identification.
 """
 
 from __future__ import annotations
