@@ -197,8 +197,8 @@ def tools(folder: Path, wanted: Sequence[str]) -> str:
 @pytest.mark.parametrize(
     ("ratio", "words"),
     [
-        (0.98, r"2 % higher than the ensemble's \(within one"),
-        (0.5, r"100 % higher .* \(beyond one"),
+        (0.98, r"2.0 % higher than the ensemble's \(within one"),
+        (0.5, r"100.0 % higher .* \(beyond one"),
     ],
 )
 def test_the_single_model_is_proposed_with_its_size(

@@ -255,7 +255,7 @@ def describe_single_model(run: RunFolder, ensemble: str, single: str, ensemble_b
         is_within = increase <= rows[ensemble].standard_error
         percentage = 100.0 * math.expm1(increase)
         error_text = (
-            f"; its validation error is {abs(percentage):.0f} %"
+            f"; its validation error is {abs(percentage):.1f} %"
             f" {'higher' if percentage > 0.0 else 'lower'} than the ensemble's"
             f" ({'within' if is_within else 'beyond'} one standard error)"
         )
