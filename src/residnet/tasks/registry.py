@@ -176,8 +176,8 @@ def write_client_pdf(
     from residnet.report.client import read_client_text, write_client_report
 
     run = RunFolder.open(path)
-    require_free_space(output_file or path)
     pdf_file = output_file or path / "client_report.pdf"
+    require_free_space(pdf_file.parent)
     if pdf_file.suffix.lower() != ".pdf":
         raise UsageError(f"--out {pdf_file}: expected a file name that ends in .pdf")
     text = None if text_file is None else read_client_text(text_file)
