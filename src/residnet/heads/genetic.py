@@ -22,7 +22,11 @@ from residnet.regression.expressions import (
     format_product,
 )
 from residnet.regression.genetic import GeneticEquations
-from residnet.regression.lack_of_fit import estimate_lack_of_fit, probe_families
+from residnet.regression.lack_of_fit import (
+    estimate_lack_of_fit,
+    probe_families,
+    select_test_rows,
+)
 from residnet.regression.sparse import SparseRegression
 
 if TYPE_CHECKING:
@@ -79,7 +83,9 @@ class GeneticHead(EquationHead):
 
     def _add_lack_of_fit(self, solution: Solution, samples: Samples) -> Solution:
         """Add the lack of fit of the usual candidates and the terms of a solution to its notes."""
-        z = self.features.select_clamped(samples.z)
+        rows = select_test_rows(len(samples))
+        z = self.features.select_clamped(samples.z[rows])
+        target = samples.target[rows].numpy()
         solution_library = ExpressionLibrary(self.config.evolution.nesting)
         prefix = "library."
         solution_library.load_state_dict(
@@ -97,7 +103,7 @@ class GeneticHead(EquationHead):
             | {
                 "lack_of_fit": estimate_lack_of_fit(
                     columns.numpy(),
-                    samples.target[:, k].numpy(),
+                    target[:, k],
                     families,
                     probes,
                 )

@@ -23,7 +23,11 @@ from residnet.regression.equation_rows import (
 )
 from residnet.regression.estimator import Coefficient, Solution
 from residnet.regression.expressions import format_equation, format_sum, terms_to_sympy
-from residnet.regression.lack_of_fit import estimate_lack_of_fit, probe_families
+from residnet.regression.lack_of_fit import (
+    estimate_lack_of_fit,
+    probe_families,
+    select_test_rows,
+)
 from residnet.regression.sparse import SparseRegression
 
 if TYPE_CHECKING:
@@ -323,6 +327,16 @@ class SymbolicHead(EquationHead):
 
     def _estimate_lack_of_fit(self, samples: SegmentedSamples) -> dict[str, dict[str, float]]:
         """Return the lack of fit of all candidates of each axis by family of functions."""
+        is_allowed = self._allowed_terms(samples).numpy()
+        if not self.config.estimator.sequential:
+            # probes of all samples would take several times the memory of the fit
+            rows = select_test_rows(len(samples.target))
+            samples = SegmentedSamples(
+                samples.features[rows],
+                samples.target[rows],
+                samples.segment[rows],
+                samples.time_step,
+            )
         with torch.no_grad():
             term_values = self.candidate_values(torch.from_numpy(samples.features)).numpy()
         families, probes = probe_families(samples.features, self.features.names)
@@ -336,7 +350,6 @@ class SymbolicHead(EquationHead):
         n_terms = term_values.shape[1]
         probe_ends = n_terms + np.cumsum([columns.shape[1] for columns in probes])
         probe_columns = np.split(regression_rows.x, [n_terms, *probe_ends[:-1]], axis=1)[1:]
-        is_allowed = self._allowed_terms(samples).numpy()
         return {
             output: estimate_lack_of_fit(
                 regression_rows.x[:, :n_terms][:, is_allowed[:, k]],

@@ -35,6 +35,11 @@ _SPAN_TOLERANCE: Final = 1e-6
 """Norm of a unit probe orthogonal to the candidates, below which it lies in their span."""
 
 
+def select_test_rows(n_rows: int) -> slice:
+    """Return the rows of the test, at most `_MAX_ROWS` evenly spaced ones of all rows."""
+    return slice(None, None, -(-max(n_rows, 1) // _MAX_ROWS))
+
+
 def probe_families(
     features: np.ndarray, names: Sequence[str]
 ) -> tuple[list[tuple[str, ...]], list[np.ndarray]]:
@@ -84,12 +89,12 @@ def estimate_lack_of_fit(
         candidates that the family predicts by cross-validation. Empty if there is no lack of fit,
         or if there are too few samples to test it.
     """
-    rows = np.arange(0, len(y), -(-len(y) // _MAX_ROWS))
+    rows = select_test_rows(len(y))
     target = y[rows]
     norms = np.linalg.norm(x[rows], axis=0)
     candidates = x[rows][:, norms > 0] / norms[norms > 0]
     # with nearly as many candidates as rows, the candidates fit the noise
-    if len(rows) < 2 * candidates.shape[1] + _N_BLOCKS * 2 * _PAIR_DEGREE**2:
+    if len(target) < 2 * candidates.shape[1] + _N_BLOCKS * 2 * _PAIR_DEGREE**2:
         return {}
     left_vectors, singular_values, _ = np.linalg.svd(candidates, full_matrices=False)
     basis = left_vectors[:, singular_values > 1e-10 * singular_values.max(initial=1e-300)]
