@@ -328,6 +328,9 @@ def test_errors_of_the_pose_are_told_after_the_times_that_matter(
     # velocities were made from the positions
     assert first.floor.position == pytest.approx(0.0, abs=1e-9)
     assert first.models["constant_velocity"].position == pytest.approx(0.0, abs=1e-9)
+    # the paired differences are 5 m in every window
+    assert first.change_from_constant_velocity["mlp"]["position"] == pytest.approx((5.0, 5.0))
+    assert "constant_velocity" not in first.change_from_constant_velocity
 
 
 def test_no_interval_of_a_heading_passes_half_a_turn(run: FreeRun, logs: list[PreparedLog]) -> None:

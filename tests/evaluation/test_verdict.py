@@ -236,7 +236,13 @@ def test_unsound_models_and_divergences_are_named() -> None:
             "Up to 10 s ahead",
         ),
         # a tenth of the way is no use where the bow points elsewhere
-        ([horizon(30, errors(3.0, 67.0))], "limited", "30 s ahead mlp is off by 3.0 m"),
+        ([horizon(30, errors(3.0, 67.0))], "do not use", "30 s ahead mlp is off by 3.0 m"),
+        # of limited use up to the horizon that meets its limits
+        (
+            [horizon(10, errors(3.0, 5.0)), horizon(30, errors(25.0, 25.0))],
+            "limited",
+            "10 s ahead mlp is off by 3.0 m",
+        ),
         # the upper end of the interval counts, and where there is none nobody can say
         ([horizon(30, errors(5.0, 5.0, half=0.5))], "limited", "A good model has"),
         ([horizon(30, errors(3.0, 5.0, half=None))], "too few windows", "5 of 3 logs are needed"),
@@ -263,10 +269,12 @@ def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
     entries = [horizon(10, errors(0.5, 2.0)), horizon(30, errors(3.0, 5.0))]
     said = write_verdict(evidence(limits_by_protocol=under(horizons=entries)))
     assert said[0].endswith(
-        "is off by 3.0 m (2.7 to 3.3, 5.0 % of the 60 m sailed) and 5.0 deg (4.5 to 5.5)."
+        "is off by 3.0 m (95 % prediction interval 2.7 to 3.3, 5.0 % of the 60 m sailed) and 5.0"
+        " deg (4.5 to 5.5)."
     )
     assert said[1].startswith(
-        "Reference models: constant velocity 30 m (27 to 33) and 40 deg (36 to 44); baseline"
+        "Reference models (95 % prediction intervals): constant velocity 30 m (27 to 33) and 40 deg"
+        " (36 to 44); baseline"
     )
     assert said[1].endswith("noise floor (measured velocities, integrated) 0.10 m and 0.20 deg.")
     assert said[2] == "At other times of these free runs: 0.50 m and 2.0 deg after 10 s."
@@ -274,7 +282,7 @@ def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
     # no number has an exponent that a reader must work out
     limits = under(horizons=[horizon(100, errors(1234.0, 113.0))])
     lost = " ".join(write_verdict(evidence(limits_by_protocol=limits)))
-    assert "off by 1234 m (1111 to 1357, 617 % of the 200 m sailed) and 113 deg" in lost
+    assert "off by 1234 m (95 % prediction interval 1111 to 1357, 617 % of the 200 m" in lost
 
 
 def test_a_model_as_near_as_the_plant_itself_is_good() -> None:
@@ -418,3 +426,27 @@ def test_velocities_that_leave_the_positions_make_no_model_good() -> None:
     assert rate_model(evidence(limits_by_protocol=limits)) == "limited"
     sentences = " ".join(write_verdict(evidence(limits_by_protocol=limits)))
     assert "integrated, leave the measured positions by 21 % of the way" in sentences
+
+
+@pytest.mark.parametrize(
+    ("position_change", "heading_change", "level"),
+    [
+        ((-29.0, -20.0), (-0.7, -0.5), "good"),
+        # better in position alone
+        ((-29.0, -20.0), (-0.7, 0.1), "do not use"),
+        ((-29.0, 3.0), (-0.7, -0.5), "do not use"),
+    ],
+)
+def test_a_useful_model_is_significantly_better_than_constant_velocity_in_both(
+    position_change: tuple[float, float], heading_change: tuple[float, float], level: str
+) -> None:
+    changes = {"mlp": {"position": position_change, "heading": heading_change}}
+    entry = horizon(30, errors(3.0, 5.0)).model_copy(
+        update={"change_from_constant_velocity": changes}
+    )
+    judged = evidence(limits_by_protocol=under(horizons=[entry]))
+    assert rate_model(judged) == level
+    text = " ".join(write_verdict(judged))
+    assert ("significantly better than constant velocity in position and heading" in text) == (
+        level == "do not use"
+    )

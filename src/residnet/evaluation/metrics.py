@@ -477,6 +477,9 @@ class ProtocolEvaluation:
                     sailed=float(np.mean(distances)),
                     floor=floor,
                     models=_summarize_pose_errors(pose_errors_by_model, log_indices),
+                    change_from_constant_velocity=_compare_pose_errors(
+                        pose_errors_by_model, log_indices
+                    ),
                 )
             )
         return entries
@@ -688,6 +691,32 @@ def _summarize_pose_errors(
         means = {name: mean for name, (mean, _) in mean_and_interval.items()}
         summary[model] = PoseErrors.model_validate({**means, "intervals": intervals_by_name})
     return summary
+
+
+def _compare_pose_errors(
+    pose_errors: Mapping[str, Mapping[str, np.ndarray]], log_indices: np.ndarray
+) -> dict[str, dict[str, Interval | None]]:
+    """Return confidence intervals of the differences to the constant-velocity model.
+
+    Args:
+        pose_errors: magnitudes [W] of the pose errors by model and name.
+        log_indices: log index [W] of each window.
+    """
+    reference_errors = pose_errors.get(CONSTANT_VELOCITY)
+    if reference_errors is None:
+        return {}
+    blocks = make_resampling_blocks(log_indices)
+    changes: dict[str, dict[str, Interval | None]] = {}
+    for model, sizes_by_name in pose_errors.items():
+        if model == CONSTANT_VELOCITY:
+            continue
+        differences = np.column_stack(
+            [sizes - reference_errors[name] for name, sizes in sizes_by_name.items()]
+        )
+        changes[model] = dict(
+            zip(sizes_by_name, bootstrap_intervals(differences, blocks), strict=True)
+        )
+    return changes
 
 
 def find_row(

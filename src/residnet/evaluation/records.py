@@ -276,6 +276,9 @@ class HorizonRow(Record):
         floor: errors of the integrated measured velocities, which even exact velocities of a model
             would have.
         models: errors by model.
+        change_from_constant_velocity: by model and pose error, the paired 95 % confidence interval
+            of its mean error minus that of the constant-velocity model, SI; None if there are too
+            few logs. Empty without a constant-velocity model, and in runs of earlier versions.
     """
 
     seconds: float
@@ -286,6 +289,9 @@ class HorizonRow(Record):
     sailed: float
     floor: PoseErrors
     models: dict[str, PoseErrors]
+    change_from_constant_velocity: dict[str, dict[str, Interval | None]] = Field(
+        default_factory=dict
+    )
 
 
 class ClassErrors(Record):

@@ -125,6 +125,9 @@ _MAX_ANGLE_ERROR = math.radians(10.0)
 Both limits apply to the upper limit of the prediction interval; twice the noise floor is allowed in
 any case. The values are a convention of residnet, and the verdict states them.
 """
+_MAX_LIMITED_DISTANCE_SHARE = 0.25
+_MAX_LIMITED_ANGLE_ERROR = math.radians(30.0)
+"""The same for a model of limited use; it must be better than constant velocity, too."""
 _POSE_ERROR_SUFFIXES = {"depth": " of depth", "attitude": " of attitude"}
 """Suffixes of pose errors other than horizontal position and heading."""
 _MAX_RATIO_TO_BEST = 1.5
@@ -179,7 +182,9 @@ def rate_model(evidence: VerdictEvidence) -> str:
         or bool(evidence.one_sided_text)
         or bool(list_unidentifiable_inputs(evidence))
     )
-    return GOOD_LEVEL if longest_good_horizon(evidence) and not has_limitation else LIMITED_LEVEL
+    if longest_good_horizon(evidence) and not has_limitation:
+        return GOOD_LEVEL
+    return LIMITED_LEVEL if not horizons or longest_limited_horizon(evidence) else DO_NOT_USE
 
 
 def list_unidentifiable_inputs(evidence: VerdictEvidence) -> list[str]:
@@ -292,19 +297,58 @@ def longest_good_horizon(evidence: VerdictEvidence) -> float:
                 twice_noise_floor,
                 _MAX_RATIO_TO_BEST * min(rival_errors, default=selected_error),
             )
-            beats_constant_velocity = (
-                CONSTANT_VELOCITY not in errors_by_model
-                or selected_error
-                <= max(twice_noise_floor, errors_by_model[CONSTANT_VELOCITY][error_name])
-            )
             if not (
                 is_near_best
-                and beats_constant_velocity
+                and is_better_than_constant_velocity(evidence, row, error_name)
                 and interval[1] <= max(error_limit, twice_noise_floor)
             ):
                 return longest_horizon
         longest_horizon = row.seconds
     return longest_horizon
+
+
+def longest_limited_horizon(evidence: VerdictEvidence) -> float:
+    """Return the horizon in s up to which the selected model is of limited use; 0 for none.
+
+    All pose errors must be significantly smaller than those of the constant-velocity model, and
+    within the limits of a limited model up to the upper end of their prediction intervals.
+    """
+    longest_horizon = 0.0
+    for _, row in known_horizons(evidence):
+        if not _has_enough_data(evidence, row):
+            return longest_horizon
+        for error_name, interval in row.models[evidence.selected].intervals.items():
+            assert interval is not None, "checked by _has_enough_data"
+            error_limit = (
+                _MAX_LIMITED_ANGLE_ERROR
+                if POSE_ERROR_UNITS[error_name] == "rad"
+                else _MAX_LIMITED_DISTANCE_SHARE * row.sailed
+            )
+            twice_noise_floor = 2.0 * row.floor.by_name[error_name]
+            if interval[1] > max(error_limit, twice_noise_floor):
+                return longest_horizon
+            if not is_better_than_constant_velocity(evidence, row, error_name):
+                return longest_horizon
+        longest_horizon = row.seconds
+    return longest_horizon
+
+
+def is_better_than_constant_velocity(
+    evidence: VerdictEvidence, row: HorizonRow, error_name: str
+) -> bool:
+    """Return whether a pose error is significantly smaller than that of constant velocity.
+
+    Without a confidence interval of the difference the mean errors decide. True without a
+    constant-velocity model.
+    """
+    reference_errors = row.models.get(CONSTANT_VELOCITY)
+    if reference_errors is None or evidence.selected == CONSTANT_VELOCITY:
+        return True
+    changes = row.change_from_constant_velocity.get(evidence.selected, {})
+    if (interval := changes.get(error_name)) is not None:
+        return interval[1] < 0.0
+    selected_error = row.models[evidence.selected].by_name[error_name]
+    return selected_error < reference_errors.by_name[error_name]
 
 
 def contradicts_positions(row: HorizonRow) -> bool:
@@ -325,8 +369,10 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
         horizon for horizon in horizons if _has_enough_data(evidence, horizon.row)
     ]
     longest_horizon = longest_good_horizon(evidence) if sufficient_horizons else 0.0
+    # the horizon of the level, so that badge and sentence are about the same free runs
+    level_horizon = longest_horizon or longest_limited_horizon(evidence)
     main_horizon = next(
-        (horizon for horizon in horizons if horizon.row.seconds == longest_horizon),
+        (horizon for horizon in horizons if horizon.row.seconds == level_horizon),
         (sufficient_horizons or horizons)[-1],
     )
     main_row = main_horizon.row
@@ -360,9 +406,16 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
         )
         criterion_sentences = [
             f"A good model has errors within {good_limits_text} up to the upper end of the"
-            " interval, or within twice the noise floor, no diverged window, and errors near those"
-            " of the best model of the run."
+            " prediction interval, or within twice the noise floor, no diverged window, and errors"
+            " near those of the best model of the run."
         ]
+    if sufficient_horizons and not level_horizon:
+        criterion_sentences.append(
+            "A model of limited use has errors within"
+            f" {100.0 * _MAX_LIMITED_DISTANCE_SHARE:.0f} % of the way and"
+            f" {math.degrees(_MAX_LIMITED_ANGLE_ERROR):.0f} deg, and is significantly better than"
+            " constant velocity in position and heading: do not use this one."
+        )
     reference_labels = {CONSTANT_VELOCITY: "constant velocity", evidence.baseline: "baseline"}
     reference_texts = [
         f"{label} {_format_errors_with_intervals(main_row.models[name])}"
@@ -398,7 +451,7 @@ def describe_horizons(evidence: VerdictEvidence) -> list[str]:
     return [
         lead_sentence,
         *contradiction_sentences,
-        f"Reference models:"
+        f"Reference models (95 % prediction intervals):"
         f" {'; '.join([*reference_texts, *([noise_floor_text] if has_noise_floor else [])])}.",
         *criterion_sentences,
         *(
@@ -430,6 +483,9 @@ def _format_errors_with_intervals(errors: PoseErrors, distance_travelled: float 
         interval = errors.intervals[error_name]
         unit_factor = display_unit(POSE_ERROR_UNITS[error_name]).factor
         details = [format_interval(interval, unit_factor, 2)] if interval else []
+        if details and distance_travelled > 0.0 and not texts:
+            # stated once; the interval of the heading is of the same kind
+            details[0] = f"95 % prediction interval {details[0]}"
         if error_name == "position" and distance_travelled > 0.0:
             details.append(
                 f"{format_number(100.0 * error / distance_travelled, 2)} % of"
