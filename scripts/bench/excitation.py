@@ -1,6 +1,7 @@
 """Does a verdict of "good" hold in open loop, and does `outside` flag what logs did not excite?
 
     python scripts/bench/excitation.py [--kinds pid alike ...] [--seed 101] [--out DIR]
+    python scripts/bench/excitation.py --domain-only [--kinds pid alike ...] [--seed 101]
 
 For each kind of boat of `excitation_boats.py`, logs are written, drafted by `residnet new` and
 fitted by `residnet run`. The predictor then predicts windows of 10 s of new logs of the same kind,
@@ -8,7 +9,8 @@ and of open-loop flights whose inputs step by themselves within the logged range
 for each kind: the level, the states of the inputs, the share of steps flagged as outside in both
 sets, and of the open-loop windows inside the domain (less than a tenth of the steps flagged) the
 share whose error of position, of heading, or of either exceeds its prediction interval. Runs that
-`--out` holds are used again.
+`--out` holds are used again. `--domain-only` fits no models: it prints the flags of the operating
+domain alone.
 """
 
 from __future__ import annotations
@@ -18,15 +20,21 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import bench
 import excitation_boats as boats
 import numpy as np
 import torch
+import yaml
 
+import residnet
+from residnet.dynamics.domain import DomainCheck
 from residnet.dynamics.store import ModelSpec, load_model, resolve_model_name
 from residnet.export.guard import GuardedDynamics
+from residnet.identification.domain import estimate_domain
+from residnet.preprocessing.prepare import compute_training_ranges
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.verdict import verdict_level
 
@@ -57,6 +65,52 @@ def input_columns(spec: ModelSpec, header: list[str]) -> list[int]:
     """Return the column of each input of a model in the tables of a boat."""
     names = [name.removesuffix("_rps").removesuffix("_deg") for name in header]
     return [names.index(name) for name in spec.signals.input_columns]
+
+
+def make_domain_check(
+    dataset: residnet.Dataset, header: list[str]
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function of a table that flags samples outside domain and ranges of the logs [T].
+
+    The logs of validation belong to the training of the short logs of these boats.
+    """
+    signals = dataset.signals
+    column_names = [name.removesuffix("_rps").removesuffix("_deg") for name in header]
+    columns = [column_names.index(name) for name in signals.input_columns]
+    training_logs = [*dataset.logs("train"), *dataset.logs("validation")]
+    domain = estimate_domain(training_logs, signals, dataset.prepare.grid.step)
+    lower, upper = compute_training_ranges(training_logs)
+    names = (*signals.dof.dynamic_states, *signals.input_columns)
+    margins = np.array([domain.range_margins.get(name, 0.0) for name in names])
+    check = DomainCheck(domain, signals.dof.state_names, signals.input_columns, torch.float64)
+
+    def flag_samples(table: np.ndarray) -> np.ndarray:
+        w = table[:, columns]
+        if dataset.prepare.hold == "mean":
+            w = np.concatenate((0.5 * (w[1:] + w[:-1]), w[-1:]))
+        values = np.column_stack((table[:, 4:7], w))
+        is_in_range = ((values >= lower - margins) & (values <= upper + margins)).all(axis=1)
+        is_in_domain = check(torch.from_numpy(table[:, 1:7]), torch.from_numpy(w)).numpy()
+        return np.asarray(~(is_in_range & is_in_domain))
+
+    return flag_samples
+
+
+def prepare_draft(folder: Path) -> residnet.Dataset:
+    """Return the logs of a drafted config, prepared as its fit prepares them."""
+    config = yaml.safe_load((folder / "boat.yaml").read_text())
+    config["data"]["split"]["root"] = str(folder / config["data"]["split"]["root"])
+    signals = dict(config["signals"])
+    preparation = config["prepare"]
+    return residnet.prepare(
+        config["data"],
+        signals.pop("inputs"),
+        step=preparation["grid"]["step"],
+        held_channels=preparation["grid"].get("held"),
+        derivative=preparation["derivative"],
+        hold=preparation["hold"],
+        **signals,
+    )
 
 
 def judge(
@@ -107,7 +161,14 @@ def judge(
 
 def main() -> None:
     """Print the table."""
-    options = bench.options(__doc__, kinds=dict.fromkeys(boats.KINDS), seed=101, effort=0.1, out="")
+    options = bench.options(
+        __doc__,
+        kinds=dict.fromkeys(boats.KINDS),
+        seed=101,
+        effort=0.1,
+        out="",
+        domain_only=False,
+    )
     root = Path(options.out or tempfile.mkdtemp())
     print("kind         seed level        flagged: same kind, open loop; beyond the interval:")
     for number, kind in enumerate(options.kinds):
@@ -115,6 +176,27 @@ def main() -> None:
         seed = options.seed + number
         folder = root / f"{kind}_{seed}"
         boat = boats.write_logs(kind, seed, folder / "log")
+        logs = [read_table(path) for path in sorted((folder / "log").glob("*.csv"))]
+        if options.domain_only:
+            run_residnet("new", "log", "--out", "boat.yaml", "--overwrite", folder=folder)
+            flag_samples = make_domain_check(prepare_draft(folder), boats.log_header(boat))
+            tables = [
+                [
+                    boats.sail(boat, boats.KINDS[kind][1](boat), 100.0)[100:]
+                    for _ in range(_N_NEW_LOGS)
+                ],
+                list(boats.open_loop_flights(boat, logs, _N_FLIGHTS)),
+            ]
+            shares = []
+            for part in tables:
+                for k, rows in enumerate(part):
+                    # written and read, so that the noise of the sensors is that of the logs
+                    boats.write_table(folder / "new" / f"{k}.csv", boat, rows)
+                    part[k] = read_table(folder / "new" / f"{k}.csv")
+                flags = [flag_samples(table) for table in part]
+                shares.append(np.concatenate(flags).mean())
+            print(f"{kind:12s} {seed:4d} {shares[0]:6.1%} {shares[1]:6.1%}", flush=True)
+            continue
         if not (folder / "run" / "report.html").exists():
             run_residnet("new", "log", "--out", "boat.yaml", folder=folder)
             run_residnet(
@@ -124,7 +206,6 @@ def main() -> None:
         spec, model = load_model(run.path / "models" / resolve_model_name(run.path, "predictor"))
         guarded = GuardedDynamics(model.double(), spec).double().eval()
         columns = input_columns(spec, boats.log_header(boat))
-        logs = [read_table(path) for path in sorted((folder / "log").glob("*.csv"))]
         fresh = []
         for k in range(_N_NEW_LOGS):
             rows = boats.sail(boat, boats.KINDS[kind][1](boat), 100.0)[100:]

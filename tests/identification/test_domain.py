@@ -103,6 +103,22 @@ def test_the_log_distance_compares_with_the_training_data() -> None:
     assert log_domain_distance(OperatingDomain(n_logs=1), log.y, log.w, STATES, ("delta",)) is None
 
 
+def test_a_log_of_another_kind_does_not_widen_the_domain() -> None:
+    signals = SignalsConfig(inputs=("delta",))
+    logs = logs_of("steps", range(5))
+    domain = estimate_domain(logs, signals, 0.1)
+    # a log at twice the speed, which no other log explains
+    fast = logs_of("steps", range(5, 6))[0]
+    fast.y[:, 3] *= 2.0
+    mixed = estimate_domain([*logs, fast], signals, 0.1)
+    n_features = round(len(mixed.factor) ** 0.5)
+    # Markov's inequality: at most this for the distribution of the training logs itself
+    assert mixed.limit <= n_features / 0.008 + 1e-6
+    assert mixed.false_flags > domain.false_flags
+    new_logs = logs_of("steps", range(10, 14))
+    assert np.mean([flagged(mixed, log, ("delta",)) for log in new_logs]) < 0.02
+
+
 def test_open_loop_is_outside_of_logs_of_a_controller() -> None:
     signals = SignalsConfig(inputs=("delta",))
     domain = estimate_domain(logs_of("controller", range(6)), signals, 0.1)

@@ -140,7 +140,7 @@ def judged(run: Path, level: str) -> Path:
     """A made-up run whose verdict has that level; a log has a clock that jumps."""
     ends = {"position": 0.4, "heading": 0.01}
     # what the end of an interval allows counts
-    most = 100.0 if level == "limited" else 1.1
+    most = 15.0 if level == "limited" else 1.1
     spans = {of: [0.9 * x, most * x] for of, x in ends.items()}
     windows = 3 if level == "too few windows" else 12
     horizon: dict[str, Any] = {

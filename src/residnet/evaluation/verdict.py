@@ -478,7 +478,7 @@ def _format_pose_errors(errors: PoseErrors) -> str:
 
 def _format_errors_with_intervals(errors: PoseErrors, distance_travelled: float = 0.0) -> str:
     """Return errors of position and heading with their intervals as text."""
-    texts = []
+    texts: list[str] = []
     for error_name, error in errors.by_name.items():
         interval = errors.intervals[error_name]
         unit_factor = display_unit(POSE_ERROR_UNITS[error_name]).factor

@@ -54,9 +54,8 @@ _MIN_LAW_R2: Final = 0.3
 """R^2 of a control law in leave-one-log-out cross-validation, below which the reference of the
 controller is no function of the channels of the model.
 """
-_HEADING_EXCESS: Final = 1.5
-"""Factor by which new headings may exceed the largest deviation from the reference of a controller.
-"""
+_MIN_HEADING_LIMIT: Final = math.radians(0.5)
+"""Smallest limit of the deviation of a heading from the reference, a compass's error."""
 
 
 def detect_feedback_of_logs(
@@ -105,23 +104,20 @@ def estimate_domain(
     """
     samples = [_usable_samples(log, len(logs)) for log in logs if log.usable.any()]
     names = (*signals.dof.state_names, *signals.input_columns)
-    relations = [
-        _relate_unexcited_input(name, samples, names, signals.inputs) for name in signals.unexcited
-    ]
-    relations += _relate_collinear_inputs(samples, names, signals.inputs)
-    is_closed_loop_only = False
-    for feedback in detect_feedback_of_logs(logs, signals, step):
-        if not feedback.is_closed_loop:
-            continue
-        law = _fit_control_law(feedback, samples, names)
-        is_closed_loop_only |= law is None
-        relations += [] if law is None else [law]
+    relations, is_closed_loop_only = _relate_inputs(logs, samples, signals, step)
     parts = samples
     if len(samples) < _MIN_LOGS:
         parts = [part for sample in samples for part in np.array_split(sample, 4) if len(part)]
     folds = _make_folds(len(parts))
     scores = [_held_out_deviations(relation, parts, folds, names) for relation in relations]
     smallest_limits = [relation.tolerance for relation in relations]
+    largest_limits = [math.inf] * len(relations)
+    # the heading of a controlled vessel has a range, too
+    controlled = [k for k, relation in enumerate(relations) if relation.heading is not None]
+    for k in controlled:
+        scores.append(_heading_deviations(relations[k], parts, names))
+        smallest_limits.append(_MIN_HEADING_LIMIT)
+        largest_limits.append(math.pi)
     channels, columns = _varying_channels(parts, names, signals)
     margins = np.zeros(0)
     if channels:
@@ -130,18 +126,26 @@ def estimate_domain(
         margins = np.minimum(_predict_range_margins(rows), _MAX_RANGE_MARGIN * scale)
         scores.append(_held_out_range_excesses(rows, np.maximum(margins, 1e-9 * scale), folds))
         smallest_limits.append(1.0)
+        largest_limits.append(math.inf)
     density: dict[str, object] = {}
     density_channels, density_columns = _select_density_channels(channels, columns, signals)
     if density_channels:
         density, features, moments = _estimate_density(parts, density_channels, density_columns)
         scores.append(_held_out_scores(features, moments, folds))
         smallest_limits.append(1e-9)
-    limits, false_flags = _calibrate_limits(scores, smallest_limits)
+        # the mean of q over the training logs is the number of features, so that by Markov's
+        # inequality a larger limit would tell of logs of different kinds, not of their distribution
+        largest_limits.append(math.sqrt(features[0].shape[1] / FALSE_FLAG_SHARE))
+    limits, false_flags = _calibrate_limits(scores, smallest_limits, largest_limits)
+    n_relations = len(relations)
     for k, relation in enumerate(relations):
         relations[k] = relation.model_copy(update={"tolerance": limits[k]})
+    for limit, k in zip(limits[n_relations:], controlled, strict=False):
+        relations[k] = relations[k].model_copy(update={"max_heading": limit})
     if channels:
         scale = np.concatenate(parts)[:, columns].std(axis=0)
-        margins = np.minimum(limits[len(relations)] * margins, _MAX_RANGE_MARGIN * scale)
+        factor = limits[n_relations + len(controlled)]
+        margins = np.minimum(factor * margins, _MAX_RANGE_MARGIN * scale)
     if density:
         density["limit"] = limits[-1] ** 2
     return OperatingDomain.model_validate(
@@ -211,14 +215,41 @@ def _estimate_density(
     return density, features, moments
 
 
+def _relate_inputs(
+    logs: Sequence[PreparedLog], samples: Sequence[np.ndarray], signals: SignalsConfig, step: float
+) -> tuple[list[InputRelation], bool]:
+    """Return the relations of inputs to each other and to the motion.
+
+    Returns:
+        Relations of unexcited, collinear and controlled inputs, and whether a controller follows
+        a reference that the model cannot see.
+    """
+    names = (*signals.dof.state_names, *signals.input_columns)
+    relations = [
+        _relate_unexcited_input(name, samples, names, signals.inputs) for name in signals.unexcited
+    ]
+    relations += _relate_collinear_inputs(samples, names, signals.inputs)
+    is_closed_loop_only = False
+    for feedback in detect_feedback_of_logs(logs, signals, step):
+        if not feedback.is_closed_loop:
+            continue
+        law = _fit_control_law(feedback, samples, names)
+        is_closed_loop_only |= law is None
+        relations += [] if law is None else [law]
+    return relations, is_closed_loop_only
+
+
 def _calibrate_limits(
-    scores: Sequence[Sequence[np.ndarray]], smallest_limits: Sequence[float]
+    scores: Sequence[Sequence[np.ndarray]],
+    smallest_limits: Sequence[float],
+    largest_limits: Sequence[float],
 ) -> tuple[list[float], float]:
     """Return the limits of some criteria at the joint level 1 - FALSE_FLAG_SHARE.
 
     Args:
         scores: of each criterion, the scores [K] of the held-out samples of each log.
         smallest_limits: smallest limit of each criterion.
+        largest_limits: largest limit of each criterion.
 
     Returns:
         The limit of each criterion, and the share of the samples beyond any of them.
@@ -226,17 +257,31 @@ def _calibrate_limits(
     if not scores:
         return [], 0.0
     level = 1.0 - FALSE_FLAG_SHARE
+    bounds = list(zip(smallest_limits, largest_limits, strict=True))
     limits = [
-        max(_weighted_quantile(score, level), smallest_limit)
-        for score, smallest_limit in zip(scores, smallest_limits, strict=True)
+        float(np.clip(_weighted_quantile(score, level), *bound))
+        for score, bound in zip(scores, bounds, strict=True)
     ]
+    # a score beyond the largest limit is flagged in any case and must not widen other criteria
     joint_scores = [
-        np.max([score[k] / limit for score, limit in zip(scores, limits, strict=True)], axis=0)
+        np.max(
+            [
+                np.minimum(score[k], bound[1]) / limit
+                for score, limit, bound in zip(scores, limits, bounds, strict=True)
+            ],
+            axis=0,
+        )
         for k in range(len(scores[0]))
     ]
     factor = max(_weighted_quantile(joint_scores, level), 1.0)
-    false_flags = float(np.mean([(score > factor).mean() for score in joint_scores]))
-    return [factor * limit for limit in limits], false_flags
+    limits = [
+        float(np.clip(factor * limit, *bound)) for limit, bound in zip(limits, bounds, strict=True)
+    ]
+    flags = [
+        np.any([score[k] > limit for score, limit in zip(scores, limits, strict=True)], axis=0)
+        for k in range(len(scores[0]))
+    ]
+    return limits, float(np.mean([flag.mean() for flag in flags]))
 
 
 Fold = tuple[np.ndarray, np.ndarray]
@@ -373,6 +418,17 @@ def _held_out_deviations(
     return deviations
 
 
+def _heading_deviations(
+    relation: InputRelation, samples: Sequence[np.ndarray], names: Sequence[str]
+) -> list[np.ndarray]:
+    """Return the deviation of the heading from the reference of a controller at each sample."""
+    assert relation.heading is not None
+    column = names.index("psi")
+    return [
+        np.abs(np.angle(np.exp(1j * (sample[:, column] - relation.heading)))) for sample in samples
+    ]
+
+
 def _relation_regressors(
     relation: InputRelation, sample: np.ndarray, names: Sequence[str]
 ) -> np.ndarray:
@@ -457,7 +513,6 @@ def _fit_control_law(
     heading_column = names.index("psi")
     joined = np.concatenate(samples)
     reference = float(np.angle(np.exp(1j * joined[:, heading_column]).mean()))
-    heading = np.angle(np.exp(1j * (joined[:, heading_column] - reference)))
     velocity_names = tuple(name for name in ("v", "r") if name in names)
     law = InputRelation(
         input=feedback.name,
@@ -466,7 +521,6 @@ def _fit_control_law(
         channels=velocity_names,
         gains=(0.0,) * len(velocity_names),
         heading=reference,
-        max_heading=min(float(np.abs(heading).max()) * _HEADING_EXCESS + 0.01, math.pi),
         tolerance=1e-9,
     )
     # the regression has a constant of its own
