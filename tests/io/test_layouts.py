@@ -179,6 +179,9 @@ def test_forces_by_their_units_and_speed_by_its_letter() -> None:
         "F_y [kN]",
         "M_z [Nm]",
     }
+    acting = match_channels(["acting_tau_x [N]", "tau_x [N]", "psi"], DraftNotes())
+    assert acting["tau_x"] == "tau_x [N]"
+    assert acting["acting_tau_x"] == "acting_tau_x [N]"
     speed = match_channels(["X", "Y", "Heading", "V [m/s]", "Drift angle", "Rudder"], DraftNotes())
     assert "V [m/s]" not in speed.values()
 

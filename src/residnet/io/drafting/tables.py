@@ -991,7 +991,8 @@ def _match_force_column(column: str) -> str | None:
     if unit is None or is_part:
         return None
     words = parsed_name.text.split()
-    if not words:
+    if not words or "_".join(words) in CHANNEL_UNITS:
+        # a canonical name such as acting_tau_x has its own channel
         return None
     axis = re.sub(r"^[fmt](?=[xyzuvrn]$)", "", words[-1])
     if words == [axis]:
