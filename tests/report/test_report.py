@@ -312,6 +312,7 @@ def test_what_doctor_sanity_refit_and_currents_found_is_shown(run: Path) -> None
     for words in ("Physical sanity", "plsr, damping: words on damping", REFITTED):
         assert words in text
     assert "0.31 ± 0.020" in text
+    assert "A constant current of each log was estimated: 0.33 m/s on average" in text
     assert "of other logs" in text
     loud = {one.code for report in reports for one in report.findings if one.level != "note"}
     assert "gaps" in loud

@@ -69,6 +69,7 @@ class VerdictEvidence:
         excitation: contents of excitation.json; None for runs of earlier versions.
         n_logs: number of logs of the free runs; 0 if unknown.
         n_logs_of_fit: number of them that are among the data of the fit, by their SHA-256.
+        current_text: one sentence on the currents of the logs; empty without an estimate.
     """
 
     selected: str
@@ -83,6 +84,7 @@ class VerdictEvidence:
     excitation: ExcitationFile | None = None
     n_logs: int = 0
     n_logs_of_fit: int = 0
+    current_text: str = ""
 
     @property
     def data_name(self) -> str:
@@ -159,6 +161,7 @@ def write_verdict(evidence: VerdictEvidence) -> list[str]:
         ),
         describe_unexcited(evidence),
         evidence.data_quality_text,
+        evidence.current_text,
         *horizon_sentences,
         describe_soundness(evidence),
         "" if evidence.selection is None else evidence.selection.reason,

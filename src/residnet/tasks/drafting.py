@@ -5,6 +5,7 @@ The inputs of the model are selected from channels of commands and actuators.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 import shlex
@@ -12,7 +13,7 @@ import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -64,6 +65,9 @@ from residnet.tasks.naval_draft import (
     draft_naval_sections,
 )
 
+if TYPE_CHECKING:
+    from residnet.tasks.fit.config import FitConfig
+
 STOP = "stop: "
 """Prefix of the last line of a draft that must be completed before a run."""
 _MIN_TURN = np.radians(20.0)
@@ -71,6 +75,10 @@ _MIN_TURN = np.radians(20.0)
 _UNMATCHED_COLUMN_NOTES = (UNMAPPED_COLUMNS, TEXT_COLUMNS, UNMAPPED_FIELDS)
 _MAX_INSPECTED_LOGS = 12
 """Maximum number of logs that are inspected."""
+_MAX_TESTED_SAMPLES = 400
+_MIN_CURRENT_SHARE = 1.0 / 3.0
+"""Samples of a log in the test of a current, and share of logs with a significant current from
+which currents are estimated."""
 _MAX_SHOWN_GUESSES = 12
 """Maximum number of guesses shown on the terminal."""
 
@@ -322,13 +330,66 @@ def draft_fit_config(
             SINGLE_MODEL_NAME,
             draft_notes,
         )
-    validate_config(config, FitConfig, "draft", folder)
+    settings = validate_config(config, FitConfig, "draft", folder)
+    if _has_current(settings, [*splits["train"], *splits["validation"]], draft_notes):
+        config["current"] = {"baseline": SINGLE_MODEL_NAME}
     guesses = tuple((".".join(key), text) for key, text in draft_notes.guessed_values)
     unused = [text for key, text in draft_notes.notes if key[-1] == "channels" or key == ("data",)]
     exclusions = group_problems(draft_logs.exclusion_reasons, has_full_paths=False)
     exclusion_lines = [f"left out: {line}" for line in exclusions]
     text = dump_commented_yaml(config, draft_notes.comments_at, draft_logs.header_lines())
     return ConfigDraft(config, guesses, text, (*exclusion_lines, *unused), missing_text)
+
+
+def _has_current(settings: FitConfig, logs: Sequence[Log], draft_notes: DraftNotes) -> bool:
+    """Test whether logs over ground ran in currents, by the accelerations of a hull model.
+
+    Args:
+        settings: of the fit, without `current`.
+        logs: logs with complete motion.
+        draft_notes: receives the currents.
+    """
+    dof = settings.signals.dof
+    if not dof.is_planar or dof.fixed_states or not settings.signals.inputs:
+        return False
+    from residnet.baselines.regressors import RegressorBaseline
+    from residnet.identification.prepared import prepare_splits
+    from residnet.identification.recipe import SINGLE_MODEL_NAME
+    from residnet.training.current import estimate_currents, select_significant_currents
+    from residnet.training.current_config import CurrentConfig
+
+    signals = settings.signals.build()
+    model = settings.baselines[SINGLE_MODEL_NAME].build(signals.names)
+    if not isinstance(model, RegressorBaseline):
+        return False
+    try:
+        prepared = prepare_splits({"train": logs[:_MAX_INSPECTED_LOGS]}, settings)["train"]
+        # neighbouring samples are correlated, so that few of them suffice for a test
+        thinned = [
+            dataclasses.replace(
+                log,
+                trainable=log.trainable
+                & (np.arange(len(log)) % max(len(log) // _MAX_TESTED_SAMPLES, 1) == 0),
+            )
+            for log in prepared
+        ]
+        _, rows = estimate_currents(model, signals, thinned, CurrentConfig())
+    except ResidnetError:
+        # logs without a usable sample are reported when the draft is run
+        return False
+    speeds = [float(np.nanmedian(np.hypot(log.log["u"], log.log["v"]))) for log in prepared]
+    currents = select_significant_currents(rows, speeds)
+    if len(currents) < _MIN_CURRENT_SHARE * len(rows):
+        return False
+    listed = ", ".join(
+        f"{row.log} {row.speed:.2g} m/s (p = {row.p_value:.1g})" for row in currents[:3]
+    )
+    draft_notes.add_guess(
+        ("current",),
+        f"{len(currents)} of {len(rows)} logs ran in a significant constant current or wind:"
+        f" {listed}; the current of each log is estimated, remove this section for still water",
+    )
+    return True
 
 
 def _explain_missing_steering(

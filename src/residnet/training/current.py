@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
+from scipy.special import fdtrc
 from torch import Tensor
 
 from residnet.baselines.regressors import RegressorBaseline
@@ -35,6 +36,9 @@ _MIN_ROUND_GAIN = 0.1
 """Decrease of the negative log-posterior below which a round is the last one."""
 _CONVERGED_STEP = 1e-4
 """Largest change of a current in m/s at which Gauss-Newton has converged."""
+_MAX_P_VALUE = 0.01
+_MIN_SPEED_SHARE = 0.02
+"""Largest p-value and smallest share of the speed of a significant current."""
 
 
 def estimate_currents(
@@ -94,10 +98,32 @@ def estimate_currents(
             current_north=float(c[0]),
             current_east=float(c[1]),
             standard_error=(birge_ratio * e).tolist(),
+            # the variance ratio has two degrees of freedom per fitted log
+            p_value=float(
+                fdtrc(2.0, 2.0 * len(logs), 0.5 * float((c / (birge_ratio * e)).square().sum()))
+            ),
         )
         for i, (p, c, e) in enumerate(zip((*logs, *others), current, error, strict=True))
     ]
     return current.numpy(), rows
+
+
+def select_significant_currents(
+    rows: Sequence[CurrentRow], speeds: Sequence[float]
+) -> list[CurrentRow]:
+    """Return the significant currents, with Bonferroni's correction for the number of logs.
+
+    Args:
+        rows: currents of logs with their p-values.
+        speeds: speed of each vessel in m/s; a current below a fiftieth of it does not matter.
+    """
+    return [
+        row
+        for row, speed in zip(rows, speeds, strict=True)
+        if row.p_value is not None
+        and row.p_value * len(rows) < _MAX_P_VALUE
+        and row.speed > _MIN_SPEED_SHARE * speed
+    ]
 
 
 def _estimate(problem: _CurrentProblem, config: CurrentConfig) -> tuple[Tensor, Tensor, Tensor]:

@@ -16,6 +16,8 @@ class CurrentRow(Record):
         current_north: velocity of the water to the north in m/s.
         current_east: velocity of the water to the east in m/s.
         standard_error: standard errors of both in m/s.
+        p_value: probability of such an estimate without a current, by an F test; None if it was
+            not tested.
     """
 
     log: str
@@ -23,6 +25,7 @@ class CurrentRow(Record):
     current_north: float
     current_east: float
     standard_error: tuple[float, float]
+    p_value: float | None = None
 
     @property
     def speed(self) -> float:

@@ -114,11 +114,12 @@ def _currents_table(run: RunFiles, currents: Sequence[CurrentRow]) -> Table:
             ("log", lambda row: row.log),
             (f"north [{unit}]", lambda row: component(row.current_north, row.standard_error[0])),
             (f"east [{unit}]", lambda row: component(row.current_east, row.standard_error[1])),
+            ("p-value", lambda row: format_number(row.p_value, 1)),
             ("coefficients", lambda row: "fitted with it" if row.fitted else "of other logs"),
         ],
         caption="Every log ran in a constant current of its own, which was estimated, with one"
-        " standard error: as far as the two halves of a log agree. Errors of this page are those of"
-        " the motion through the water.",
+        " standard error: as far as the two halves of a log agree. The p-value is that of an F test"
+        " against no current. Errors of this page are those of the motion through the water.",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from residnet.report.blocks import Bullets, Cell, Facts, Section, Text, build_ta
 from residnet.report.figure import Figure
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.free_runs import distinct_manoeuvres
+from residnet.training.records import CurrentsFile
 
 
 def verdict_sentences(run: RunFiles) -> list[str]:
@@ -99,6 +101,21 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
         run.read_record(ExcitationFile, "excitation.json"),
         len(fit_marks),
         sum(fit_marks),
+        current_text=_describe_currents(run),
+    )
+
+
+def _describe_currents(run: RunFiles) -> str:
+    """Return a sentence on the currents of the logs; empty if none were estimated."""
+    currents = run.read_record(CurrentsFile, "currents.json")
+    if currents is None or not currents.root:
+        return ""
+    unit, factor = run.display_unit("u")
+    speeds = [factor * row.speed for row in currents.root]
+    return (
+        f"A constant current of each log was estimated: {format_number(statistics.mean(speeds), 2)}"
+        f" {unit} on average, at most {format_number(max(speeds), 2)} {unit}; errors are those of"
+        " the motion through the water."
     )
 
 
