@@ -85,7 +85,8 @@ class InstrumentErrorRow(Record):
         value: estimate.
         standard_error: standard error of the estimate.
         is_determined: whether sensors determine it; otherwise the smoothness of the motion does.
-        is_significant: whether it is determined and differs from zero by 3.5 standard errors.
+        is_significant: whether it is determined and differs from zero by 3.5 standard errors; a
+            clock also by half a sample.
     """
 
     name: str
