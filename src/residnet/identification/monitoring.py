@@ -675,14 +675,14 @@ class FaultHypothesis:
         test_statistic: statistic of the score test, in standard deviations of clean logs.
         estimated_size: size of the change in its unit.
         standard_error: standard error of the size.
-        explained_square: reduction of the joint score statistic by this change alone.
+        score_reduction: reduction of the joint score statistic by this change alone.
     """
 
     change: SystemChange
     test_statistic: float
     estimated_size: float
     standard_error: float
-    explained_square: float
+    score_reduction: float
 
 
 @dataclass(frozen=True)
@@ -693,7 +693,7 @@ class MonitorVerdict:
         is_alarm: whether the largest score exceeds the threshold; an online detector keeps the
             alarm until the scores are clearly below the threshold.
         threshold: threshold of the scores.
-        hypotheses: possible changes in descending order of `explained_square`.
+        hypotheses: possible changes in descending order of `score_reduction`.
         innovation_rms: root mean square of the whitened innovations of each channel; 1 on clean
             logs.
     """
@@ -1017,7 +1017,7 @@ class ChangeDetector:
             )
         ]
         is_alarm = max(hypothesis.test_statistic for hypothesis in hypotheses) > self.threshold
-        hypotheses.sort(key=lambda hypothesis: -hypothesis.explained_square)
+        hypotheses.sort(key=lambda hypothesis: -hypothesis.score_reduction)
         n_windows = sum(group_sums.n_windows for group_sums in sums_by_group)
         squares = (
             np.sum([group_sums.squared_innovations for group_sums in sums_by_group], axis=0)

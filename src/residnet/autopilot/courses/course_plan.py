@@ -533,7 +533,7 @@ def _search_outline(
             for circle, clearance in zip(request.circles, extra_clearance, strict=True)
         ],
         turn_room(0),
-        [turn_room(circle.table) for circle in request.circles],
+        [turn_room(circle.turn_table_index) for circle in request.circles],
         request.turns.min_radius,
         ring_offsets,
     ).find_outline()

@@ -240,13 +240,13 @@ class Circle:
         centre: complex position in m.
         radius: radius in m.
         turn_sign: +1 if the buoy is left to starboard, -1 to port, 0 if the circle is entered.
-        table: index of the turn table for the turn round the buoy.
+        turn_table_index: index of the turn table for the turn round the buoy.
     """
 
     centre: complex
     radius: float
     turn_sign: int
-    table: int
+    turn_table_index: int
 
 
 @final
@@ -399,7 +399,7 @@ class RouteSearch:
         positions = np.concatenate([radius * np.exp(1j * angle) for radius in (*radii, arc_radius)])
         headings = np.tile(angle + turn_sign * 0.5 * math.pi, len(radii) + 1)
         poses = _Poses(circle.centre + positions, headings, number)
-        return poses.with_arc(turn_sign, circle.table, arc_radius)
+        return poses.with_arc(turn_sign, circle.turn_table_index, arc_radius)
 
     def _circles_between(self, number: int) -> list[int]:
         """Return the circles between a buoy and its predecessor, the nearest first."""

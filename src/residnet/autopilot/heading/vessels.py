@@ -407,7 +407,7 @@ class SteeredModel(SteeredVessel):
         vessel: SteeredPlant,
     ) -> None:
         states = get_dof(model.signals.names).state_names
-        self.hull = model
+        self.learned_model = model
         self.vessel = vessel
         self.uses_step_mean = input_hold == "mean"
         self.axis = axis = vessel.axis
@@ -438,7 +438,7 @@ class SteeredModel(SteeredVessel):
         A model without memory can be built for any time step.
         """
         return VariedModel(
-            self.hull,
+            self.learned_model,
             dt,
             self.input_indices,
             self.uses_step_mean,
@@ -449,7 +449,7 @@ class SteeredModel(SteeredVessel):
 
     def memory(self, variation: Tensor) -> Tensor:
         """Return the variation of the steering and the zero memory of the head (residual model)."""
-        initial_memory = variation.new_zeros(len(variation), self.hull.n_state)
+        initial_memory = variation.new_zeros(len(variation), self.learned_model.n_state)
         return torch.cat((variation, initial_memory), dim=1)
 
     def straight_course(self, speed: Tensor) -> tuple[Tensor, Tensor]:

@@ -277,11 +277,11 @@ def monitor_run(
     refit_folder: Path | None,
 ) -> tuple[list[MonitoredLog], RefitResult | None]:
     """Test new logs for changes, and refit the model; see `FitConfig.monitor`."""
-    from residnet.tasks.fit.service import FittedModelService, require_refit_folder, run_refit
+    from residnet.tasks.fit.service import FittedModelMonitor, require_refit_folder, run_refit
 
     if refit_folder is not None:
         require_refit_folder(run, refit_folder, config)
-    monitor = FittedModelService(config, run, logs, model, settings)
+    monitor = FittedModelMonitor(config, run, logs, model, settings)
     monitored_logs = monitor.monitor_logs()
     refit_result = None if refit_folder is None else run_refit(monitor, refit_folder)
     return monitored_logs, refit_result

@@ -130,7 +130,7 @@ class MonitoredLog:
                     size=suspect.estimated_size,
                     standard_error=suspect.standard_error,
                     unit=suspect.change.unit,
-                    explains=suspect.explained_square,
+                    explains=suspect.score_reduction,
                 )
                 for suspect in self.final_verdict.hypotheses
             ),
@@ -154,7 +154,7 @@ class MonitoredLog:
         ]
 
 
-class FittedModelService:
+class FittedModelMonitor:
     """A fitted model with its change detector and the new logs to be monitored.
 
     Args:
@@ -389,7 +389,7 @@ def require_refit_folder(run: RunFolder, output_folder: Path, config: FitConfig)
     RunFolder(output_folder).require_usable(dump_config(config))
 
 
-def run_refit(monitor: FittedModelService, output_folder: Path) -> RefitResult:
+def run_refit(monitor: FittedModelMonitor, output_folder: Path) -> RefitResult:
     """Refit a model on the first two thirds of the new logs, and evaluate it on the others.
 
     The new run contains `constant_velocity`, the old model under its name, and the new model as
