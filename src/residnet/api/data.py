@@ -241,7 +241,7 @@ def draft_config(
         progress: called with the progress of the reading.
         length: length of the vessel in the logs, such as "3.22 m", for a manoeuvring booklet and
             hydrodynamic derivatives; None for neither.
-        scale: length of the ship divided by that of the vessel in the logs.
+        scale: length of the ship divided by the length of the vessel in the logs.
         **particulars: `beam`, `draught` and `mass` in the scale of the logs.
 
     Returns:

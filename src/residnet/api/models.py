@@ -121,7 +121,7 @@ class Model:
 
         Args:
             order: highest order of the Taylor series about straight-ahead motion, 1 to 3.
-            scale: length of the target vessel divided by that of the vessel in the logs
+            scale: length of the target vessel divided by the length of the vessel in the logs
                 (Froude's law of similarity).
             density_ratio: ratio of the densities of the water.
             **particulars: `length` and `speed`, and as known `draught`, `beam`, `mass`,
@@ -156,7 +156,7 @@ class Model:
         Coefficients, inputs, time step, ranges and prediction intervals are scaled by Froude's law.
 
         Args:
-            scale: length of the target vessel divided by that of the vessel in the logs.
+            scale: length of the target vessel divided by the length of the vessel in the logs.
             density_ratio: ratio of the densities of the water.
             **effects: full-scale corrections with their `source`: factors `resistance`,
                 `propeller` and `rudder` of forces at full scale relative to the scaled ones.
@@ -494,7 +494,7 @@ class Monitor:
 
     Args:
         model: model of the unchanged vessel.
-        reference_data: data of the unchanged vessel, such as those of the fit.
+        reference_data: data of the unchanged vessel, such as the data of the fit.
         settings: keys of `residnet.identification.monitoring.MonitorConfig`: `window`,
             `stretch`, `false_alarm`, `group` in s.
 

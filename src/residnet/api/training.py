@@ -97,7 +97,7 @@ def head_training(
 ) -> HeadTrainingRun:
     """Fit the baseline, and return the training of a network for the user's own trainer.
 
-    The results are those of `fit` with the same arguments.
+    The results are equal to the results of `fit` with the same arguments.
 
     Args:
         data: dataset from `prepare`.

@@ -96,7 +96,7 @@ class MMGForces(nn.Module):
     def forward(self, z: Tensor, theta: Tensor) -> Tensor:
         """Compute nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34].
 
-        The order of the parameters is that of `PARAMETER_NAMES`.
+        The parameters have the order of `PARAMETER_NAMES`.
         """
         (
             m_x, m_y, J_z, R_0, X_vv, X_vr, X_rr, X_vvvv,

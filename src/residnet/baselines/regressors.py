@@ -118,7 +118,7 @@ class RegressorBaseline(ParametricBaseline):
     def mean_information(self, samples: Samples) -> Tensor:
         """Return the Fisher information [P, P] per sample.
 
-        The variance of each axis is that of the least-squares residuals.
+        The variance of each axis is the variance of the least-squares residuals.
         """
         phi, variance = self._terms_and_residual_variance(samples)
         mean_gram = phi.T @ phi / len(samples)

@@ -104,7 +104,7 @@ class DerivativesFile(FileRecord):
         mass_matrix: M [3][3] in SI; None if unknown.
         particulars: main particulars in SI.
         froude_number: U / sqrt(g L).
-        scale: length of the target vessel divided by that of the vessel in the logs.
+        scale: length of the target vessel divided by the length of the vessel in the logs.
         operating_point: values of the inputs at the expansion point.
         surge_imbalance: surge acceleration at the expansion point in m/s^2; zero at an equilibrium.
         rows: derivatives by order, axis and variables.
@@ -249,9 +249,9 @@ def compute_derivatives(
         covariance: covariance of the baseline's free parameters [P][P]; None if unknown.
         has_correlations: whether the covariance has the correlations of the parameters.
         order: highest order of the expansion, 1 to 3.
-        scale: length of the target vessel divided by that of the vessel in the logs (Froude's law
-            of similarity).
-        density_ratio: density of the water at the target scale divided by that of the logs.
+        scale: length of the target vessel divided by the length of the vessel in the logs
+            (Froude's law of similarity).
+        density_ratio: density of the water at the target scale divided by the density in the logs.
 
     Raises:
         UsageError: if the model has no baseline with free parameters in u, v and r.
@@ -582,8 +582,8 @@ def _make_row(
         error: standard error of `value`; None if it is unknown.
         particulars: particulars of the target vessel.
         is_force: whether the derivative is one of a force, otherwise of an acceleration.
-        scale: length of the target vessel divided by that of the vessel in the logs.
-        density_ratio: water density at the target scale divided by that of the logs.
+        scale: length of the target vessel divided by the length of the vessel in the logs.
+        density_ratio: water density at the target scale divided by the density in the logs.
     """
     dimension = (_FORCE_DIMENSIONS if is_force else _ACCELERATION_DIMENSIONS)[axis]
     for variable in monomial:

@@ -194,7 +194,7 @@ class AbkowitzConfig(VesselFile):
     def build_hull(self) -> Hull:
         """Build the inertia in SI, with rigid-body Coriolis forces if the series excludes them.
 
-        The hydrodynamic forces are those of `AbkowitzForces`.
+        `AbkowitzForces` computes the hydrodynamic forces.
         """
         from residnet.physics.plant import Hull
 

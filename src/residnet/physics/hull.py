@@ -157,7 +157,8 @@ class HullCoefficients(NamedTuple):
 
     Attributes:
         mass: mass matrix M with added mass [n][n].
-        force_rows: coefficients of the force of each axis by term; those of damping are negative.
+        force_rows: coefficients of the force of each axis by term; damping terms are
+            negative.
         channels: channels of the motion: velocities, then phi with roll and theta with pitch.
     """
 

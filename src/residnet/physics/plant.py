@@ -95,7 +95,8 @@ class Hull(nn.Module):
 
     Args:
         mass: mass matrix M with added mass, [n][n].
-        force_rows: coefficients C of the force of each axis by term; those of damping are negative.
+        force_rows: coefficients C of the force of each axis by term; damping terms are
+            negative.
         channels: channels of the motion: velocities through the water, then phi with roll and theta
             with pitch.
         vessel: name of the vessel, for the message.

@@ -218,8 +218,8 @@ class DerivativesConfig(Particulars):
     Attributes:
         model: name of the baseline.
         order: highest order of the Taylor series.
-        scale: length of the ship divided by that of the vessel in the logs.
-        density_ratio: density of the ship's water divided by that of the logs.
+        scale: length of the ship divided by the length of the vessel in the logs.
+        density_ratio: density of the ship's water divided by the density in the logs.
     """
 
     model: str = "baseline"
@@ -252,7 +252,7 @@ _DRIVE_PREFIXES = ("n", "tau_x", "thrust", "throttle")
 
 
 def is_drive(name: str) -> bool:
-    """Return whether an input is that of a propeller or thrust, by its name."""
+    """Return whether an input belongs to a propeller or is a thrust, by its name."""
     base_name = name.removeprefix("cmd_")
     return any(
         base_name == prefix or base_name.startswith(f"{prefix}_") for prefix in _DRIVE_PREFIXES
@@ -272,7 +272,7 @@ class FroudeScaling:
     """Conversion of quantities between similar vessels at the same Froude number.
 
     Attributes:
-        scale: length of the target vessel divided by that of the original.
+        scale: length of the target vessel divided by the length of the original.
         density_ratio: density of the water at the target divided by that at the original.
 
     Raises:

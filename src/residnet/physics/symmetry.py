@@ -100,7 +100,7 @@ def _product_parity(factors: Iterable[Factor], parities: Mapping[str, float]) ->
 
 
 def compute_term_parity(term: str, names: Sequence[str]) -> int | None:
-    """Return the parity of a term; None if that of a channel is unknown."""
+    """Return the parity of a term; None if the parity of a channel is unknown."""
     factors = parse_term(term, names)
     has_known_parity = all(factor.name in _CHANNEL_PARITY for factor in factors)
     return _product_parity(factors, _CHANNEL_PARITY) if has_known_parity else None

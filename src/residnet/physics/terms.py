@@ -232,7 +232,7 @@ class CandidatesConfig(Config):
 
     @property
     def _has_ship_inputs(self) -> bool:
-        """Whether the products of inputs are those of propellers and rudders."""
+        """Whether the products of inputs are the products of propellers and rudders."""
         return self.input_degree is None and not self.coupling
 
     def _input_products(self, motions: Sequence[str], inputs: Sequence[str]) -> list[str]:

@@ -26,7 +26,7 @@ class VesselFile(Config, ABC):
     A file can refer to another one of its kind as `base` and contain the differences only.
 
     Attributes:
-        name: name of the vessel, which equals that of the file.
+        name: name of the vessel, equal to the name of the file.
         description: one line for `residnet list vessels`.
         length: length of the hull, the unit of manoeuvring indices.
     """

@@ -31,7 +31,7 @@ def derive_run(
         model_name: name of the model.
         particulars: main particulars by name, as texts such as "7 m" or SI numbers.
         order: highest order of the Taylor series, 1 to 3.
-        scale: length of the target vessel divided by that of the vessel in the logs.
+        scale: length of the target vessel divided by the length of the vessel in the logs.
         density_ratio: ratio of the densities of the water.
 
     Raises:

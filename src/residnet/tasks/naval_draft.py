@@ -46,7 +46,7 @@ class NavalParticulars:
 
     Attributes:
         length: length of the vessel in the logs.
-        scale: length of the ship divided by that of the vessel in the logs.
+        scale: length of the ship divided by the length of the vessel in the logs.
         particulars: further particulars by name: beam, draught, mass.
     """
 

@@ -89,7 +89,7 @@ class SecondOrderConfig(ResponseConfig):
     damping: float = Field(gt=0)
 
     def derivative(self, states: Tensor, target: Tensor, rate_limit: float) -> Tensor:
-        """Return the derivatives of the positions, then those of their rates."""
+        """Return the derivatives of the positions, then the derivatives of their rates."""
         import torch
 
         position, velocity = states.chunk(2, dim=-1)
