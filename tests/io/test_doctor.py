@@ -373,7 +373,7 @@ def test_check_gaps_accepts_a_few_lost_rows_of_a_fast_recorder(n_lost: int, fix:
     t = 0.01 * np.arange(3000)
     is_present = (t < 10.0) | (t > 10.0 + 0.01 * n_lost)
     log = Log("fast", t[is_present], {"u": 1.0 + 0.2 * np.sin(0.3 * t[is_present])})
-    assert fix in one(inspect_log(log), "gaps").fix
+    assert fix in one(inspect_log(log), "gaps").action
 
 
 def test_check_repeated_rows_accepts_chance_repeats() -> None:

@@ -83,7 +83,7 @@ def test_what_cannot_be_compared(two: list[Path], tmp_path: Path) -> None:
     for runs, said in (
         (two[:1], "name at least two runs"),
         (two[:1] * 2, "given twice"),
-        (two, "runs of fits can be compared"),
+        (two, "metrics.json"),
     ):
         with pytest.raises(UsageError, match=said):
             compare_runs(runs, tmp_path / "out")
