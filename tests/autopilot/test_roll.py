@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from residnet.core.errors import ConfigError
 from residnet.physics.vessel import load_vessel
 
 LIMITS = math.radians(20.0), math.radians(25.0)
+NO_GAINS: Mapping[str, float] = {}
 HEADING_ONLY = {
     "heading_gain": 0.5,
     "yaw_rate_gain": 3.0,
@@ -35,8 +37,8 @@ HEADING_ONLY = {
 BEAM_SEAS = [Sea(4, 90.0), Sea(4, 270.0)]
 
 
-def make_policy(units: int = 0, **gains: float) -> RollPolicy:
-    values = {name: torch.tensor([value]) for name, value in (HEADING_ONLY | gains).items()}
+def make_policy(units: int = 0, gains: Mapping[str, float] = NO_GAINS) -> RollPolicy:
+    values = {name: torch.tensor([value]) for name, value in {**HEADING_ONLY, **gains}.items()}
     return RollPolicy(values, LIMITS, units, 0.1, is_trained=units > 0)
 
 
@@ -105,8 +107,12 @@ def test_fins_and_rudder_reduce_the_roll(simulation: RollSimulation) -> None:
     inputs, _ = simulation.sample_inputs(BEAM_SEAS, 4, 0)
     with torch.no_grad():
         without, fins, rudder = (
-            simulation.simulate(make_policy(**gains), inputs)
-            for gains in ({}, {"fin_roll_rate_gain": 2.0}, {"rudder_roll_rate_gain": 0.5})
+            simulation.simulate(make_policy(gains=gains), inputs)
+            for gains in (
+                NO_GAINS,
+                {"fin_roll_rate_gain": 2.0},
+                {"rudder_roll_rate_gain": 0.5},
+            )
         )
     for runs in (fins, rudder):
         assert float(runs.roll.square().mean()) < 0.9 * float(without.roll.square().mean())
@@ -117,9 +123,9 @@ def test_fins_and_rudder_reduce_the_roll(simulation: RollSimulation) -> None:
 def test_training_starts_from_the_law_and_improves_it(simulation: RollSimulation) -> None:
     gains = {"fin_roll_rate_gain": 0.5, "rudder_roll_rate_gain": 0.1}
     inputs, heights = simulation.sample_inputs(BEAM_SEAS, 8, 77)
-    policy = make_policy(4, **gains)
+    policy = make_policy(4, gains)
     with torch.no_grad():
-        law_runs = simulation.simulate(make_policy(**gains), inputs)
+        law_runs = simulation.simulate(make_policy(gains=gains), inputs)
         start_runs = simulation.simulate(policy, inputs)
     # the network adds nothing before the training
     torch.testing.assert_close(law_runs.roll, start_runs.roll)
@@ -145,7 +151,7 @@ def test_tuning_finds_a_better_law(simulation: RollSimulation) -> None:
     gains, cost = tune_roll_law(simulation, BEAM_SEAS, LIMITS, generations=2, population=2)
     assert set(gains) == set(GAIN_NAMES)
     with torch.no_grad():
-        tuned = simulation.simulate(make_policy(**gains), inputs).costs(heights, RollWeights())
+        tuned = simulation.simulate(make_policy(gains=gains), inputs).costs(heights, RollWeights())
         untuned = simulation.simulate(make_policy(), inputs).costs(heights, RollWeights())
     assert float(tuned.mean()) == pytest.approx(cost, rel=1e-4)
     assert cost < float(untuned.mean())

@@ -120,7 +120,7 @@ def test_inputs_are_held_as_in_the_fit(hold: Any, expected: list[float]) -> None
 
 
 def test_a_gear_with_lag_and_delay_follows_its_command() -> None:
-    gear = GivenActuators({"delta": InputShare(steer=0.5, lag="2 s", delay="0.3 s")}, (), 0.1)
+    gear = GivenActuators({"delta": InputShare(steer=0.5, lag=2.0, delay=0.3)}, (), 0.1)
     assert gear.state_names == ("delta", "_delta_delay1", "_delta_delay2", "_delta_delay3")
     a = gear.make_initial_state(1, ())
     angles = []

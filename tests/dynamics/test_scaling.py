@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from residnet.baselines.base import ParametricBaseline
 from residnet.baselines.given_config import EquationsConfig
 from residnet.baselines.mmg_config import MMGConfig
 from residnet.baselines.regressors import RegressorBaseline
@@ -132,6 +133,8 @@ def test_an_mmg_model_keeps_its_non_dimensional_parameters_and_scales_its_partic
     assert scaled_spec.baseline.hull.length == pytest.approx(350.0)
     assert scaled_spec.baseline.hull.mass == pytest.approx(3270.0 * 50**3 * 1.025)
     assert scaled_spec.baseline.hull.density == pytest.approx(1025.0)
+    assert isinstance(scaled.baseline, ParametricBaseline)
+    assert isinstance(model.baseline, ParametricBaseline)
     assert torch.equal(scaled.baseline.theta, model.baseline.theta)
 
 
@@ -147,6 +150,8 @@ def test_scale_effects_change_the_terms_of_their_force_and_need_a_source() -> No
     spec, model = make_model()
     effects = ScaleEffects(resistance=0.8, rudder=1.1, propeller=0.9, source="towing test")
     _, changed = apply_scale_effects(spec, model, effects)
+    assert isinstance(changed.baseline, ParametricBaseline)
+    assert isinstance(model.baseline, ParametricBaseline)
     ratio = changed.baseline.theta / model.baseline.theta
     factor_of = dict(zip(TERMS, ratio.T.tolist(), strict=True))
     assert factor_of["u"][0] == pytest.approx(0.8)

@@ -393,6 +393,7 @@ def test_one_seed_has_no_spread_and_the_reference_no_difference(tmp_path: Path) 
     assert rows[1].nrmse_sd is None
     recipe, other = tabulate_variants(rows, "recipe").rows
     assert [cell.text for cell in recipe.cells[:4]] == [f"{rows[0].nrmse_mean:.4f}", "–", "", ""]
+    assert rows[1].difference_ci95 is not None
     low, high = rows[1].difference_ci95
     assert (other.cells[3].text, other.cells[3].mark) == (f"+{low:.4f} to +{high:.4f}", "best")
     figure = plot_differences(rows, "recipe")
