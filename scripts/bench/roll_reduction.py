@@ -96,7 +96,7 @@ def judge(folder: Path, seed: int, *_: int) -> None:
     policies = {name: law(gains) for name, gains in tuned.items()}
     if (folder / "policy.pt").exists():
         policies["learned"] = law(tuned["trained_law"], UNITS)
-        policies["learned"].load_state_dict(torch.load(folder / "policy.pt"))
+        policies["learned"].load_state_dict(torch.load(folder / "policy.pt", weights_only=True))
     courses = simulation(120.0)
     inputs, heights = courses.sample_inputs(list_seas(), ROWS, seed + 99)
     rms: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
@@ -141,7 +141,7 @@ STAGES = {"tune": tune, "train": train, "judge": judge}
 def main() -> None:
     """Run the stages in order."""
     given = bench.options(
-        __doc__, stage=STAGES, folder="/tmp/roll", seed=0, generations=14, epochs=10
+        __doc__, stage=STAGES, folder="runs/roll_reduction", seed=0, generations=14, epochs=10
     )
     folder = Path(given.folder)
     folder.mkdir(parents=True, exist_ok=True)
