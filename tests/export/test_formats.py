@@ -71,7 +71,10 @@ def exported(variant: str) -> ExportedVessel:
 
 def compiled(file: Path, made: ExportedVessel) -> LoadedExport:
     library = compile_shared_library([file], file.with_suffix(".so"))
-    return CompiledModel(library, made, torch.float32, file.stem)
+    # a track that depends on rounding is written in double precision
+    card = json.loads(file.with_suffix(".card.json").read_text())
+    dtype = torch.float64 if card["dtype"].startswith("float64") else torch.float32
+    return CompiledModel(library, made, dtype, file.stem)
 
 
 LOADED: dict[str, Callable[[Path, ExportedVessel], LoadedExport]] = {

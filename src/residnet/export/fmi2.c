@@ -40,7 +40,7 @@ EXPORT void *fmi2Instantiate(
     const Callbacks *callbacks, int visible, int logging) {
     Instance *m;
     (void)name; (void)resources; (void)visible; (void)logging;
-    if (type != 1 || strcmp(guid, MODEL_TOKEN) != 0) return NULL;
+    if (type != 1 || strcmp(guid, FMI_UNIT_TOKEN) != 0) return NULL;
     m = (Instance *)calloc(1, sizeof(Instance));
     if (!m) return NULL;
     m->environment = callbacks->environment;

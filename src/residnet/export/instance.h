@@ -26,7 +26,7 @@
 typedef void (*Logger)(void *environment, int status, const char *message, void *callback);
 
 typedef struct {
-    MODEL_REAL x[MODEL_STATES], start[MODEL_STATES], w[MODEL_INPUTS], s[MODEL_MEMORY + 1];
+    FMI_UNIT_REAL x[FMI_UNIT_STATES], start[FMI_UNIT_STATES], w[FMI_UNIT_INPUTS], s[FMI_UNIT_MEMORY + 1];
     int outside, phase, time_defined, stop_defined;
     double time, stop;
     void *environment, *callback;
@@ -34,7 +34,7 @@ typedef struct {
 } Instance;
 
 static const char *const STEP_REFUSED =
-    "the communication step is not a multiple of the model's step of " MODEL_DT_TEXT " s";
+    "the communication step is not a multiple of the model's step of " FMI_UNIT_DT_TEXT " s";
 static const char *const REFERENCE_REFUSED = "no variable has this value reference";
 static const char *const OUTPUT_REFUSED = "an output cannot be set; set its start value";
 static const char *const START_REFUSED =
@@ -55,7 +55,7 @@ static int refused(Instance *m, const char *why) { return answer(m, STATUS_ERROR
 
 static void begin(Instance *m) {
     memcpy(m->x, m->start, sizeof m->x);
-    MODEL_INITIAL_STATE(m->s);
+    FMI_UNIT_INITIAL_STATE(m->s);
     m->outside = 0;
 }
 
@@ -92,10 +92,10 @@ static int finish_initialization(Instance *m) {
     return STATUS_OK;
 }
 
-static MODEL_REAL *real_variable(Instance *m, unsigned reference) {
-    if (reference >= INPUT && reference < INPUT + MODEL_INPUTS) return m->w + (reference - INPUT);
-    if (reference >= STATE && reference < STATE + MODEL_STATES) return m->x + (reference - STATE);
-    if (reference >= START && reference < START + MODEL_STATES)
+static FMI_UNIT_REAL *real_variable(Instance *m, unsigned reference) {
+    if (reference >= INPUT && reference < INPUT + FMI_UNIT_INPUTS) return m->w + (reference - INPUT);
+    if (reference >= STATE && reference < STATE + FMI_UNIT_STATES) return m->x + (reference - STATE);
+    if (reference >= START && reference < START + FMI_UNIT_STATES)
         return m->start + (reference - START);
     return NULL;
 }
@@ -103,7 +103,7 @@ static MODEL_REAL *real_variable(Instance *m, unsigned reference) {
 static int get_reals(Instance *m, const unsigned *references, size_t count, double *values) {
     size_t i;
     for (i = 0; i < count; i++) {
-        const MODEL_REAL *found = real_variable(m, references[i]);
+        const FMI_UNIT_REAL *found = real_variable(m, references[i]);
         if (references[i] == 0u) values[i] = m->time;
         else if (found) values[i] = (double)*found;
         else return refused(m, REFERENCE_REFUSED);
@@ -121,7 +121,7 @@ static int set_reals(Instance *m, const unsigned *references, size_t count, cons
         if (references[i] >= START && m->phase == STEPPING) return refused(m, START_REFUSED);
     }
     for (i = 0; i < count; i++)
-        *real_variable(m, references[i]) = (MODEL_REAL)values[i];
+        *real_variable(m, references[i]) = (FMI_UNIT_REAL)values[i];
     /* until the first step the outputs are the start values */
     if (m->phase != STEPPING) begin(m);
     return STATUS_OK;
@@ -132,9 +132,9 @@ static int set_reals(Instance *m, const unsigned *references, size_t count, cons
    A point in Unix time is rounded to 2.4e-7 s, and so is a step that is the difference of two
    points: what may differ has a share of the model's step and a share of the time. */
 static int advance(Instance *m, double point, double size) {
-    const double steps = size / MODEL_DT;
+    const double steps = size / FMI_UNIT_DT;
     const double rounding = 4.0 * DBL_EPSILON * (fabs(point) + fabs(size));
-    const double tolerance = 1e-6 * MODEL_DT + rounding;
+    const double tolerance = 1e-6 * FMI_UNIT_DT + rounding;
     long k, n;
     int status = STATUS_OK;
     if (m->phase != STEPPING)
@@ -142,15 +142,15 @@ static int advance(Instance *m, double point, double size) {
     if (!(steps >= 0.5 && steps < 1e9)) return refused(m, STEP_REFUSED);
     n = (long)floor(steps + 0.5);
     /* where time resolves the step no more, every size would be a multiple */
-    if (!(tolerance < 0.1 * MODEL_DT)) return refused(m, STEP_REFUSED);
-    if (fabs(size - (double)n * MODEL_DT) > tolerance)
+    if (!(tolerance < 0.1 * FMI_UNIT_DT)) return refused(m, STEP_REFUSED);
+    if (fabs(size - (double)n * FMI_UNIT_DT) > tolerance)
         return refused(m, STEP_REFUSED);
     if (m->stop_defined && point + size > m->stop + tolerance) return refused(m, LATE_STEP_REFUSED);
     if (m->time_defined && fabs(point - m->time) > tolerance)
         status = answer(m, STATUS_WARNING, TIME_DIFFERS);
     m->outside = 0;
     for (k = 0; k < n; k++)
-        if (MODEL_STEP(m->x, m->w, m->s, m->x, m->s)) m->outside = 1;
+        if (FMI_UNIT_STEP(m->x, m->w, m->s, m->x, m->s)) m->outside = 1;
     m->time = point + size;
     m->time_defined = 1;
     return status;
