@@ -17,25 +17,24 @@ from config_keys import Key, config_classes, keys, selector, summary, undocument
 _LOG = get_plugin_logger("config_pages")
 FOLDER = "reference/config"
 PAGES = {
-    "tasks": ("Tasks", "A run is one YAML file. Its key `task` says what kind of run it is."),
-    "documents": ("Studies of the five documents", "These tasks repeat published experiments."),
-    "data": ("Logs and their preparation", "These classes describe where logs come from."),
+    "tasks": ("Tasks", "A run is one YAML file. Its key `task` selects the kind of run."),
+    "studies": ("Studies of the five documents", "These tasks repeat published experiments."),
+    "io": ("Readers of logs", "These classes describe files of logs and their channels."),
+    "preprocessing": ("Preparation", "These classes describe the preparation of logs for a fit."),
     "baselines": ("Baselines", "A baseline is the known part of a model."),
-    "heads": ("Residual heads", "A head learns what the baseline leaves."),
-    "dynamics": ("Dynamics", "These classes describe how a model moves in time."),
-    "training": ("Training and refit", "These classes describe how parameters are found."),
-    "judge": ("Evaluation", "These classes describe how models are judged in free run."),
-    "control": ("Control", "These classes describe controllers, guidance and courses."),
-    "manoeuvres": ("Manoeuvres", "These classes describe what a vessel is told to do."),
-    "physics": ("Vessels and their surroundings", "These classes describe vessel files."),
+    "heads": ("Residual heads", "A head learns the residual of the baseline."),
+    "training": ("Training and refit", "These classes describe the estimation of parameters."),
+    "evaluation": ("Evaluation", "These classes describe the evaluation of models in free runs."),
+    "autopilot": ("Control", "These classes describe controllers, guidance and courses."),
+    "manoeuvres": ("Manoeuvres", "These classes describe simulated manoeuvres."),
+    "physics": ("Vessels and their environment", "These classes describe vessel files."),
 }
-_INVISIBLE = {"regression", "export", "simulators", "report", "runs"}
 
 
 def page_of(config: type[BaseModel]) -> str:
     """Return the name of the page that a class stands on."""
     package = config.__module__.split(".")[1]
-    return "tasks" if package in _INVISIBLE or package not in PAGES else package
+    return package if package in PAGES else "tasks"
 
 
 def linked(text: str, page: str, classes: dict[str, type[BaseModel]]) -> str:

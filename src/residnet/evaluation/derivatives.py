@@ -101,7 +101,7 @@ class DerivativesFile(FileRecord):
         quantity: `force`, or `acceleration` where the masses are unknown.
         masses: source of the masses: `identified` from forces in the logs, `estimated` from
             main particulars, or `unknown`.
-        mass_matrix: M [3][3] in SI; None if unknown.
+        mass_matrix: rows of the mass matrix M in SI; None if unknown.
         particulars: main particulars in SI.
         froude_number: U / sqrt(g L).
         scale: length of the target vessel divided by the length of the vessel in the logs.
