@@ -21,11 +21,10 @@ from residnet.physics.force_terms import FERRY_TERMS
 from residnet.studies.jervan2020.force_logs import compare_accelerations
 from residnet.studies.jervan2020.measured.config import ForceResidualConfig
 from residnet.studies.jervan2020.measured.execute import (
-    build_sections,
+    ForceResidualExecutor,
     is_significantly_better,
     read_logs,
     run_force_study,
-    summarize,
 )
 
 CONFIG = Path(residnet.__file__).parents[2] / "configs" / "studies" / "jervan2020" / "measured.yaml"
@@ -108,8 +107,13 @@ def test_what_the_hull_lacks_is_found_and_said(tmp_path: Path) -> None:
     coefficients = dict(zip(FERRY_TERMS, results["models"]["ridge"]["coefficients"], strict=True))
     assert coefficients["u_dot"][0] == pytest.approx(500, rel=0.05)
     assert coefficients["r_dot"][2] == pytest.approx(400, rel=0.05)
-    assert "in the mean over the axes: plsr and ridge." in " ".join(summarize(settings, results))
-    titles = [section.title for section in build_sections(settings, results, tmp_path / "run")]
+    assert "in the mean over the axes: plsr and ridge." in " ".join(
+        ForceResidualExecutor(settings).summarize(results)
+    )
+    titles = [
+        section.title
+        for section in ForceResidualExecutor(settings).build_sections(results, tmp_path / "run")
+    ]
     # the first picture has no title
     assert titles[:3] == ["", "Data and cross-validation", "Commanded and actual force"]
     assert "Residual of the actual force" in titles
@@ -125,7 +129,7 @@ def test_a_residual_of_noise_is_said_to_be_none(tmp_path: Path) -> None:
         any(is_significantly_better(rows[name], "believed")) for name in ("ols", "surface")
     )
     assert is_significantly_better(rows["believed"], "zero")[3]
-    said = summarize(settings, results)
+    said = ForceResidualExecutor(settings).summarize(results)
     assert "None of the 2 regressions is better" in " ".join(said)
     assert "Recommended: the believed model alone in surge, sway and yaw." in said
 
@@ -143,7 +147,7 @@ def test_a_believed_model_that_is_worse_than_no_force_is_no_yardstick(tmp_path: 
     assert is_significantly_better(rows["ridge"], "believed") == [True] * 4
     assert not any(is_significantly_better(rows["ridge"], "reference"))
     assert rows["believed"]["minus_zero"]["ci95"][3][0] > 0
-    said = " ".join(summarize(settings, results))
+    said = " ".join(ForceResidualExecutor(settings).summarize(results))
     for words in (
         "worse than no force in surge, sway and yaw",
         "None of the 1 regressions is better than the better of no force",
@@ -216,7 +220,10 @@ def test_a_model_that_is_not_determined_is_set_aside_and_said(tmp_path: Path) ->
     assert list(results["models"]) == ["ridge"]
     said = "model earth: a constant force in earth axes is not identifiable"
     assert results["failed"]["earth"].startswith(said)
-    titles = [section.title for section in build_sections(settings, results, tmp_path / "run")]
+    titles = [
+        section.title
+        for section in ForceResidualExecutor(settings).build_sections(results, tmp_path / "run")
+    ]
     assert "Not determined by these logs" in titles
 
 

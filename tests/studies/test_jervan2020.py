@@ -29,15 +29,14 @@ from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
 from residnet.studies.jervan2020.ferry.config import FerryModelConfig, FerryStudyConfig
 from residnet.studies.jervan2020.ferry.execute import (
+    FerryExecutor,
     FerryStudy,
     build_record,
-    build_sections,
     compare_residuals,
     find_best_flown_model,
     identify_model,
     list_feed_forward_objections,
     run_ferry_study,
-    summarize,
     write_results,
 )
 from residnet.studies.jervan2020.ferry.judging import draw_judging_courses
@@ -293,8 +292,10 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
     results, figures = write_results(wanted, found, folder)
     assert results["models"]["case"]["not_forward"].startswith("model case: its mass matrix")
     told = "With lag_ridge as feed-forward, the mean position error in the course"
-    assert any(sentence.startswith(told) for sentence in summarize(wanted, results))
-    titles = {section.title for section in build_sections(wanted, results, folder.path)}
+    assert any(sentence.startswith(told) for sentence in FerryExecutor(wanted).summarize(results))
+    titles = {
+        section.title for section in FerryExecutor(wanted).build_sections(results, folder.path)
+    }
     assert titles >= {"Models that cannot run forward in time", "Feed-forward without feedback"}
     left = {path.name for path in (tmp_path / "run" / "models").glob("*.yaml")}
     assert left == {"lag_ridge_forward.yaml"}

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, final
+from typing import Any, ClassVar, Generic, TypeVar, final
 
 import numpy as np
 
@@ -19,42 +20,82 @@ from residnet.runs.task import ExportWriters, PackageTask, SummaryMetric, TaskOu
 
 StudyResults = Mapping[str, Any]
 """Results of a study, as in its file in the run folder."""
+StudyConfig = TypeVar("StudyConfig", bound="StudyTask")
+"""Config class of a study."""
 
 
 class StudyTask(PackageTask):
     """A computational experiment of a document, with its results in one JSON file.
 
-    The module `execute` in the package of the config has the functions `compute_results(config,
-    folder)`, which returns the results for JSON and the figures, `summarize(config, results)`,
-    `main_figures(config, results)` and `build_sections(config, results, run)`, and optionally
-    `exports(config, folder)`.
+    The module `execute` in the package of the config has the `StudyExecutor` of the study.
     """
 
+    executor_class: ClassVar[str]
+    """Name of the `StudyExecutor` in the module `execute`, which is imported when it is used."""
     results_file: ClassVar[str] = "study.json"
 
     @final
+    def build_executor(self) -> StudyExecutor[Any]:
+        """Return the executor of the study with this config."""
+        executor_class: type[StudyExecutor[Any]] = getattr(self.executor(), self.executor_class)
+        return executor_class(self)
+
+    @final
     def execute(self, folder: RunFolder) -> TaskOutcome:
-        results: dict[str, Any]
-        figures: Iterable[Figure]
-        results, figures = self.call_executor("compute_results", folder)
+        executor = self.build_executor()
+        results, figures = executor.compute_results(folder)
         folder.write_json(folder.path / self.results_file, results)
         for figure in figures:
             write_figure(folder.figures, figure)
         # reloaded from the file, as the report reads them
         stored_results: StudyResults = read_json(folder.path / self.results_file)
-        sentences: list[str] = self.call_executor("summarize", stored_results)
-        metrics: dict[str, SummaryMetric] = self.call_executor("main_figures", stored_results)
-        has_exports = hasattr(self.executor(), "exports")
-        exports: ExportWriters = self.call_executor("exports", folder) if has_exports else {}
-        return TaskOutcome(sentences, metrics, exports=exports)
+        return TaskOutcome(
+            executor.summarize(stored_results),
+            executor.main_figures(stored_results),
+            exports=executor.export_writers(folder),
+        )
 
     @classmethod
     @final
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         results = read_json(run.path / cls.results_file)
         config = load_config(run.resolved_config, [], cls)
-        sections: Sequence[Section] = config.call_executor("build_sections", results, run.path)
-        return sections
+        return config.build_executor().build_sections(results, run.path)
+
+
+class StudyExecutor(ABC, Generic[StudyConfig]):
+    """Work of a study: its results, and what summary and report say about them.
+
+    Args:
+        config: settings of the study.
+    """
+
+    def __init__(self, config: StudyConfig) -> None:
+        self.config = config
+
+    @abstractmethod
+    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+        """Compute the results for the JSON file of the study, and the figures.
+
+        Args:
+            folder: the run folder, for further files.
+        """
+
+    @abstractmethod
+    def summarize(self, results: StudyResults) -> list[str]:
+        """Return complete sentences on the main results, for the head of the report."""
+
+    @abstractmethod
+    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
+        """Return the main figures of the study by name, for summary.json."""
+
+    @abstractmethod
+    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
+        """Return the sections of the report from the results and the figures in the run folder."""
+
+    def export_writers(self, folder: RunFolder) -> ExportWriters:
+        """Return functions that write each model for controllers; none by default."""
+        return {}
 
 
 def published_cell(value: float | None, published: float | None, digits: int = 4) -> Cell:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, final
+from typing import Annotated, ClassVar, Literal, final
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -149,6 +149,8 @@ class BreedingTaskConfig(StudyTask, SearchConfig):
             the table; combinations with null are skipped.
         published_error: mean square errors that the document prints, in (m/s^2)^2, likewise.
     """
+
+    executor_class: ClassVar[str] = "BreedingExecutor"
 
     task: Literal["breeding"]
     rows: StudyAxis

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from residnet.studies.halvorsen2019.breeding.config import (
     SearchConfig,
     SettingValue,
 )
-from residnet.studies.study import StudyResults, find_figures
+from residnet.studies.study import StudyExecutor, StudyResults, find_figures
 
 _MIN_PLOTTED_ERROR = 1e-34
 """Smallest plotted error, in (m/s^2)^2, on the logarithmic axis; rounding errors are smaller."""
@@ -37,153 +37,157 @@ def check(config: BreedingTaskConfig) -> None:
     require_package("deap", "genetic programming", "gp")
 
 
-def compute_results(
-    config: BreedingTaskConfig, folder: RunFolder
-) -> tuple[dict[str, Any], Iterable[Figure]]:
-    rows = []
-    cells = config.combinations()
-    for n_done, (i, j) in enumerate(cells):
-        progress.report_progress("searching equations", n_done, len(cells))
-        settings = config.combination_config(i, j)
-        start_time = time.process_time()
-        trials = [run_search_trial(settings, seed) for seed in range(config.repeats)]
-        errors, equations = ([*values] for values in zip(*trials, strict=True))
-        rows.append(
-            {
-                "row": config.rows.values[i],
-                "column": config.columns.values[j],
-                "found": sum(error < config.threshold for error in errors),
-                "published_found": config.published and config.published[i][j],
-                "right": sum(set(equation) == set(TRUE_COEFFICIENTS) for equation in equations),
-                "error": sum(errors) / len(errors),
-                "published_error": config.published_error and config.published_error[i][j],
-                "seconds": (time.process_time() - start_time) / config.repeats,
-                "equations": equations,
-            }
-        )
-    progress.report_progress("searching equations", len(cells), len(cells))
-    content = {
-        "schema": "residnet.breeding/1",
-        "run": config.name,
-        "keys": (config.rows.key, config.columns.key),
-        "rows": rows,
-        # where the mean error is least, for each value of the first setting
-        "least": {
-            str(value): min(
-                (row for row in rows if row["row"] == value), key=lambda row: row["error"]
-            )["column"]
-            for value in config.rows.values
-        },
-    }
-    return content, [_result_figure(config, rows)]
+@final
+class BreedingExecutor(StudyExecutor[BreedingTaskConfig]):
+    """Search for the equation of the mass-spring-damper with every combination of two settings."""
 
+    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+        rows = []
+        cells = self.config.combinations()
+        for n_done, (i, j) in enumerate(cells):
+            progress.report_progress("searching equations", n_done, len(cells))
+            settings = self.config.combination_config(i, j)
+            start_time = time.process_time()
+            trials = [run_search_trial(settings, seed) for seed in range(self.config.repeats)]
+            errors, equations = ([*values] for values in zip(*trials, strict=True))
+            rows.append(
+                {
+                    "row": self.config.rows.values[i],
+                    "column": self.config.columns.values[j],
+                    "found": sum(error < self.config.threshold for error in errors),
+                    "published_found": self.config.published and self.config.published[i][j],
+                    "right": sum(set(equation) == set(TRUE_COEFFICIENTS) for equation in equations),
+                    "error": sum(errors) / len(errors),
+                    "published_error": self.config.published_error
+                    and self.config.published_error[i][j],
+                    "seconds": (time.process_time() - start_time) / self.config.repeats,
+                    "equations": equations,
+                }
+            )
+        progress.report_progress("searching equations", len(cells), len(cells))
+        content = {
+            "schema": "residnet.breeding/1",
+            "run": self.config.name,
+            "keys": (self.config.rows.key, self.config.columns.key),
+            "rows": rows,
+            # where the mean error is least, for each value of the first setting
+            "least": {
+                str(value): min(
+                    (row for row in rows if row["row"] == value), key=lambda row: row["error"]
+                )["column"]
+                for value in self.config.rows.values
+            },
+        }
+        return content, [_result_figure(self.config, rows)]
 
-def summarize(config: BreedingTaskConfig, results: StudyResults) -> list[str]:
-    rows = results["rows"]
-    runs = config.repeats * len(rows)
-    sentences = [
-        f"The equation is found in {sum(row['found'] for row in rows)} of {runs} runs: their"
-        f" mean square error on the test record is below {config.threshold:g} (m/s^2)^2."
-    ]
-    published_rows = [row for row in rows if row["published_found"] is not None]
-    if published_rows:
-        n_found, n_published = (
-            sum(row[key] for row in published_rows) for key in ("found", "published_found")
-        )
+    def summarize(self, results: StudyResults) -> list[str]:
+        rows = results["rows"]
+        runs = self.config.repeats * len(rows)
+        sentences = [
+            f"The equation is found in {sum(row['found'] for row in rows)} of {runs} runs: their"
+            f" mean square error on the test record is below {self.config.threshold:g} (m/s^2)^2."
+        ]
+        published_rows = [row for row in rows if row["published_found"] is not None]
+        if published_rows:
+            n_found, n_published = (
+                sum(row[key] for row in published_rows) for key in ("found", "published_found")
+            )
+            sentences.append(
+                f"Halvorsen 2019 finds it in {n_published:g} of the"
+                f" {_PUBLISHED_RUNS * len(published_rows)} runs of the same table; here it is"
+                f" {n_found} of {self.config.repeats * len(published_rows)}."
+            )
+        best_columns = [
+            f"{_format_value(column)} ({row})" for row, column in results["least"].items()
+        ]
         sentences.append(
-            f"Halvorsen 2019 finds it in {n_published:g} of the"
-            f" {_PUBLISHED_RUNS * len(published_rows)} runs"
-            f" of the same table; here it is {n_found} of {config.repeats * len(published_rows)}."
+            f"The mean error is least at {self.config.columns.key} = {', '.join(best_columns)}."
         )
-    best_columns = [f"{_format_value(column)} ({row})" for row, column in results["least"].items()]
-    sentences.append(
-        f"The mean error is least at {config.columns.key} = {', '.join(best_columns)}."
-    )
-    n_true_terms = sum(row["right"] for row in rows)
-    return [
-        *sentences,
-        f"In {n_true_terms} of {runs} runs the terms are exactly the true ones.",
-    ]
+        n_true_terms = sum(row["right"] for row in rows)
+        return [
+            *sentences,
+            f"In {n_true_terms} of {runs} runs the terms are exactly the true ones.",
+        ]
 
+    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
+        rows = results["rows"]
+        descriptions = {"found": "that find the equation", "right": "with the true terms"}
+        return {
+            f"share of runs {description}": SummaryMetric(
+                sum(row[key] for row in rows) / (self.config.repeats * len(rows))
+            )
+            for key, description in descriptions.items()
+        }
 
-def main_figures(config: BreedingTaskConfig, results: StudyResults) -> dict[str, SummaryMetric]:
-    rows = results["rows"]
-    descriptions = {"found": "that find the equation", "right": "with the true terms"}
-    return {
-        f"share of runs {description}": SummaryMetric(
-            sum(row[key] for row in rows) / (config.repeats * len(rows))
-        )
-        for key, description in descriptions.items()
-    }
-
-
-def build_sections(config: BreedingTaskConfig, results: StudyResults, run: Path) -> list[Section]:
-    rows = results["rows"]
-    explanation = Text(
-        is_secondary=True,
-        paragraphs=[
-            f"Each cell shows in how many of {config.repeats} runs the mean square error on the"
-            f" test record is below {config.threshold:g} (m/s^2)^2. Small print: the"
-            " number in the document (of ten runs), the number of runs with exactly the true"
-            " terms, and the mean of the mean square errors.",
-            f"Rows: {config.rows.key}. Columns: {config.columns.key}.",
-        ],
-    )
-    cells = {(row["row"], row["column"]): row for row in rows}
-
-    def cell(value: SettingValue, column_value: SettingValue) -> Cell:
-        row = cells.get((value, column_value))
-        if row is None:
-            return Cell(DASH)
-        n_published = row["published_found"]
-        published_text = "" if n_published is None else f"published {n_published:g}; "
-        note = f"{published_text}{row['right']} true; {format_number(row['error'], 2)}"
-        return Cell(str(row["found"]), note)
-
-    table = build_table(
-        config.rows.values,
-        [
-            (config.rows.key, _format_value),
-            *(
-                (
-                    _format_value(column_value),
-                    lambda value, other=column_value: cell(value, other),
-                )
-                for column_value in config.columns.values
-            ),
-        ],
-    )
-    all_equations = [
-        (row, seed, equation) for row in rows for seed, equation in enumerate(row["equations"])
-    ]
-
-    def equation_text(row: Any) -> str:
-        terms = [f"{format_number(value, 4)} {name}" for name, value in row[2].items()]
-        return " + ".join(terms) or DASH
-
-    equations = build_table(
-        all_equations,
-        [
-            (
-                "setting",
-                lambda row: f"{_format_value(row[0]['row'])}, {_format_value(row[0]['column'])}",
-            ),
-            ("seed", lambda row: Cell(str(row[1]))),
-            ("equation of the acceleration", equation_text),
-        ],
-    )
-    return [
-        Section(
-            "",
-            [
-                *(picture.preview() for picture in find_figures(run, "study")),
-                table,
-                explanation,
+    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
+        rows = results["rows"]
+        explanation = Text(
+            is_secondary=True,
+            paragraphs=[
+                f"Each cell shows in how many of {self.config.repeats} runs the mean square error"
+                f" on the test record is below {self.config.threshold:g} (m/s^2)^2. Small print:"
+                " the number in the document (of ten runs), the number of runs with exactly the"
+                " true terms, and the mean of the mean square errors.",
+                f"Rows: {self.config.rows.key}. Columns: {self.config.columns.key}.",
             ],
-        ),
-        Section("Found by setting", find_figures(run, "study")),
-        Section("All equations", [equations], is_folded=True),
-    ]
+        )
+        cells = {(row["row"], row["column"]): row for row in rows}
+
+        def cell(value: SettingValue, column_value: SettingValue) -> Cell:
+            row = cells.get((value, column_value))
+            if row is None:
+                return Cell(DASH)
+            n_published = row["published_found"]
+            published_text = "" if n_published is None else f"published {n_published:g}; "
+            note = f"{published_text}{row['right']} true; {format_number(row['error'], 2)}"
+            return Cell(str(row["found"]), note)
+
+        table = build_table(
+            self.config.rows.values,
+            [
+                (self.config.rows.key, _format_value),
+                *(
+                    (
+                        _format_value(column_value),
+                        lambda value, other=column_value: cell(value, other),
+                    )
+                    for column_value in self.config.columns.values
+                ),
+            ],
+        )
+        all_equations = [
+            (row, seed, equation) for row in rows for seed, equation in enumerate(row["equations"])
+        ]
+
+        def equation_text(row: Any) -> str:
+            terms = [f"{format_number(value, 4)} {name}" for name, value in row[2].items()]
+            return " + ".join(terms) or DASH
+
+        equations = build_table(
+            all_equations,
+            [
+                (
+                    "setting",
+                    lambda row: (
+                        f"{_format_value(row[0]['row'])}, {_format_value(row[0]['column'])}"
+                    ),
+                ),
+                ("seed", lambda row: Cell(str(row[1]))),
+                ("equation of the acceleration", equation_text),
+            ],
+        )
+        return [
+            Section(
+                "",
+                [
+                    *(picture.preview() for picture in find_figures(run, "study")),
+                    table,
+                    explanation,
+                ],
+            ),
+            Section("Found by setting", find_figures(run, "study")),
+            Section("All equations", [equations], is_folded=True),
+        ]
 
 
 def run_search_trial(settings: SearchConfig, seed: int) -> tuple[float, dict[str, float]]:

@@ -7,7 +7,7 @@ the data alone.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, final
+from typing import Annotated, ClassVar, Literal, final
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -213,6 +213,8 @@ class SeaTrialTaskConfig(StudyTask, ComputingTask):
             square error (m/s^2, m/s^2, rad/s^2), C_p and adjusted R^2 (Tables 7.3, 7.4), mean
             absolute residual and the limits of its 95 % interval (Table 7.5).
     """
+
+    executor_class: ClassVar[str] = "SeaTrialExecutor"
 
     task: Literal["sea_trial"]
     trials: dict[str, SeaTrialConfig] = Field(min_length=1)

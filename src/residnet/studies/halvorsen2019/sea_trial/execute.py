@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import torch
@@ -70,6 +70,7 @@ from residnet.studies.halvorsen2019.standard_model import (
     true_parameters,
 )
 from residnet.studies.study import (
+    StudyExecutor,
     StudyResults,
     comparison_columns,
     find_figures,
@@ -98,98 +99,104 @@ _SAME_COST = 1e-6
 """Relative difference below which two costs belong to the same minimum."""
 
 
-def compute_results(
-    config: SeaTrialTaskConfig, folder: RunFolder
-) -> tuple[dict[str, Any], Iterable[Figure]]:
-    trials = {}
-    figures = []
-    for name in config.trials:
-        trials[name], trial_figures = run_trial(config, name)
-        figures += trial_figures
-    return {"schema": "residnet.sea_trial/1", "run": config.name, "trials": trials}, figures
+@final
+class SeaTrialExecutor(StudyExecutor[SeaTrialTaskConfig]):
+    """Fit and evaluate models of Odin by phase on simulated trials."""
 
+    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+        trials = {}
+        figures = []
+        for name in self.config.trials:
+            trials[name], trial_figures = run_trial(self.config, name)
+            figures += trial_figures
+        return {
+            "schema": "residnet.sea_trial/1",
+            "run": self.config.name,
+            "trials": trials,
+        }, figures
 
-def summarize(config: SeaTrialTaskConfig, results: StudyResults) -> list[str]:
-    sentences = []
-    for name, trial in results["trials"].items():
-        set_name = next(iter(trial["rows"]))
-        best_texts = [
-            f"{row['model']} for {axis} ({format_number(row['rmse'])} {_UNITS[axis]})"
-            for axis, row in _best_rows(trial["rows"][set_name]).items()
-        ]
-        sentences.append(
-            f"Trial {name}: on the validation stretches of the {SET_NAMES[set_name]}, the"
-            f" models"
-            f" with the least root mean square error are {join_list(best_texts)}."
-        )
-        undetermined = trial["standard"][set_name]["undetermined"]
-        if undetermined:
+    def summarize(self, results: StudyResults) -> list[str]:
+        sentences = []
+        for name, trial in results["trials"].items():
+            set_name = next(iter(trial["rows"]))
+            best_texts = [
+                f"{row['model']} for {axis} ({format_number(row['rmse'])} {_UNITS[axis]})"
+                for axis, row in _best_rows(trial["rows"][set_name]).items()
+            ]
             sentences.append(
-                f"Of the standard model, the data of trial {name} determine only combinations"
-                f" of {join_list(undetermined)}."
+                f"Trial {name}: on the validation stretches of the {SET_NAMES[set_name]}, the"
+                f" models"
+                f" with the least root mean square error are {join_list(best_texts)}."
             )
-    return sentences
+            undetermined = trial["standard"][set_name]["undetermined"]
+            if undetermined:
+                sentences.append(
+                    f"Of the standard model, the data of trial {name} determine only combinations"
+                    f" of {join_list(undetermined)}."
+                )
+        return sentences
 
+    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
+        figures: dict[str, SummaryMetric] = {}
+        for name, trial in results["trials"].items():
+            set_name, rows = next(iter(trial["rows"].items()))
+            standard_rows = [
+                row for row in rows if row["model"] == STANDARD and row["on"] == set_name
+            ]
+            for row in (*_best_rows(rows).values(), *standard_rows):
+                key = f"{name}: rmse of {row['axis']}, {row['model']}"
+                figures[key] = SummaryMetric(row["rmse"], _UNITS[row["axis"]])
+        return figures
 
-def main_figures(config: SeaTrialTaskConfig, results: StudyResults) -> dict[str, SummaryMetric]:
-    figures: dict[str, SummaryMetric] = {}
-    for name, trial in results["trials"].items():
+    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
+        name, trial = next(iter(results["trials"].items()))
         set_name, rows = next(iter(trial["rows"].items()))
-        standard_rows = [row for row in rows if row["model"] == STANDARD and row["on"] == set_name]
-        for row in (*_best_rows(rows).values(), *standard_rows):
-            key = f"{name}: rmse of {row['axis']}, {row['model']}"
-            figures[key] = SummaryMetric(row["rmse"], _UNITS[row["axis"]])
-    return figures
-
-
-def build_sections(config: SeaTrialTaskConfig, results: StudyResults, run: Path) -> list[Section]:
-    name, trial = next(iter(results["trials"].items()))
-    set_name, rows = next(iter(trial["rows"].items()))
-    best_rows = _best_rows(rows)
-    summary_table = build_table(
-        (
-            row
-            for row in rows
-            if row is best_rows[row["axis"]] or (row["model"] == STANDARD and row["on"] == set_name)
-        ),
-        [
-            ("acceleration", "axis"),
-            ("model", "model"),
-            ("RMSE", lambda row: f"{format_number(row['rmse'])} {_UNITS[row['axis']]}", str),
-        ],
-        caption=f"Trial {name}, {SET_NAMES[set_name]}",
-        is_selected=lambda row: row is best_rows[row["axis"]],
-        group_key=lambda row: row["axis"],
-    )
-    previews = [picture.preview() for picture in find_figures(run, f"{set_name}_{name}")]
-    sections_written = [Section("", [*previews, summary_table])]
-    for trial_index, (name, trial) in enumerate(results["trials"].items()):
-        blocks: list[Text | Section] = [Text(_trial_text(trial))]
-        for set_name, rows in trial["rows"].items():
-            table = _goodness_table(
-                set_name, rows, {} if trial_index else config.published.get(set_name, {})
-            )
-            title = f"Validation, {SET_NAMES[set_name]}"
-            blocks.append(Section(title, [table, *find_figures(run, f"{set_name}_{name}")]))
-        parameters: list[Block] = [
-            _parameter_table(trial),
-            Bullets(_identifiability_notes(trial)),
-        ]
-        parameters += find_figures(run, f"parameters_{name}")
-        blocks.append(Section("Parameters of the standard model", parameters))
-        equations = [
-            (model.replace("_", "-"), text)
-            for model, texts in trial["equations"].items()
-            for text in texts.values()
-        ]
-        if equations:
-            columns = [("model", lambda row: row[0]), ("equation", lambda row: row[1])]
-            blocks.append(Section("Equations", [build_table(equations, columns)]))
-        blocks.append(Section("The trial", find_figures(run, f"trial_{name}"), is_folded=True))
-        sections_written.append(
-            Section(f"Trial {name}: vessel {config.trials[name].vessel}", blocks)
+        best_rows = _best_rows(rows)
+        summary_table = build_table(
+            (
+                row
+                for row in rows
+                if row is best_rows[row["axis"]]
+                or (row["model"] == STANDARD and row["on"] == set_name)
+            ),
+            [
+                ("acceleration", "axis"),
+                ("model", "model"),
+                ("RMSE", lambda row: f"{format_number(row['rmse'])} {_UNITS[row['axis']]}", str),
+            ],
+            caption=f"Trial {name}, {SET_NAMES[set_name]}",
+            is_selected=lambda row: row is best_rows[row["axis"]],
+            group_key=lambda row: row["axis"],
         )
-    return sections_written
+        previews = [picture.preview() for picture in find_figures(run, f"{set_name}_{name}")]
+        sections_written = [Section("", [*previews, summary_table])]
+        for trial_index, (name, trial) in enumerate(results["trials"].items()):
+            blocks: list[Text | Section] = [Text(_trial_text(trial))]
+            for set_name, rows in trial["rows"].items():
+                table = _goodness_table(
+                    set_name, rows, {} if trial_index else self.config.published.get(set_name, {})
+                )
+                title = f"Validation, {SET_NAMES[set_name]}"
+                blocks.append(Section(title, [table, *find_figures(run, f"{set_name}_{name}")]))
+            parameters: list[Block] = [
+                _parameter_table(trial),
+                Bullets(_identifiability_notes(trial)),
+            ]
+            parameters += find_figures(run, f"parameters_{name}")
+            blocks.append(Section("Parameters of the standard model", parameters))
+            equations = [
+                (model.replace("_", "-"), text)
+                for model, texts in trial["equations"].items()
+                for text in texts.values()
+            ]
+            if equations:
+                columns = [("model", lambda row: row[0]), ("equation", lambda row: row[1])]
+                blocks.append(Section("Equations", [build_table(equations, columns)]))
+            blocks.append(Section("The trial", find_figures(run, f"trial_{name}"), is_folded=True))
+            sections_written.append(
+                Section(f"Trial {name}: vessel {self.config.trials[name].vessel}", blocks)
+            )
+        return sections_written
 
 
 @dataclass(frozen=True)

@@ -117,6 +117,7 @@ class FerryStudyConfig(StudyTask, ComputingTask):
         seed: seed of the noise.
     """
 
+    executor_class: ClassVar[str] = "FerryExecutor"
     results_file: ClassVar[str] = "ferry.json"
 
     task: Literal["ferry_study"]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import torch
@@ -67,6 +67,7 @@ from residnet.studies.jervan2020.residual import (
     to_baseline_yaml,
 )
 from residnet.studies.study import (
+    StudyExecutor,
     StudyResults,
     comparison_columns,
     find_figures,
@@ -100,16 +101,123 @@ _FREE_RUN_TRIALS: Mapping[str, Any] = {
 """Manoeuvres of the plant for the free runs of the models."""
 
 
-def compute_results(
-    config: FerryStudyConfig, folder: RunFolder
-) -> tuple[dict[str, Any], Iterable[Figure]]:
-    return write_results(config, run_ferry_study(config), folder)
+@final
+class FerryExecutor(StudyExecutor[FerryStudyConfig]):
+    """Identify residual models of a ferry and repeat its course with them as feed-forward."""
 
+    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+        return write_results(self.config, run_ferry_study(self.config), folder)
 
-def exports(config: FerryStudyConfig, folder: RunFolder) -> ExportWriters:
-    return {
-        name: partial(config.export_model, ExportRequest(folder, name)) for name in config.models
-    }
+    def export_writers(self, folder: RunFolder) -> ExportWriters:
+        return {
+            name: partial(self.config.export_model, ExportRequest(folder, name))
+            for name in self.config.models
+        }
+
+    def summarize(self, results: StudyResults) -> list[str]:
+        models = results["models"]
+        best_name = find_best_model(results)
+        remaining_text = join_numbers([100 * share for share in models[best_name]["share_left"]])
+        sentences = [
+            f"Of {len(models)} residual models, {best_name} leaves the least of the residual"
+            f" force on"
+            f" the unseen half of the course: {remaining_text} % of its mean square in surge,"
+            f" sway and yaw."
+        ]
+        judging = results["judging"]
+        best_flown = find_best_flown_model(results)
+        sentences.append(
+            f"On {len(judging[BELIEVED_NAME]['courses'])} judging courses the exported feed-forward"
+            f" of {best_flown} has the smallest mean position error:"
+            f" {_error_text(judging[best_flown])}; the believed model's is"
+            f" {_error_text(judging[BELIEVED_NAME])}."
+        )
+        for run_kind in ("course", "crossing"):
+            position_errors = {name: run["position_mae"] for name, run in results[run_kind].items()}
+            believed_error = position_errors.pop(BELIEVED_NAME, None)
+            if position_errors:
+                closest_model = min(position_errors, key=position_errors.__getitem__)
+                change_text = (
+                    "decreases"
+                    if position_errors[closest_model] < believed_error
+                    else "does NOT decrease: it changes"
+                )
+                sentences.append(
+                    f"With {closest_model} as feed-forward, the mean position error in the"
+                    f" {run_kind} {change_text}"
+                    f" from {format_number(believed_error)} m to"
+                    f" {format_number(position_errors[closest_model])} m."
+                )
+        return sentences + [
+            f"On the changed vessel, {name} {update['text']}."
+            for name, update in results["later"].items()
+        ]
+
+    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
+        best_name = find_best_model(results)
+        shares = zip(AXES, results["models"][best_name]["share_left"], strict=True)
+        return (
+            {
+                f"residual left by {best_name}, {axis}": SummaryMetric(share)
+                for axis, share in shares
+            }
+            | {
+                f"mean position error on the judging courses with {name}": SummaryMetric(
+                    run["position_mae"], "m"
+                )
+                for name, run in results["judging"].items()
+                if run["position_mae"] is not None
+            }
+            | {
+                f"mean position error on the course with {name}": SummaryMetric(
+                    run["position_mae"], "m"
+                )
+                for name, run in results["course"].items()
+            }
+        )
+
+    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
+        residual_table = _residual_table(self.config, results)
+        run_pictures = [
+            picture.preview() for picture in find_figures(run, "errors_course", "errors_crossing")
+        ]
+        sections_written = [
+            Section("", [*run_pictures[:1], residual_table.select_columns(3, 6)]),
+            Section("Residual force on the unseen half", [residual_table]),
+            Section("Judging courses", [_judging_table(results)]),
+        ]
+        for run_kind, title in (
+            ("course", "Course in closed loop"),
+            ("crossing", "Operational crossing"),
+            ("feed_forward_alone", "Feed-forward without feedback"),
+        ):
+            if results[run_kind]:
+                run_pictures = find_figures(run, f"errors_{run_kind}", f"forces_{run_kind}")
+                sections_written.append(
+                    Section(
+                        title,
+                        [
+                            *_tracking_tables(self.config, results[run_kind], run_kind),
+                            *run_pictures,
+                        ],
+                    )
+                )
+        if results["later"]:
+            sections_written.append(
+                Section("The changed vessel", [_update_table(results["later"])])
+            )
+        sections_written.append(Section("Forward in time", [_free_run_table(results["forward"])]))
+        # Table 4.11
+        comparisons = {
+            name: {
+                "true": {} if model.on else results["true_coefficients"],
+                "published": model.published.coefficients,
+            }
+            for name, model in self.config.models.items()
+        }
+        return sections_written + model_sections(
+            "Coefficients", results["models"], run, "notes", comparisons
+        )
 
 
 def export_model(config: FerryStudyConfig, request: ExportRequest) -> Path:
@@ -141,105 +249,6 @@ def export_model(config: FerryStudyConfig, request: ExportRequest) -> Path:
     exported = ExportedForce(name, required_force, ranges, chain_rows[-1]["notes"].get("lag"))
     return request.write(
         exported, list_feed_forward_objections(name, results), f"{name}_feed_forward"
-    )
-
-
-def summarize(config: FerryStudyConfig, results: StudyResults) -> list[str]:
-    models = results["models"]
-    best_name = find_best_model(results)
-    remaining_text = join_numbers([100 * share for share in models[best_name]["share_left"]])
-    sentences = [
-        f"Of {len(models)} residual models, {best_name} leaves the least of the residual"
-        f" force on"
-        f" the unseen half of the course: {remaining_text} % of its mean square in surge,"
-        f" sway and yaw."
-    ]
-    judging = results["judging"]
-    best_flown = find_best_flown_model(results)
-    sentences.append(
-        f"On {len(judging[BELIEVED_NAME]['courses'])} judging courses the exported feed-forward"
-        f" of {best_flown} has the smallest mean position error:"
-        f" {_error_text(judging[best_flown])}; the believed model's is"
-        f" {_error_text(judging[BELIEVED_NAME])}."
-    )
-    for run_kind in ("course", "crossing"):
-        position_errors = {name: run["position_mae"] for name, run in results[run_kind].items()}
-        believed_error = position_errors.pop(BELIEVED_NAME, None)
-        if position_errors:
-            closest_model = min(position_errors, key=position_errors.__getitem__)
-            change_text = (
-                "decreases"
-                if position_errors[closest_model] < believed_error
-                else "does NOT decrease: it changes"
-            )
-            sentences.append(
-                f"With {closest_model} as feed-forward, the mean position error in the"
-                f" {run_kind} {change_text}"
-                f" from {format_number(believed_error)} m to"
-                f" {format_number(position_errors[closest_model])} m."
-            )
-    return sentences + [
-        f"On the changed vessel, {name} {update['text']}."
-        for name, update in results["later"].items()
-    ]
-
-
-def main_figures(config: FerryStudyConfig, results: StudyResults) -> dict[str, SummaryMetric]:
-    best_name = find_best_model(results)
-    shares = zip(AXES, results["models"][best_name]["share_left"], strict=True)
-    return (
-        {f"residual left by {best_name}, {axis}": SummaryMetric(share) for axis, share in shares}
-        | {
-            f"mean position error on the judging courses with {name}": SummaryMetric(
-                run["position_mae"], "m"
-            )
-            for name, run in results["judging"].items()
-            if run["position_mae"] is not None
-        }
-        | {
-            f"mean position error on the course with {name}": SummaryMetric(
-                run["position_mae"], "m"
-            )
-            for name, run in results["course"].items()
-        }
-    )
-
-
-def build_sections(config: FerryStudyConfig, results: StudyResults, run: Path) -> list[Section]:
-    residual_table = _residual_table(config, results)
-    run_pictures = [
-        picture.preview() for picture in find_figures(run, "errors_course", "errors_crossing")
-    ]
-    sections_written = [
-        Section("", [*run_pictures[:1], residual_table.select_columns(3, 6)]),
-        Section("Residual force on the unseen half", [residual_table]),
-        Section("Judging courses", [_judging_table(results)]),
-    ]
-    for run_kind, title in (
-        ("course", "Course in closed loop"),
-        ("crossing", "Operational crossing"),
-        ("feed_forward_alone", "Feed-forward without feedback"),
-    ):
-        if results[run_kind]:
-            run_pictures = find_figures(run, f"errors_{run_kind}", f"forces_{run_kind}")
-            sections_written.append(
-                Section(
-                    title, [*_tracking_tables(config, results[run_kind], run_kind), *run_pictures]
-                )
-            )
-    if results["later"]:
-        sections_written.append(Section("The changed vessel", [_update_table(results["later"])]))
-    sections_written.append(Section("Forward in time", [_free_run_table(results["forward"])]))
-    # Table 4.11
-    comparisons = {
-        name: {
-            "true": {} if model.on else results["true_coefficients"],
-            "published": model.published.coefficients,
-        }
-        for name, model in config.models.items()
-    }
-    return sections_written + model_sections(
-        "Coefficients", results["models"], run, "notes", comparisons
     )
 
 

@@ -85,6 +85,7 @@ class ForceResidualConfig(StudyTask, ComputingTask):
         models: regressions by name.
     """
 
+    executor_class: ClassVar[str] = "ForceResidualExecutor"
     results_file: ClassVar[str] = "force_residual.json"
 
     task: Literal["force_residual"]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import torch
@@ -64,6 +64,7 @@ from residnet.studies.jervan2020.residual import (
     model_sections,
 )
 from residnet.studies.study import (
+    StudyExecutor,
     StudyResults,
     comparison_columns,
     find_figures,
@@ -88,81 +89,88 @@ def read_logs(config: ForceResidualConfig) -> MeasuredForceLogs:
     return read_force_logs(config.data, config.channels, config.prepare, config.validation)
 
 
-def compute_results(
-    config: ForceResidualConfig, folder: RunFolder
-) -> tuple[dict[str, Any], Iterable[Figure]]:
-    return run_force_study(config)
+@final
+class ForceResidualExecutor(StudyExecutor[ForceResidualConfig]):
+    """Cross-validate regressions of the residual force on measured logs."""
 
+    def compute_results(self, folder: RunFolder) -> tuple[dict[str, Any], Iterable[Figure]]:
+        return run_force_study(self.config)
 
-def summarize(config: ForceResidualConfig, results: StudyResults) -> list[str]:
-    """Return sentences on the improvement by regressions for each force."""
-    sentences: list[str] = []
-    for force, rows in _rows_by_force(results).items():
-        if results["intervals"] is None:
+    def summarize(self, results: StudyResults) -> list[str]:
+        """Return sentences on the improvement by regressions for each force."""
+        sentences: list[str] = []
+        for force, rows in _rows_by_force(results).items():
+            if results["intervals"] is None:
+                sentences.append(
+                    f"{force.capitalize()} force: there are too few segments to compare models."
+                )
+                continue
+            believed = rows["believed"]
+            bounds = believed["minus_zero"]["ci95"][:3]
+            worse_axes = [axis for axis, limits in zip(AXES, bounds, strict=True) if limits[0] > 0]
             sentences.append(
-                f"{force.capitalize()} force: there are too few segments to compare models."
+                f"{force.capitalize()} force: the believed model is better than no force"
+                f" {_axes_text(is_significantly_better(believed, 'zero'))}"
+                + (f", and worse than no force in {join_list(worse_axes)}." if worse_axes else ".")
             )
-            continue
-        believed = rows["believed"]
-        bounds = believed["minus_zero"]["ci95"][:3]
-        worse_axes = [axis for axis, limits in zip(AXES, bounds, strict=True) if limits[0] > 0]
-        sentences.append(
-            f"{force.capitalize()} force: the believed model is better than no force"
-            f" {_axes_text(is_significantly_better(believed, 'zero'))}"
-            + (f", and worse than no force in {join_list(worse_axes)}." if worse_axes else ".")
-        )
-        sentences += _gain_sentences(
-            [row for name, row in rows.items() if name not in REFERENCE_MODELS]
-        )
-    thrusters = results["forces"]["lag"]
-    lags = {name: model["all"].get("lag") for name, model in results["models"].items()}
-    lag_texts = [
-        f"{format_number(lag['frequency'])} rad/s and {format_number(lag['delay'], 2)} s for {name}"
-        for name, lag in lags.items()
-        if lag
-    ]
-    if lag_texts and not isinstance(thrusters, str):
-        sentences.append(
-            f"The lag fitted together with the residual is {join_list(lag_texts)}; the actual"
-            f" forces"
-            f" follow the commands with {format_number(thrusters['frequency'])} rad/s and"
-            f" {format_number(thrusters['delay'], 2)} s."
-        )
-    return sentences
+            sentences += _gain_sentences(
+                [row for name, row in rows.items() if name not in REFERENCE_MODELS]
+            )
+        thrusters = results["forces"]["lag"]
+        lags = {name: model["all"].get("lag") for name, model in results["models"].items()}
+        lag_texts = [
+            f"{format_number(lag['frequency'])} rad/s and {format_number(lag['delay'], 2)} s"
+            f" for {name}"
+            for name, lag in lags.items()
+            if lag
+        ]
+        if lag_texts and not isinstance(thrusters, str):
+            sentences.append(
+                f"The lag fitted together with the residual is {join_list(lag_texts)}; the actual"
+                f" forces"
+                f" follow the commands with {format_number(thrusters['frequency'])} rad/s and"
+                f" {format_number(thrusters['delay'], 2)} s."
+            )
+        return sentences
 
+    def main_figures(self, results: StudyResults) -> dict[str, SummaryMetric]:
+        figures: dict[str, SummaryMetric] = {}
+        for force, rows in _rows_by_force(results).items():
+            best_row = min(rows.values(), key=lambda row: sum(row["of_zero"]))
+            for row in (rows["believed"], best_row):
+                name = f"share of the {force} force left by {row['model']}"
+                figures[name] = SummaryMetric(sum(row["of_zero"]) / 3)
+        return figures
 
-def main_figures(config: ForceResidualConfig, results: StudyResults) -> dict[str, SummaryMetric]:
-    figures: dict[str, SummaryMetric] = {}
-    for force, rows in _rows_by_force(results).items():
-        best_row = min(rows.values(), key=lambda row: sum(row["of_zero"]))
-        for row in (rows["believed"], best_row):
-            name = f"share of the {force} force left by {row['model']}"
-            figures[name] = SummaryMetric(sum(row["of_zero"]) / 3)
-    return figures
-
-
-def build_sections(config: ForceResidualConfig, results: StudyResults, run: Path) -> list[Section]:
-    previews = [picture.preview() for picture in find_figures(run, "scores")]
-    first_group = next(iter(_rows_by_force(results).values()))
-    sections_written = [
-        Section("", [*previews, _model_table(config, results, first_group).select_columns(3, 6)]),
-        _data_section(config, results),
-        _force_section(results, run),
-    ]
-    if results["acceleration"]:
-        sections_written.append(_acceleration_section(results, run))
-    for force, rows in _rows_by_force(results).items():
+    def build_sections(self, results: StudyResults, run: Path) -> list[Section]:
+        previews = [picture.preview() for picture in find_figures(run, "scores")]
+        first_group = next(iter(_rows_by_force(results).values()))
+        sections_written = [
+            Section(
+                "",
+                [*previews, _model_table(self.config, results, first_group).select_columns(3, 6)],
+            ),
+            _data_section(self.config, results),
+            _force_section(results, run),
+        ]
+        if results["acceleration"]:
+            sections_written.append(_acceleration_section(results, run))
+        for force, rows in _rows_by_force(results).items():
+            sections_written.append(
+                Section(
+                    f"Residual of the {force} force", [_model_table(self.config, results, rows)]
+                )
+            )
         sections_written.append(
-            Section(f"Residual of the {force} force", [_model_table(config, results, rows)])
+            Section("Errors and residuals", find_figures(run, "scores", "residual_"))
         )
-    sections_written.append(
-        Section("Errors and residuals", find_figures(run, "scores", "residual_"))
-    )
-    if results["failed"]:
-        failure_reasons = list(results["failed"].values())
-        sections_written.append(Section("Not determined by these logs", [Bullets(failure_reasons)]))
-    title = "Coefficients of models fitted to all samples"
-    return sections_written + model_sections(title, results["models"], run, "all", {})
+        if results["failed"]:
+            failure_reasons = list(results["failed"].values())
+            sections_written.append(
+                Section("Not determined by these logs", [Bullets(failure_reasons)])
+            )
+        title = "Coefficients of models fitted to all samples"
+        return sections_written + model_sections(title, results["models"], run, "all", {})
 
 
 class CrossValidatedModel(NamedTuple):
