@@ -76,6 +76,17 @@ class Scaling:
         # an input that is nearly constant in training may move in the test
         self.w_std = np.maximum(self.w_std, 0.05 * np.abs(self.w_mean))
 
+    def symmetrize(self, columns: Sequence[int], signs: Sequence[float]) -> None:
+        """Make means and standard deviations equal to those of mirrored logs with these logs."""
+        n = len(self.x_mean)
+        mean = np.concatenate((self.x_mean, self.w_mean))
+        std = np.concatenate((self.x_std, self.w_std))
+        index = list(columns)
+        mean = 0.5 * (mean + np.array(signs) * mean[index])
+        std = 0.5 * (std + std[index])
+        self.x_mean, self.w_mean = mean[:n], mean[n:]
+        self.x_std, self.w_std = std[:n], std[n:]
+
     def decimate(self, log: PreparedLog, start: int = 0, stop: int | None = None) -> Series:
         """Return the samples from `start` to `stop` of a log at the step of the peers."""
         y = log.y[start:stop, VELOCITIES]
@@ -367,10 +378,14 @@ class N4sid(Peer):
 class Recurrent(nn.Module):
     """K encoders and decoders of a recurrent cell, with weights [K, ., .], in one batch."""
 
-    def __init__(self, n_members: int, n_inputs: int, size: int, cell: str) -> None:
+    def __init__(
+        self, n_members: int, n_inputs: int, size: int, cell: str, gain: float | Tensor = 0.5
+    ) -> None:
         super().__init__()
         self.size = size
         self.cell = cell
+        self.gain = gain
+        self.limits: tuple[Tensor, Tensor] | None = None
         n_gates = 4 if cell == "lstm" else 3
 
         def parameter(*shape: int) -> nn.Parameter:
@@ -391,6 +406,7 @@ class Recurrent(nn.Module):
         )
         self.output = nn.Parameter(0.1 * parameter(size, 3).data)
         self.skip = nn.Parameter(0.1 * parameter(n_inputs, 3).data)
+        self.output_bias = nn.Parameter(torch.zeros(n_members, 1, 3))
 
     def update(self, part: str, z: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
         """Return hidden and cell states [K, B, H] after inputs z [K, B, n_inputs]."""
@@ -416,90 +432,228 @@ class Recurrent(nn.Module):
         predicted = []
         for k in range(w.shape[2]):
             z = torch.cat((x, w[:, :, k]), dim=-1)
+            if self.limits is not None:
+                z = z.clamp(*self.limits)
             h, c = self.update("decoder", z, h, c)
-            increment = 0.5 * (torch.bmm(h, self.output) + torch.bmm(z, self.skip))
+            increment = self.gain * (
+                torch.bmm(h, self.output) + torch.baddbmm(self.output_bias, z, self.skip)
+            )
             x = (x + increment).clamp(-_MAX_VELOCITY, _MAX_VELOCITY)
             predicted.append(x)
         return torch.stack(predicted, dim=2)
 
 
+@dataclass(frozen=True)
+class NetworkSettings:
+    """Settings of plain recurrent networks.
+
+    Attributes:
+        cell: `gru` or `lstm`.
+        n_members: number of networks.
+        size: hidden units of each network.
+        n_batches: number of batches.
+        batch_size: windows in a batch for each network.
+        learning_rate: largest learning rate of the cosine schedule.
+        loss: `huber`, the mean over samples, or `window`, the mean over windows of the root mean
+            square error, as the recipe has it.
+        horizons: shares of the batches, and the horizon of each relative to the longest one.
+        longest: longest horizon relative to the shortest log.
+        gain: change of a velocity in a step for an output of 1, in standard deviations of the
+            velocity; `increment` for the standard deviation of the increments.
+        decay: decay of the exponential average of the weights; 0 for the last weights.
+        is_mirrored: whether half of the windows are mirrored.
+        clips_members: whether the gradient of each network is clipped separately.
+        is_limited: whether inputs of the networks are limited to their training range.
+        validates: whether the weights with the smallest error on the last log are taken, which is
+            not trained on.
+    """
+
+    cell: str = "gru"
+    n_members: int = 6
+    size: int = 32
+    n_batches: int = 300
+    batch_size: int = 32
+    learning_rate: float = 3e-3
+    loss: str = "huber"
+    horizons: tuple[tuple[float, float], ...] = ((0.25, 0.3), (0.5, 0.6), (1.0, 1.0))
+    longest: float = 1.0
+    gain: float | str = 0.5
+    decay: float = 0.99
+    is_mirrored: bool = False
+    clips_members: bool = False
+    is_limited: bool = False
+    validates: bool = False
+
+
+_START_NOISE = 0.03
+"""Standard deviation of the noise on the initial velocities, in standard deviations."""
+_VALIDATION_INTERVAL = 25
+"""Batches between two validations of `NetworkSettings.validates`."""
+
+
 class Gru(Peer):
-    """Six gated recurrent units in free run with growing horizons, averaged."""
+    """Recurrent networks in free run with growing horizons, averaged.
 
-    learning_rate = 3e-3
-    cell = "gru"
-    n_members = 6
-    n_batches = 300
+    Args:
+        n_past: steps of the measured past.
+        horizon: steps of a free run.
+        settings: settings of the networks.
+        mirror: source column and sign of each velocity and input in the mirror.
+    """
 
-    def __init__(self, n_past: int, horizon: int) -> None:
+    settings = NetworkSettings()
+
+    def __init__(
+        self,
+        n_past: int,
+        horizon: int,
+        settings: NetworkSettings | None = None,
+        mirror: tuple[list[int], list[float]] = ([], []),
+    ) -> None:
         self.n_past = n_past
         self.horizon = horizon
+        self.settings = settings or self.settings
+        self.mirror = mirror
 
     def fit(self, logs: Sequence[Series], **settings: Any) -> None:
+        options = self.settings
         torch.manual_seed(0)
         random = np.random.default_rng(0)
+        validation = logs[-1:] if options.validates else ()
+        if options.validates:
+            logs = logs[:-1]
         rows = [torch.from_numpy(np.column_stack((log.x[:-1], log.w))).float() for log in logs]
         targets = [torch.from_numpy(log.x).float() for log in logs]
         shortest = min(len(log.w) for log in logs)
-        longest = max(min(self.horizon, shortest - self.n_past - 1), 2)
-        net = Recurrent(self.n_members, rows[0].shape[1], 32, self.cell)
+        room = min(int(options.longest * shortest), shortest - self.n_past - 1)
+        longest = max(min(self.horizon, room), 2)
+        joined = torch.cat(rows)
+        gain: float | Tensor
+        if isinstance(options.gain, str):
+            gain = torch.cat([part.diff(dim=0) for part in targets]).std(dim=0)
+        else:
+            gain = options.gain
+        net = Recurrent(options.n_members, rows[0].shape[1], options.size, options.cell, gain)
+        if options.is_limited:
+            net.limits = (joined.amin(0), joined.amax(0))
         average = copy.deepcopy(net)
-        optimizer = torch.optim.AdamW(net.parameters(), lr=self.learning_rate, weight_decay=1e-3)
-        for batch in range(self.n_batches):
-            progress = batch / self.n_batches
-            share = 0.3 if progress < 0.25 else 0.6 if progress < 0.5 else 1.0
+        best = (np.inf, average)
+        optimizer = torch.optim.AdamW(net.parameters(), lr=options.learning_rate, weight_decay=1e-3)
+        for batch in range(options.n_batches):
+            progress = batch / options.n_batches
+            share = next(share for end, share in options.horizons if progress < end)
             length = max(round(share * longest), 2)
             optimizer.param_groups[0]["lr"] = (
-                self.learning_rate
+                options.learning_rate
                 * max(0.5 * (1.0 + np.cos(np.pi * progress)), 0.02)
                 * min((batch + 1) / 20, 1.0)
             )
-            starts = [
-                (i, k) for i, z in enumerate(rows) for k in range(self.n_past, len(z) - length)
-            ]
-            chosen = random.integers(len(starts), size=(self.n_members, 32))
-
-            def gather(tables: list[Tensor], first: int, last: int) -> Tensor:
-                """Return rows `first` to `last` after each start [K, B, ., .]."""
-                return torch.stack(
-                    [
-                        torch.stack([tables[i][k + first : k + last] for i, k in members])
-                        for members in [[starts[j] for j in part] for part in chosen]  # noqa: B023
-                    ]
-                )
-
-            past = gather(rows, -self.n_past, 0)
-            start = gather(targets, 0, 1)[:, :, 0]
-            start = start + 0.03 * torch.randn_like(start)
-            predicted = net(past, start, gather(rows, 0, length)[..., 3:])
-            error = predicted - gather(targets, 1, length + 1)
-            loss = nn.functional.smooth_l1_loss(
-                error, torch.zeros_like(error), reduction="none", beta=0.3
-            )
+            loss = self.compute_loss(net, rows, targets, length, random)
             optimizer.zero_grad()
-            loss.mean((1, 2, 3)).sum().backward()
-            nn.utils.clip_grad_norm_(net.parameters(), float(self.n_members))
+            loss.backward()
+            if options.clips_members:
+                clip_members(net)
+            else:
+                nn.utils.clip_grad_norm_(net.parameters(), float(options.n_members))
             optimizer.step()
-            decay = min(0.99, (batch + 1) / (batch + 10))
+            decay = min(options.decay, (batch + 1) / (batch + 10))
             with torch.no_grad():
                 for averaged, value in zip(average.parameters(), net.parameters(), strict=True):
                     averaged.lerp_(value, 1.0 - decay)
-        self.net = average
+            if validation and (batch + 1) % _VALIDATION_INTERVAL == 0:
+                self.net = average
+                error = self.free_run_error(validation, longest)
+                if error < best[0]:
+                    best = (error, copy.deepcopy(average))
+        self.net = best[1] if validation else average
+
+    def compute_loss(
+        self,
+        net: Recurrent,
+        rows: list[Tensor],
+        targets: list[Tensor],
+        length: int,
+        random: np.random.Generator,
+    ) -> Tensor:
+        """Return the loss of a batch of free runs of `length` steps from random starts."""
+        options = self.settings
+        starts = [(i, k) for i, z in enumerate(rows) for k in range(self.n_past, len(z) - length)]
+        chosen = random.integers(len(starts), size=(options.n_members, options.batch_size))
+        members = [[starts[j] for j in part] for part in chosen]
+
+        def gather(tables: list[Tensor], first: int, last: int) -> Tensor:
+            """Return rows `first` to `last` after each start [K, B, ., .]."""
+            return torch.stack(
+                [
+                    torch.stack([tables[i][k + first : k + last] for i, k in part])
+                    for part in members
+                ]
+            )
+
+        past = gather(rows, -self.n_past, 0)
+        start = gather(targets, 0, 1)
+        inputs = gather(rows, 0, length)[..., 3:]
+        target = gather(targets, 1, length + 1)
+        if options.is_mirrored:
+            rows_mirrored = torch.rand(options.n_members, options.batch_size, 1, 1) < 0.5
+            columns, signs = (torch.tensor(part) for part in self.mirror)
+
+            def reflect(values: Tensor, part: slice) -> Tensor:
+                image = values[..., columns[part] - (part.start or 0)] * signs[part]
+                return torch.where(rows_mirrored, image, values)
+
+            past = reflect(past, slice(None))
+            start = reflect(start, slice(3))
+            inputs = reflect(inputs, slice(3, None))
+            target = reflect(target, slice(3))
+        start = start[:, :, 0] + _START_NOISE * torch.randn_like(start[:, :, 0])
+        error = net(past, start, inputs) - target
+        if options.loss == "window":
+            return torch.sqrt(error.square().mean((2, 3)) + 0.05**2).mean(1).sum()
+        loss = nn.functional.smooth_l1_loss(
+            error, torch.zeros_like(error), reduction="none", beta=0.3
+        )
+        return loss.mean((1, 2, 3)).sum()
+
+    def free_run_error(self, logs: Sequence[Series], length: int) -> float:
+        """Return the root mean square error of free runs over windows of logs."""
+        errors = []
+        for log in logs:
+            starts = range(self.n_past, len(log.w) - length, max(length // 5, 1))
+            runs = Runs(
+                np.stack([log.x[k - self.n_past : k] for k in starts]),
+                np.stack([log.w[k - self.n_past : k] for k in starts]),
+                np.stack([log.x[k] for k in starts]),
+                np.stack([log.w[k : k + length] for k in starts]),
+            )
+            measured = np.stack([log.x[k + 1 : k + length + 1] for k in starts])
+            errors.append(np.sqrt(np.mean((self.simulate(runs) - measured) ** 2)))
+        return float(np.mean(errors))
 
     @torch.no_grad()
     def simulate(self, runs: Runs) -> np.ndarray:
-        past = np.concatenate((runs.past_x, runs.past_w), axis=2)
+        past = np.concatenate((runs.past_x, runs.past_w), axis=2)[:, -self.n_past :]
+        n_members = self.settings.n_members
         tensors = [
-            torch.from_numpy(part).float()[None].repeat(self.n_members, *[1] * part.ndim)
+            torch.from_numpy(part).float()[None].repeat(n_members, *[1] * part.ndim)
             for part in (past, runs.start, runs.w)
         ]
         return np.asarray(self.net(*tensors).double().mean(0).numpy())
 
 
+def clip_members(net: nn.Module) -> None:
+    """Clip the gradient of each network to a norm of 1."""
+    gradients = [p.grad for p in net.parameters() if p.grad is not None]
+    norm = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()
+    factor = 1.0 / norm.clamp(min=1.0)
+    for gradient in gradients:
+        gradient.mul_(factor.view(-1, *[1] * (gradient.ndim - 1)))
+
+
 class Lstm(Gru):
     """The same with long short-term memories."""
 
-    cell = "lstm"
+    settings = NetworkSettings(cell="lstm")
 
 
 PEERS: dict[str, type[Peer]] = {
@@ -513,9 +667,10 @@ class Comparison:
 
     Args:
         data: prepared logs and protocols of the fit.
+        coarsening: ratio of the time step to a hundredth of a free run.
     """
 
-    def __init__(self, data: residnet.Dataset) -> None:
+    def __init__(self, data: residnet.Dataset, coarsening: int = 1) -> None:
         self.data = data
         self.step = data.prepare.grid.step
         self.protocol = data.evaluation.protocols[data.evaluation.selection]
@@ -523,7 +678,7 @@ class Comparison:
         self.splits = {name: data.logs(name) for name in ("train", "validation", "test")}
         window = self.windows("test")[0]
         self.length = window.stop - window.start
-        factor = max(round(self.length / _STEPS_PER_FREE_RUN), 1)
+        factor = coarsening * max(round(self.length / _STEPS_PER_FREE_RUN), 1)
         self.scaling = Scaling(self.splits["train"], factor)
         self.n_past = int(self.protocol.history / self.step) // factor
 
@@ -539,6 +694,14 @@ class Comparison:
 
     def errors(self, peer: Peer, name: str) -> np.ndarray:
         """Return the NRMSE of a peer in each window of a split, as metrics.json averages it."""
+        means = [np.nanmean(error**2, axis=0) for error in self.velocity_errors(peer, name)]
+        return np.array([float(np.mean(np.sqrt(mean))) for mean in means])
+
+    def velocity_errors(self, peer: Peer, name: str) -> list[np.ndarray]:
+        """Return the errors [T, 3] of a peer in each window of a split, relative to the scales.
+
+        They are NaN where they are not scored.
+        """
         scaling = self.scaling
         logs = self.splits[name]
         # windows with equal lengths of past and run are simulated as one batch
@@ -547,7 +710,7 @@ class Comparison:
         for number, window in enumerate(all_windows):
             n_past = min(self.n_past, window.start // scaling.factor)
             batches.setdefault((n_past, window.stop - window.start), []).append(number)
-        errors = np.empty(len(all_windows))
+        errors: dict[int, np.ndarray] = {}
         for (n_past, length), numbers in batches.items():
             windows = [all_windows[number] for number in numbers]
             n_steps = -(-(length - 1) // scaling.factor)
@@ -564,22 +727,19 @@ class Comparison:
             runs = Runs(past_x[:, :-1], past_w, past_x[:, -1], np.stack(inputs))
             simulated = np.concatenate((past_x[:, -1:], peer.simulate(runs)), axis=1)
             for number, window, x in zip(numbers, windows, simulated, strict=True):
-                errors[number] = self.score(x, logs[window.log_index], window)
-        return errors
+                errors[number] = self.compare(x, logs[window.log_index], window)
+        return [errors[number] for number in range(len(all_windows))]
 
-    def score(self, x: np.ndarray, log: PreparedLog, window: Any) -> float:
-        """Return the NRMSE of standardised velocities [T + 1, 3] at the step of the peers."""
+    def compare(self, x: np.ndarray, log: PreparedLog, window: Any) -> np.ndarray:
+        """Return the errors [T, 3] of standardised velocities [K + 1, 3] at the peers' step."""
         scaling = self.scaling
         fine = np.arange(window.stop - window.start) / scaling.factor
         predicted = np.stack([np.interp(fine, np.arange(len(x)), column) for column in x.T], axis=1)
         difference = predicted * scaling.x_std + scaling.x_mean
         difference = difference - log.y[window.start : window.stop, VELOCITIES]
-        usable = log.usable[window.start : window.stop]
         # u and v are scored at usable samples only, see `FreeRunErrors.is_scored`
-        rmse = [
-            np.sqrt(np.mean(difference[usable if k < 2 else slice(None), k] ** 2)) for k in range(3)
-        ]
-        return float(np.mean(np.array(rmse) / self.scales))
+        difference[~log.usable[window.start : window.stop], :2] = np.nan
+        return np.asarray(difference / self.scales)
 
     def judge(self, name: str) -> dict[str, Any]:
         """Tune and fit a peer; return its test error, settings and CPU seconds."""

@@ -2,7 +2,12 @@
 
     python scripts/bench/recurrent.py [--logs measured|boats|shipped] [--count 4] [--seed S]
         [--minutes 5] [--past 5 10] [--arms NAME ...] [--save FILE]
+        [--plain NAME ...] [--cache FOLDER]
     python scripts/bench/recurrent.py --summary FILE ...
+
+`--plain` adds networks of `peers.py` with one setting changed each, which depend on no other code
+of the project; `plain` has those of the published recipe. `--cache` stores the errors of the arms
+of a draw with its logs, so that further plain networks need no fit.
 
 Each draw has three training logs and one validation log, `minutes` long together, and four logs for
 the comparison. The hull and all arms are fitted to the same logs, and each arm is compared in the
@@ -14,6 +19,7 @@ for every value. The draws of a seed are for choices: report with another seed.
 from __future__ import annotations
 
 import json
+import pickle
 import time
 from pathlib import Path
 from typing import Any
@@ -21,10 +27,12 @@ from unittest import mock
 
 import bench
 import numpy as np
+from peers import Comparison, Gru, NetworkSettings
 from recipe import SOURCES, STRETCHES, Missed, split
 
 import residnet
 from residnet.identification import recipe, settings
+from residnet.physics.symmetry import mirror_channels
 
 ARMS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "hull_network": ("hull", {}, {}),
@@ -35,6 +43,35 @@ ARMS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "encoder_twice": ("constant_velocity", {"encoder": "measurements"}, {"steps": 30}),
 }
 """Baseline, changed keys of the head and of its training for each arm of the ablation."""
+PLAIN: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "plain_mirror": {"is_mirrored": True},
+    "plain_past_5": {"past": 5.0},
+    "plain_past_2": {"past": 2.0},
+    "plain_full_horizon": {"longest": 1.0},
+    "plain_increment": {"gain": "increment"},
+    "plain_window_loss": {"loss": "window"},
+    "plain_limited": {"is_limited": True},
+    "plain_no_average": {"decay": 0.0},
+    "plain_joint_clip": {"clips_members": False},
+    "plain_fixed_horizon": {"horizons": ((1.0, 1.0),)},
+    "plain_lr_1e-3": {"learning_rate": 1e-3},
+    "plain_lr_1e-2": {"learning_rate": 1e-2},
+    "plain_600": {"n_batches": 600},
+    "plain_150": {"n_batches": 150},
+    "plain_64_units": {"size": 64},
+    "plain_16_units": {"size": 16},
+    "plain_one": {"n_members": 1},
+    "plain_validated": {"validates": True},
+    "plain_coarse": {"coarsening": 2},
+    "plain_like_head": {
+        "gain": "increment", "loss": "window", "is_limited": True, "decay": 0.0,
+        "clips_members": False, "is_mirrored": True,
+    },
+}  # fmt: skip
+"""Changed settings of plain networks; `past` in s, `coarsening` of the step of the others."""
+_PLAIN_DEFAULTS = {"longest": 0.6, "clips_members": True}
+"""Settings of the published recipe that differ from those of `peers.py`."""
 MEANS = (
     ("hull", "hull_network"), ("hull", "hull_encoder"), ("hull", "innovations"),
     ("hull", "encoder"), ("hull", "lstm"), ("hull", "encoder_twice"),
@@ -68,23 +105,89 @@ def make_protocols(length: float, past: float, first: float) -> dict[str, Any]:
     }
 
 
-def compare_arms(
+def fit_draw(
     splits: dict[str, Any], arms: list[str], past: float, first: float
-) -> dict[str, Any]:
-    """Fit all arms, and return the errors of the single models and of the means, and the times."""
+) -> tuple[dict[str, np.ndarray], np.ndarray, dict[str, float], Any, tuple[str, ...]]:
+    """Fit hull and arms; return errors by model [N, n], first rows of windows, times, the logs."""
     with (
         mock.patch.object(settings, "make_portfolio", lambda summary: make_plan(summary, arms)),
         mock.patch.object(recipe, "make_protocols", lambda T: make_protocols(T, past, first)),
     ):
         models = residnet.fit(splits, bands=None)
-    names = ["hull", *arms]
+    names = ["constant_velocity", "hull", *arms]
     free_run_errors = Missed(models, names, "test")
-    errors = {}
-    for members in [*((name,) for name in names), *MEANS]:
-        if set(members) <= set(names):
-            weights = np.array([(name in members) / len(members) for name in names])
-            errors[" + ".join(members)] = free_run_errors.error(weights)
     seconds = {name: float(models[name].fitted_model.notes["seconds"]) for name in arms}
+    channels = ("u", "v", "r", *models["hull"].fitted_model.spec.signals.input_columns)
+    return (
+        dict(zip(names, free_run_errors.each, strict=True)),
+        free_run_errors.begins,
+        seconds,
+        models.data,
+        channels,
+    )
+
+
+def fit_plain(name: str, data: Any, channels: tuple[str, ...]) -> tuple[np.ndarray, float]:
+    """Fit plain networks to the logs of a draw; return their test errors [N, n] and CPU seconds."""
+    options = {**_PLAIN_DEFAULTS, **PLAIN[name]}
+    past = options.pop("past", None)
+    comparison = Comparison(data, options.pop("coarsening", 1))
+    mirror = mirror_channels(channels) if options.get("is_mirrored") else None
+    if mirror is not None:
+        comparison.scaling.symmetrize(*mirror)
+    n_past = comparison.n_past
+    if past is not None:
+        n_past = min(round(past / (comparison.scaling.factor * comparison.step)), n_past)
+    network = Gru(
+        n_past,
+        comparison.length // comparison.scaling.factor,
+        NetworkSettings(**{**options, "is_mirrored": mirror is not None}),
+        mirror or ([], []),
+    )
+    logs = [log for part in ("train", "validation") for log in comparison.splits[part]]
+    begin = time.process_time()
+    network.fit([comparison.scaling.decimate(log) for log in logs])
+    seconds = time.process_time() - begin
+    return np.concatenate(comparison.velocity_errors(network, "test")), seconds
+
+
+def mean_error(errors: np.ndarray, begins: np.ndarray) -> float:
+    """Return the mean NRMSE over windows and velocities of errors [N, n], NaN where not scored."""
+    is_scored = np.isfinite(errors)
+    squares = np.add.reduceat(np.where(is_scored, errors, 0.0) ** 2, begins)
+    return float(np.sqrt(squares / np.add.reduceat(is_scored.astype(float), begins)).mean())
+
+
+def compare_arms(
+    splits: dict[str, Any],
+    arms: list[str],
+    plain: list[str],
+    past: float,
+    first: float,
+    cache: Path | None,
+) -> dict[str, Any]:
+    """Fit all arms, and return the errors of the single models and of the means, and the times."""
+    if cache is not None and cache.exists():
+        # only files of this script are read, which the caller names
+        draw = pickle.loads(cache.read_bytes())
+    else:
+        draw = fit_draw(splits, arms, past, first)
+    by_name, begins, seconds, data, channels = draw
+    for name in plain:
+        if name not in by_name:
+            by_name[name], seconds[name] = fit_plain(name, data, channels)
+    if cache is not None:
+        cache.write_bytes(pickle.dumps(draw))
+    means = [(name,) for name in by_name]
+    means += [members for members in MEANS if set(members) <= set(by_name)]
+    means += [(*reference, name) for name in plain for reference in (("hull",), MEANS[0])]
+    errors = {
+        " + ".join(members): mean_error(
+            sum(by_name[name] for name in members) / len(members), begins
+        )
+        for members in means
+        if set(members) <= set(by_name)
+    }
     return {"errors": errors, "seconds": seconds}
 
 
@@ -122,7 +225,7 @@ def main() -> None:
     """Fit the arms to each draw and print the table, or print the table of stored draws."""
     given = bench.options(
         __doc__, logs="measured", count=4, seed=100, first=0, minutes=5.0, past=[5.0],
-        arms=list(ARMS), vessels=[], save=None, summary=[],
+        arms=list(ARMS), plain=[""], cache=None, vessels=[], save=None, summary=[],
     )  # fmt: skip
     records: list[dict[str, Any]] = []
     for file in given.summary:
@@ -137,7 +240,11 @@ def main() -> None:
         )
         for past in given.past:
             begin = time.process_time()
-            record = compare_arms(splits, given.arms, past, max(given.past))
+            cache = None
+            if given.cache:
+                cache = Path(given.cache) / f"{name}_{given.seed}_{number}_{past:g}.pickle"
+            plain = [arm for arm in given.plain if arm]
+            record = compare_arms(splits, given.arms, plain, past, max(given.past), cache)
             record |= {"name": name, "draw": number, "seed": given.seed, "past": past}
             record["cpu"] = round(time.process_time() - begin, 1)
             records.append(record)
