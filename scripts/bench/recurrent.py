@@ -172,12 +172,14 @@ def compare_arms(
         draw = pickle.loads(cache.read_bytes())
     else:
         draw = fit_draw(splits, arms, past, first)
+        if cache is not None:
+            cache.write_bytes(pickle.dumps(draw))
     by_name, begins, seconds, data, channels = draw
     for name in plain:
         if name not in by_name:
             by_name[name], seconds[name] = fit_plain(name, data, channels)
-    if cache is not None:
-        cache.write_bytes(pickle.dumps(draw))
+            if cache is not None:
+                cache.write_bytes(pickle.dumps(draw))
     means = [(name,) for name in by_name]
     means += [members for members in MEANS if set(members) <= set(by_name)]
     means += [(*reference, name) for name in plain for reference in (("hull",), MEANS[0])]
