@@ -15,19 +15,14 @@ PAGES = {
     "003": "woo2018",
     "004": "gouletas2020",
 }
-TABLES = {
+SECTIONS = {
     document: (ROOT / "docs" / "documents" / f"{page}.md")
     .read_text(encoding="utf-8")
-    .partition("## Claims and results, row by row")[2]
+    .partition("## Claims and results")[2]
     for document, page in PAGES.items()
 }
-ROWS = [
-    [cell.strip() for cell in line.strip().strip("|").split(" | ")]
-    for table in TABLES.values()
-    for line in table.splitlines()
-    if line.startswith("| ") and not line.startswith(("| item", "| ---"))
-]
-COMMANDS = sorted({command for row in ROWS for command in re.findall(r"`([^`]+)`", row[3])})
+COMMAND = re.compile(r"`((?:residnet run|python|pytest) [^`]+)`")
+NOT_COMPUTED = ("used", "nothing to compute")
 CAPTIONS = {
     "000": {
         "Figure": "1.1 3.1-3.3 4.1 5.1-5.11 6.1-6.9 7.1-7.14 8.1",
@@ -46,39 +41,67 @@ CAPTIONS = {
 """What each document has a caption for: first and last number of each chapter."""
 
 
-def numbers(spans: str) -> set[str]:
+def parse_rows(section: str) -> list[tuple[str, list[str]]]:
+    """Return the rows of the tables of claims, each with the heading above its table."""
+    heading = ""
+    rows = []
+    for line in section.splitlines():
+        if line.startswith("### "):
+            heading = line
+        elif line.startswith("| ") and not line.startswith(("| claim", "| ---")):
+            rows.append((heading, [cell.strip() for cell in line.strip().strip("|").split(" | ")]))
+    return rows
+
+
+ROWS = {document: parse_rows(section) for document, section in SECTIONS.items()}
+COMMANDS = sorted({name for section in SECTIONS.values() for name in COMMAND.findall(section)})
+
+
+def expand_spans(spans: str) -> set[str]:
     """Return all numbers of spans such as `5.1-5.3 8.1`."""
-    found = set()
+    numbers = set()
     for span in spans.split():
         first, _, last = span.partition("-")
         chapter, dot, low = first.rpartition(".")
         high = int((last or first).rpartition(".")[2])
-        found |= {f"{chapter}{dot}{n}" for n in range(int(low), high + 1)}
-    return found
+        numbers |= {f"{chapter}{dot}{n}" for n in range(int(low), high + 1)}
+    return numbers
+
+
+def read_captions(kind: str, text: str) -> set[str]:
+    """Return the numbers of all captions of a kind in text such as `Figures 4.1 to 4.3, 4.5`."""
+    number = r"(?:[A-Z]\.)?\d+(?:\.\d+)?"
+    span = rf"{number}(?: to {number})?"
+    lists = re.findall(rf"\b{kind}s? ({span}(?:, {span})*)", text)
+    return expand_spans(" ".join(lists).replace(" to ", "-").replace(",", " "))
 
 
 @pytest.mark.parametrize("document", CAPTIONS)
 def test_every_figure_table_and_listing_has_a_row(document: str) -> None:
-    lines = TABLES[document].splitlines()
-    items = "\n".join(line.split(" | ")[0] for line in lines if line.startswith("| "))
-    # captions of pictures stand in one sentence, each with its kind
-    items += "".join(line for line in lines if line.startswith("Without a computation"))
+    places = [cells[1] for _, cells in ROWS[document]]
+    # captions of pictures are listed in one sentence
+    places += [
+        line for line in SECTIONS[document].splitlines() if line.startswith("Without a computation")
+    ]
     for kind, spans in CAPTIONS[document].items():
-        # "Figure 8 (a), 11 (a)" and "Figure 7, (21), (22)": numbers of equations are in brackets
-        named = re.findall(rf"{kind} (\S+(?: \(a\), \d+)?)", items)
-        named += re.findall(rf", {kind} (\S+)", items)
-        have = {n.strip(",") for text in named for n in re.findall(r"(?<!\()[A-Z0-9.]+", text)}
-        missing = sorted(numbers(spans) - {n.strip(".") for n in have})
+        missing = sorted(expand_spans(spans) - read_captions(kind, "\n".join(places)))
         assert not missing, f"document {document}: no row for {kind} {', '.join(missing)}"
 
 
-def test_every_row_is_whole() -> None:
-    assert len(ROWS) > 200
-    for row in ROWS:
-        assert len(row) == 5, row
-        item, published, _, command, status = row
-        assert all((item, published, status)), f"{item}: without a command or a figure it says why"
-        assert command or status in ("nothing to compute", "used") or len(status) >= 10, row
+def test_captions_are_read_from_lists_and_spans() -> None:
+    text = "Figures 4.1 to 4.3, 5.1, Table A.1, (4.4); Figure 7, (21)"
+    assert read_captions("Figure", text) == {"4.1", "4.2", "4.3", "5.1", "7"}
+    assert read_captions("Table", text) == {"A.1"}
+
+
+def test_every_row_is_complete() -> None:
+    rows = [row for document in ROWS.values() for row in document]
+    assert len(rows) > 100
+    for heading, cells in rows:
+        assert len(cells) == 4, cells
+        assert all(cells), cells
+        has_command = COMMAND.search(f"{heading} {cells[2]}") is not None
+        assert has_command or cells[3] in NOT_COMPUTED or len(cells[3]) >= 10, cells
 
 
 @pytest.mark.parametrize("command", COMMANDS)
