@@ -390,4 +390,4 @@ def test_files_and_links_exist_and_sentences_are_short(page: Path) -> None:
         for link in re.findall(r"\]\((?!http)([^)#]+)", text):
             assert (page.parent / link).exists(), f"{page.name} links to {link}"
     counts = readability.sentences(text)
-    assert sum(counts) <= 25 * len(counts), "words of a sentence in the mean"
+    assert sum(counts) <= 20 * len(counts), "words of a sentence in the mean"
