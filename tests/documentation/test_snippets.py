@@ -227,7 +227,6 @@ NOT_RUN = {
 ELSEWHERE = {
     "docs/tutorials/first_hour.md": "a test of its own follows it and compares its numbers",
     "docs/howto/extend.md": "its only blocks need a package of the reader",
-    "docs/gallery.md": "scripts/ci/long.sh draws it",
     **dict.fromkeys(
         (page for page in {block.page for block in BLOCKS} if page.startswith("docs/results/")),
         "hours of runs, each beside its figures; the stage `configs` runs their configs",
