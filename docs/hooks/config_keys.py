@@ -1,7 +1,7 @@
-"""Reads the config classes for the reference of every config key.
+"""Read the config classes for the reference of all config keys.
 
-`python docs/hooks/config_keys.py` lists the keys that no docstring documents and exits with 1
-where there are any.
+`python docs/hooks/config_keys.py` lists the keys that no docstring documents. The exit code is 1 if
+there are any.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from residnet.tasks.registry import TaskConfig
 
 ROOTS = (TaskConfig, VesselConfig)
 DISCRIMINATORS = ("task", "kind")
-_PLAIN = {str: "text", int: "whole number", float: "number", bool: "`true` or `false`"}
+_BASIC_TYPES = {str: "text", int: "whole number", float: "number", bool: "`true` or `false`"}
 _EXAMPLES = {"rad": "20 deg", "rad/s": "3 deg/s", "m/s": "6 kn", "1/s": "120 rpm", "kg": "1.8 t"}
 _LIMITS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
@@ -37,10 +37,10 @@ class Key:
     """One key of a config class.
 
     Attributes:
-        name: as it is written in YAML.
-        type: what the key takes, as Markdown; `{module.Name}` stands for a link to a class.
-        default: as Markdown; empty where the key is required.
-        text: the documentation, None where there is none.
+        name: name in YAML.
+        type: accepted values as Markdown; `{module.Name}` is replaced by a link to a class.
+        default: default value as Markdown; empty if the key is required.
+        text: documentation of the key; None without one.
     """
 
     name: str
@@ -50,48 +50,50 @@ class Key:
 
 
 def is_config(annotation: object) -> typing.TypeGuard[type[BaseModel]]:
-    """Tell whether an annotation is a config class."""
+    """Return whether an annotation is a config class."""
     return inspect.isclass(annotation) and issubclass(annotation, BaseModel)
 
 
-def parts(annotation: object) -> tuple[Any, ...]:
-    """Return what an annotation is made of: members of a union, elements of a list, and so on."""
+def list_type_arguments(annotation: object) -> tuple[Any, ...]:
+    """Return the types inside an annotation: members of a union, elements of a list and others."""
     if typing.get_origin(annotation) is Literal:
         return ()
-    if typing.get_origin(annotation) is typing.Annotated and marked(annotation.__metadata__):
+    if typing.get_origin(annotation) is typing.Annotated and find_plugin_union(
+        annotation.__metadata__
+    ):
         return tuple(load_kinds(annotation).values())
     aliased = getattr(annotation, "__value__", None)
     return (aliased,) if aliased is not None else typing.get_args(annotation)
 
 
-def marked(metadata: typing.Sequence[object]) -> PluginUnion | None:
-    """Return the kinds that an annotation takes; None where it is no choice of kinds."""
+def find_plugin_union(metadata: typing.Sequence[object]) -> PluginUnion | None:
+    """Return the registered kinds that an annotation accepts; None if it is no choice of kinds."""
     return next((item for item in metadata if isinstance(item, PluginUnion)), None)
 
 
-def config_classes() -> list[type[BaseModel]]:
-    """Return every config class that a run's or a vessel's YAML file can reach, in their order."""
-    found: dict[type[BaseModel], None] = {}
+def list_config_classes() -> list[type[BaseModel]]:
+    """Return all config classes of the YAML files of runs and vessels, in order."""
+    classes: dict[type[BaseModel], None] = {}
 
     def visit(annotation: object) -> None:
         if is_config(annotation):
-            if annotation not in found:
-                found[annotation] = None
+            if annotation not in classes:
+                classes[annotation] = None
                 for field in annotation.model_fields.values():
-                    mark = marked(field.metadata)
-                    kind = field.annotation
-                    visit(kind if mark is None else typing.Annotated[kind, mark])
+                    union = find_plugin_union(field.metadata)
+                    field_type = field.annotation
+                    visit(field_type if union is None else typing.Annotated[field_type, union])
         else:
-            for part in parts(annotation):
+            for part in list_type_arguments(annotation):
                 visit(part)
 
     for root in ROOTS:
         visit(root)
-    return list(found)
+    return list(classes)
 
 
-def documented(config: type[BaseModel]) -> dict[str, str]:
-    """Return the text of each key under `Attributes:` of a class and its bases."""
+def collect_attribute_texts(config: type[BaseModel]) -> dict[str, str]:
+    """Return the text of each key in the section `Attributes` of a class and its bases."""
     texts: dict[str, str] = {}
     for base in reversed(config.__mro__):
         for section in griffe.Docstring(inspect.cleandoc(base.__doc__ or "")).parse("google"):
@@ -102,15 +104,15 @@ def documented(config: type[BaseModel]) -> dict[str, str]:
     return texts
 
 
-def summary(config: type[BaseModel]) -> str:
+def read_summary(config: type[BaseModel]) -> str:
     """Return the docstring of a class without its sections."""
     sections = griffe.Docstring(inspect.cleandoc(config.__doc__ or "")).parse("google")
     texts = [s.value for s in sections if s.kind is griffe.DocstringSectionKind.text]
     return "\n\n".join(texts)
 
 
-def selector(config: type[BaseModel]) -> str | None:
-    """Return the key that selects this class, such as `kind: lstm`; None where there is none."""
+def format_selector(config: type[BaseModel]) -> str | None:
+    """Return the key that selects this class, such as `kind: lstm`; None without such a key."""
     for name in DISCRIMINATORS:
         field = config.model_fields.get(name)
         if field is not None and typing.get_origin(field.annotation) is Literal:
@@ -120,13 +122,13 @@ def selector(config: type[BaseModel]) -> str | None:
     return None
 
 
-def reference(config: type[BaseModel]) -> str:
-    """Return what stands for a link to a config class."""
+def make_class_link(config: type[BaseModel]) -> str:
+    """Return the placeholder of a link to a config class."""
     return "{" + f"{config.__module__}.{config.__qualname__}" + "}"
 
 
-def described_type(annotation: Any, metadata: typing.Sequence[object] = ()) -> str:
-    """Return what an annotation takes, in words."""
+def describe_type(annotation: Any, metadata: typing.Sequence[object] = ()) -> str:
+    """Return the accepted values of an annotation in words."""
     quantity = next((item for item in metadata if isinstance(item, Quantity)), None)
     if quantity is not None:
         example = _EXAMPLES.get(quantity.si, f"1.5 {quantity.si}")
@@ -134,33 +136,33 @@ def described_type(annotation: Any, metadata: typing.Sequence[object] = ()) -> s
     origin = typing.get_origin(annotation)
     arguments = typing.get_args(annotation)
     if (aliased := getattr(annotation, "__value__", None)) is not None:
-        return described_type(aliased)
-    if (mark := marked(metadata)) is not None:
-        of_kind = load_kinds(typing.Annotated[annotation, mark])
-        return " or ".join(described_type(member) for member in of_kind.values())
+        return describe_type(aliased)
+    if (union := find_plugin_union(metadata)) is not None:
+        classes_by_kind = load_kinds(typing.Annotated[annotation, union])
+        return " or ".join(describe_type(member) for member in classes_by_kind.values())
     if origin is typing.Annotated:
-        return described_type(arguments[0], arguments[1:])
+        return describe_type(arguments[0], arguments[1:])
     if origin is Literal:
         return ", ".join(f"`{'null' if value is None else value}`" for value in arguments)
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(dict.fromkeys(described_type(part) for part in arguments))
+        return " or ".join(dict.fromkeys(describe_type(part) for part in arguments))
     if origin is tuple and len(arguments) > 1 and arguments[1] is not Ellipsis:
-        return "list of (" + "; ".join(described_type(part) for part in arguments) + ")"
+        return "list of (" + "; ".join(describe_type(part) for part in arguments) + ")"
     if origin in (tuple, list, frozenset, set):
-        return f"list of {described_type(arguments[0])}"
+        return f"list of {describe_type(arguments[0])}"
     if inspect.isclass(origin) and issubclass(origin, Mapping):
-        return f"mapping from {described_type(arguments[0])} to {described_type(arguments[1])}"
-    return _named_type(annotation)
+        return f"mapping from {describe_type(arguments[0])} to {describe_type(arguments[1])}"
+    return _describe_named_type(annotation)
 
 
-def _named_type(annotation: Any) -> str:
+def _describe_named_type(annotation: Any) -> str:
     if annotation is type(None):
         return "`null`"
     if is_config(annotation):
-        return reference(annotation)
+        return make_class_link(annotation)
     if inspect.isclass(annotation):
-        if annotation in _PLAIN:
-            return _PLAIN[annotation]
+        if annotation in _BASIC_TYPES:
+            return _BASIC_TYPES[annotation]
         if issubclass(annotation, Path):
             return "path"
         if issubclass(annotation, enum.Enum):
@@ -168,7 +170,7 @@ def _named_type(annotation: Any) -> str:
     return "any value" if annotation in (Any, object) else f"`{annotation}`"
 
 
-def limits(field: FieldInfo) -> str:
+def describe_limits(field: FieldInfo) -> str:
     """Return the bounds of a key, for example ` (≥ 0)`."""
     bounds = [
         f"{sign} {getattr(item, name):g}"
@@ -184,26 +186,26 @@ def limits(field: FieldInfo) -> str:
     return f" ({', '.join(bounds + lengths)})" if bounds or lengths else ""
 
 
-def plain(value: object) -> object:
-    """Return a default as it would stand in YAML."""
+def to_yaml_value(value: object) -> object:
+    """Return a default as a value of YAML."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_defaults=True)
     if isinstance(value, Mapping):
-        return {key: plain(part) for key, part in value.items()}
+        return {key: to_yaml_value(part) for key, part in value.items()}
     if isinstance(value, (tuple, list)):
-        return [plain(part) for part in value]
+        return [to_yaml_value(part) for part in value]
     return str(value) if isinstance(value, Path) else value
 
 
-def default(field: FieldInfo) -> str:
-    """Return the default of a key as Markdown; empty where the key is required."""
+def describe_default(field: FieldInfo) -> str:
+    """Return the default of a key as Markdown; empty if the key is required."""
     if field.is_required():
         return ""
     value = field.get_default(call_default_factory=True)
     if isinstance(value, BaseModel):
-        chosen = selector(type(value))
-        return f"`{chosen}`" if chosen else f"{reference(type(value))} with its defaults"
-    value = plain(value)
+        selector = format_selector(type(value))
+        return f"`{selector}`" if selector else f"{make_class_link(type(value))} with its defaults"
+    value = to_yaml_value(value)
     if value is None:
         return "`null`"
     if isinstance(value, bool):
@@ -213,29 +215,29 @@ def default(field: FieldInfo) -> str:
     return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
 
 
-def keys(config: type[BaseModel]) -> Iterator[Key]:
-    """Yield the keys of a class, the one that selects the class left out."""
-    texts = documented(config)
-    chosen = (selector(config) or "").partition(":")[0]
+def iterate_keys(config: type[BaseModel]) -> Iterator[Key]:
+    """Yield the keys of a class except the one that selects the class."""
+    texts = collect_attribute_texts(config)
+    selecting_key = (format_selector(config) or "").partition(":")[0]
     for name, field in config.model_fields.items():
-        if name != chosen:
-            kind = described_type(field.annotation, field.metadata) + limits(field)
+        if name != selecting_key:
+            accepted = describe_type(field.annotation, field.metadata) + describe_limits(field)
             key = field.alias or name
             text = field.description or texts.get(key) or texts.get(name)
-            yield Key(key, kind, default(field), text)
+            yield Key(key, accepted, describe_default(field), text)
 
 
-def undocumented() -> list[str]:
+def list_undocumented_keys() -> list[str]:
     """Return `module: Class.key` of every key that no docstring documents."""
     return sorted(
         f"{config.__module__}: {config.__name__}.{key.name}"
-        for config in config_classes()
-        for key in keys(config)
+        for config in list_config_classes()
+        for key in iterate_keys(config)
         if not key.text
     )
 
 
 if __name__ == "__main__":
-    missing = undocumented()
-    print("\n".join(missing))
-    sys.exit(bool(missing))
+    undocumented_keys = list_undocumented_keys()
+    print("\n".join(undocumented_keys))
+    sys.exit(bool(undocumented_keys))

@@ -1,4 +1,4 @@
-"""Draws the picture of README and site: one manoeuvre of a finished run, measured and in free run.
+"""Draw the picture of README and site: one manoeuvre of a finished run, measured and in free run.
 
 residnet run quickstart
 python docs/hooks/free_run_picture.py runs/quickstart three_two_one_one_03 docs/free_run.svg
@@ -19,7 +19,7 @@ MODELS = {
 }
 
 
-def draw(table: pd.DataFrame) -> plt.Figure:
+def draw_figure(table: pd.DataFrame) -> plt.Figure:
     """Return the figure: track, yaw rate and speed over time.
 
     Args:
@@ -29,10 +29,10 @@ def draw(table: pd.DataFrame) -> plt.Figure:
     figure, (track, yaw, surge) = plt.subplots(
         1, 3, figsize=(10, 3.4), layout="constrained", width_ratios=(0.8, 1, 1)
     )
-    whole = table[table["protocol"] == "manoeuvre"]
+    manoeuvre = table[table["protocol"] == "manoeuvre"]
     # residnet cannot know the true motion: the noise of the measured yaw rate is the sensor's
     for index, (name, (label, colour)) in enumerate(MODELS.items()):
-        rows = whole[whole["model"] == name]
+        rows = manoeuvre[manoeuvre["model"] == name]
         if index == 0:
             track.plot(rows["y"], rows["x"], "0.6", linewidth=4, label="measured")
             yaw.plot(rows["t"], np.degrees(rows["r"]), "0.6", linewidth=3)
@@ -51,7 +51,7 @@ def draw(table: pd.DataFrame) -> plt.Figure:
 def main(run: str, log: str, out: str) -> None:
     """Draw `log` of the finished run in folder `run` to the file `out`."""
     table = pd.read_parquet(Path(run) / "rollouts" / "test" / f"{log}.parquet")
-    draw(table).savefig(out, metadata={"Date": None})
+    draw_figure(table).savefig(out, metadata={"Date": None})
 
 
 if __name__ == "__main__":

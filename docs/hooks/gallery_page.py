@@ -1,4 +1,4 @@
-"""Adds to the gallery the whole pages of runs that the long stage `configs` has left."""
+"""Add to the gallery the complete pages of the runs of the long stage `configs`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import mkdocs_gen_files
 RUNS = Path(__file__).parents[2] / "build" / "runs"
 
 
-def write() -> None:
-    """Copy every page into the site, and name it with its verdict; nothing where there are none."""
+def write_gallery() -> None:
+    """Copy all pages into the site and list them with their verdicts; do nothing without pages."""
     rows = []
     for page in sorted(RUNS.glob("*/report.html")):
         name = page.parent.name
@@ -26,4 +26,4 @@ def write() -> None:
             file.write("\n".join(["| run | task | verdict |", "| --- | --- | --- |", *rows]) + "\n")
 
 
-write()
+write_gallery()

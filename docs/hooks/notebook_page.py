@@ -1,4 +1,4 @@
-"""Runs the example notebooks and writes them as pages while the site is built."""
+"""Run the example notebooks and write them as pages while the site is built."""
 
 from __future__ import annotations
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, RootModel
 
+from residnet.autopilot.records import AutopilotMetricsFile, ControllersFile, CourseMetricsFile
 from residnet.core.records import StoredFile
 from residnet.core.run_records import ExportsFile, ProvenanceFile, SummaryFile
 from residnet.evaluation.derivatives import DerivativesFile
@@ -38,7 +39,13 @@ from residnet.training.records import CurrentsFile
 REPOSITORY = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(REPOSITORY / "docs" / "hooks"))
 
-from config_keys import described_type, is_config, keys, parts, summary  # noqa: E402
+from config_keys import (  # noqa: E402
+    describe_type,
+    is_config,
+    iterate_keys,
+    list_type_arguments,
+    read_summary,
+)
 
 REFERENCE = REPOSITORY / "docs" / "reference"
 RECORDS: dict[str, type[StoredFile]] = {
@@ -63,6 +70,9 @@ RECORDS: dict[str, type[StoredFile]] = {
     "sweep.json": SweepFile,
     "variants.json": VariantsFile,
     "monitor.json": MonitorFile,
+    "metrics.json of the task `autopilot`": AutopilotMetricsFile,
+    "controllers.json": ControllersFile,
+    "metrics.json of the task `course`": CourseMetricsFile,
 }
 """Files of a run folder with the class of their contents."""
 _SCHEMA_KEY = "Name and version of the format."
@@ -82,8 +92,13 @@ def iterate_records(annotation: object) -> Iterator[type[BaseModel]]:
         for field in annotation.model_fields.values():
             yield from iterate_records(field.annotation)
     else:
-        for part in parts(annotation):
+        for part in list_type_arguments(annotation):
             yield from iterate_records(part)
+
+
+def schema_stem(name: str) -> str:
+    """Return the file name of a schema without its suffix, such as `metrics_course`."""
+    return re.sub(r"\W+", "_", name.replace(".json", "").replace("of the task ", "")).strip("_")
 
 
 def write_schema(name: str, kind: type[StoredFile]) -> str:
@@ -108,12 +123,12 @@ def write_section(name: str, kind: type[StoredFile], described: set[type[BaseMod
         kind: class of its contents.
         described: records that the page already describes; those of this file are added.
     """
-    schema = f"schemas/{Path(name).stem}.schema.json"
-    first_line = summary(kind).replace(f"{name}: ", "").replace(f"models/<model>/{name}: ", "")
+    schema = f"schemas/{schema_stem(name)}.schema.json"
+    first_line = read_summary(kind).replace(f"{name}: ", "").replace(f"models/<model>/{name}: ", "")
     lines = ["", f"## {name}", "", f"{_capitalize(first_line)} [JSON schema]({schema})"]
     records = list(dict.fromkeys(iterate_records(kind)))
     if issubclass(kind, RootModel):
-        rows = described_type(kind.model_fields["root"].annotation)
+        rows = describe_type(kind.model_fields["root"].annotation)
         lines += ["", f"The file is a {_link(rows)}."]
         described.add(kind)
     for record in records:
@@ -121,9 +136,9 @@ def write_section(name: str, kind: type[StoredFile], described: set[type[BaseMod
             continue
         described.add(record)
         if record is not kind:
-            lines += ["", f"### {record.__name__}", "", summary(record)]
+            lines += ["", f"### {record.__name__}", "", read_summary(record)]
         lines += ["", "| key | value | present | meaning |", "| --- | --- | --- | --- |"]
-        for key in keys(record):
+        for key in iterate_keys(record):
             text = _SCHEMA_KEY if key.name == "schema" else _capitalize(key.text or "")
             presence = "optional" if key.default else "always"
             cells = (f"`{key.name}`", _link(key.type), presence, text)
@@ -149,7 +164,7 @@ def list_undocumented() -> list[str]:
         f"{record.__name__}.{key.name}"
         for record in records
         if not issubclass(record, RootModel)
-        for key in keys(record)
+        for key in iterate_keys(record)
         if not key.text and key.name != "schema"
     ]
 
@@ -160,7 +175,7 @@ def build_files() -> dict[Path, str]:
     files = {}
     described: set[type[BaseModel]] = set()
     for name, kind in RECORDS.items():
-        files[REFERENCE / "schemas" / f"{Path(name).stem}.schema.json"] = write_schema(name, kind)
+        files[REFERENCE / "schemas" / f"{schema_stem(name)}.schema.json"] = write_schema(name, kind)
         lines += write_section(name, kind, described)
     return {REFERENCE / "run_files.md": "\n".join(lines) + "\n", **files}
 

@@ -13,6 +13,7 @@ from read_page import plain
 from tiny import call, read_json, write_yaml
 
 from residnet.autopilot.evaluation import describe_limit_cycles, list_policy_objections
+from residnet.autopilot.records import HeadingRow
 from residnet.autopilot.report.heading import cost_sentences
 from residnet.autopilot.tasks.autopilot.config import AutopilotConfig
 from residnet.autopilot.tasks.autopilot.execute import load_trained_policy
@@ -134,36 +135,43 @@ def test_policies_are_exported_with_their_cards_and_read_back(run: Path) -> None
         assert float(command) == pytest.approx(float(wish), abs=1e-6)
 
 
+def heading_row(
+    protocol: str, model: str, kind: str, *, cycling: int | None = None, **metrics: float
+) -> HeadingRow:
+    """Return a row whose distributions have one value."""
+    statistics = ("mean", "median", "p95", "max")
+    return HeadingRow.model_validate(
+        {"model": model, "kind": kind, "split": "simulated", "protocol": protocol, "n": 100}
+        | {name: dict.fromkeys(statistics, value) for name, value in metrics.items()}
+        | {"cycling": cycling}
+    )
+
+
 def test_the_verdict_begins_with_the_cheapest_policy() -> None:
     costs = {"a": ("network", 6.3), "b": ("policy", 6.1), "law": ("classical", 6.4)}
-    rows: list[dict[str, Any]] = [
-        {"protocol": "conditions", "model": name, "kind": kind, "cost": {"mean": cost}}
-        for name, (kind, cost) in costs.items()
+    rows = [
+        heading_row("conditions", name, kind, cost=cost) for name, (kind, cost) in costs.items()
     ]
     first, second = cost_sentences(rows)
     assert first.startswith("Under the stated conditions 'b' costs 6.100 s a change, 4.7 % below")
     assert "'a' costs 6.300 s" in second
     assert list_policy_objections("b", rows) == []
-    rows += [{**row, "protocol": "beyond_waves", "cost": {"mean": 9.0}} for row in rows[1:]]
-    rows[-1]["cost"]["mean"] = 8.0
+    rows += [heading_row("beyond_waves", "b", "policy", cost=9.0)]
+    rows += [heading_row("beyond_waves", "law", "classical", cost=8.0)]
     costly = "Do not use 'b' there: under 'waves' the mean cost is 9 s, with law 8 s."
     assert cost_sentences(rows)[1] == costly
-    rows[2]["cost"]["mean"] = 6.0
+    rows[2] = heading_row("conditions", "law", "classical", cost=6.0)
     assert list_policy_objections("b", rows) == [
         "under its conditions the mean cost is 6.1 s, with law 6 s"
     ]
 
 
 def test_the_verdict_tells_a_policy_that_keeps_swinging() -> None:
-    def quiet(name: str, kind: str, number: int) -> dict[str, Any]:
-        swing = {"rudder_swing": {"max": 0.698}, "cycling": number, "n": 100}
-        return {"protocol": "quiet", "model": name, "kind": kind, **swing}
+    def quiet(name: str, kind: str, number: int) -> HeadingRow:
+        return heading_row("quiet", name, kind, rudder_swing=0.698, cycling=number)
 
     rows = [quiet("a", "policy", 1), quiet("lqr", "classical", 2), quiet("pd", "classical", 0)]
-    rows += [
-        {"protocol": "conditions", "model": row["model"], "kind": row["kind"], "cost": {"mean": 6}}
-        for row in rows
-    ]
+    rows += [heading_row("conditions", row.model, row.kind, cost=6.0) for row in rows]
     said = (
         "'a' has a limit cycle in 1 of 100 simulations without noise, with a peak-to-peak command"
         " of up to 40 deg; "
@@ -171,5 +179,5 @@ def test_the_verdict_tells_a_policy_that_keeps_swinging() -> None:
     assert cost_sentences(rows)[1] == said + "none with pd."
     assert describe_limit_cycles("lqr", rows)[0].endswith("none with pd.")
     assert describe_limit_cycles("pd", rows) == []
-    rows[2]["cycling"] = 1
+    rows[2] = quiet("pd", "classical", 1)
     assert describe_limit_cycles("a", rows) == [said + "so has each tuned law."]

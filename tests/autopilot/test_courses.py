@@ -70,9 +70,9 @@ def test_the_steady_turn_is_that_of_the_model_and_tells_what_is_possible(
     steady = simulate_steady_turn(vessel, LIMIT, 100.0, 0.05)
     assert steady.radius == pytest.approx(3.2 / (3.47 * LIMIT), rel=1e-3)
     # printed radii of 10 m are too tight for five degrees of rudder
-    assert not any(one["possible"] for one in buoy_feasibility(BUOYS, steady.radius))
+    assert not any(one.possible for one in buoy_feasibility(BUOYS, steady.radius))
     wide = buoy_feasibility(enlarge_to_turning_radius(BUOYS, steady.radius), steady.radius)
-    assert all(one["possible"] for one in wide)
+    assert all(one.possible for one in wide)
     # circles that overlap leave no way between them
     assert overlapping_pairs([BUOYS[0], buoy(50, 45, "starboard"), BUOYS[2]]) == [(1, 2)]
     assert overlapping_pairs(BUOYS) == []

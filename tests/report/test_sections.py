@@ -50,6 +50,7 @@ def spread(mean: float) -> dict[str, float]:
 def made_autopilot(run: Path) -> Path:
     """Two controllers of one vessel; the second does not settle in four flights."""
     sea = {"significant_height": 1.5, "peak_period": 8.0, "direction": 45 * DEG}
+    sea |= {"hull": {"length": 20.0, "breadth": 5.0, "draught": 1.5}}
     test: dict[str, Any] = {
         "heading": 30 * DEG,
         "band": DEG,
@@ -57,7 +58,7 @@ def made_autopilot(run: Path) -> Path:
         "bias": DEG,
         "bias_time": 60.0,
     }
-    test |= {"overshoot": 0.1 * DEG, "wind": 10.0, "sea_time": 300.0}
+    test |= {"duration": 20.0, "wind": 10.0, "sea_time": 300.0}
     test |= {"sea": {**sea, "spectrum": {"kind": "jonswap"}}}
     resolved(run, {"task": "autopilot", "rudder": 20 * DEG, "test": test})
     rows = []
@@ -72,8 +73,13 @@ def made_autopilot(run: Path) -> Path:
             rows.append({**base, "protocol": protocol, "error_end": 0.25 * DEG})
         swing = {f"{name}_rms": spread(2.0 * DEG) for name in ("heading", "rudder", "heel")}
         rows.append({**base, "protocol": "sea", **swing})
-    write_json(run / "metrics.json", {"run": "made", "floor": "net", "rows": rows})
-    write_json(run / "controllers.json", {"controllers": {"pd": {"kp": 1.0}}})
+    metrics = {"schema": "residnet.metrics/1", "run": "made", "channels": {}, "floor": "net"}
+    write_json(run / "metrics.json", {**metrics, "flown": {}, "rows": rows})
+    turning = {"gain": 0.5, "time": 1.0, "speed": 2.0, "righting": 0.0}
+    controllers = {"schema": "residnet.controllers/1", "turning": turning}
+    write_json(
+        run / "controllers.json", {**controllers, "controllers": {"pd": {"config": {"kp": 1.0}}}}
+    )
     t = np.arange(0.0, 20.0, 0.5)
     flights = []
     names = ("settling", "overshoot", "iae", "travel", "energy")
@@ -98,12 +104,13 @@ def made_course(run: Path) -> Path:
         {"north": 100.0, "east": 100.0, "radius": 30.0, "leave_to": "starboard"},
     ]
     varied = {"flights": 4, "effect": [0.8, 1.2], "time": [0.8, 1.2], "bias": DEG, "current": 0.5}
-    way = {"acceptance": 15.0, "buoys": buoys, "start": [0.0, 0.0]}
+    way = {"acceptance": 15.0, "lookahead": 30.0, "buoys": buoys, "start": [0.0, 0.0]}
     about = {"task": "course", "protocols": ["enter", "sides"], "course": way, "spread": varied}
     resolved(run, about)
     flown = {"split": "simulated", "finished": True, "course_time": 61.5, "ratio": 1.025, "n": 2}
     flown |= {"ratio_turning": 0.95, "margin": -0.5, "tightest_turn": 18.0, "travel": 90 * DEG}
     flown |= {"cross_track_rms": 0.75, "cross_track_max": 2.0, "reference_time": 60.0}
+    flown |= {"passed": False, "distances": [15.5, 12.0]}
     wide = {"split": "spread", "n": 4, "passed": 0.75, "finished": 1.0, "ratio": 1.04}
     wide |= {"ratio_worst": 1.2, "margin": 1.0, "margin_worst": -2.0}
     wide |= {"cross_track_rms": 0.9, "reference_time": 60.0}
@@ -127,8 +134,9 @@ def made_course(run: Path) -> Path:
         {"buoy": buoy, "radius": radius, "smallest": 25.0, "possible": radius > 25.0}
         for buoy, radius in ((1, 20.0), (2, 30.0))
     ]
-    content = {"run": "made", "speed": 2.0, "rudder": 35 * DEG, "feasibility": feasibility}
-    content |= {"smallest": {"radius": 25.0, "speed": 1.5}, "rows": rows}
+    content = {"schema": "residnet.metrics/1", "run": "made", "channels": {}, "speed": 2.0}
+    smallest = {"radius": 25.0, "speed": 1.5, "yaw_rate": 0.06, "step": 0.1}
+    content |= {"rudder": 35 * DEG, "feasibility": feasibility, "smallest": smallest, "rows": rows}
     write_json(run / "metrics.json", content)
     for name, tables in (("tracks", tracks), ("courses", plans), ("spread", drawn)):
         pd.concat(tables).to_parquet(run / f"{name}.parquet")

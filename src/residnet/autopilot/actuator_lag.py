@@ -17,8 +17,9 @@ from residnet.autopilot.motion_config import ActuatorLag
 from residnet.core.errors import FitError
 
 _LOWER_BOUNDS = np.array([0.1, 0.1, 0.0])
+"""Lower bounds of the search for frequency [rad/s], damping [-] and delay [s]."""
 _UPPER_BOUNDS = np.array([30.0, 3.0, 2.0])
-"""Bounds of the search for frequency [rad/s], damping [-] and delay [s]."""
+"""Upper bounds; an estimate at a bound means that the data do not determine the lag."""
 
 
 def simulate_lagged_force(

@@ -6,7 +6,7 @@ The duration of a course is compared with a reference course of arcs and straigh
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -28,6 +28,13 @@ from residnet.autopilot.heading.conditions import (
     simulate_heading_steps,
 )
 from residnet.autopilot.heading.vessels import SteeredPlant, SteeredVessel
+from residnet.autopilot.records import (
+    ControllerKind,
+    CourseEnsembleRow,
+    CourseRow,
+    Distribution,
+    HeadingRow,
+)
 from residnet.core.columns import all_but_pose
 from residnet.core.frames import wrap_angle
 from residnet.core.layout import HEADING, POSITION, RANGE_VELOCITIES
@@ -61,27 +68,25 @@ def compute_run_metrics(
     return dict(zip(METRIC_UNITS, values, strict=True))
 
 
-def summarize_distribution(values: Tensor) -> dict[str, float]:
+def summarize_distribution(values: Tensor) -> Distribution:
     """Return mean, median, 95th percentile and maximum of values [B]."""
     array = values.double().numpy()
-    return {
-        "mean": float(array.mean()),
-        "median": float(np.median(array)),
-        "p95": float(np.quantile(array, 0.95)),
-        "max": float(array.max()),
-    }
+    return Distribution(
+        mean=float(array.mean()),
+        median=float(np.median(array)),
+        p95=float(np.quantile(array, 0.95)),
+        max=float(array.max()),
+    )
 
 
-def list_policy_objections(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def list_policy_objections(model: str, rows: Sequence[HeadingRow]) -> list[str]:
     """List reasons against a policy compared with tuned laws, from rows of metrics.json."""
     return _describe_cheaper_law(model, rows, "conditions", "under its conditions")
 
 
-def list_unsuitable_conditions(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def list_unsuitable_conditions(model: str, rows: Sequence[HeadingRow]) -> list[str]:
     """List further conditions under which a tuned law has a lower cost than a policy."""
-    protocols = dict.fromkeys(
-        row["protocol"] for row in rows if row["protocol"].startswith("beyond_")
-    )
+    protocols = dict.fromkeys(row.protocol for row in rows if row.protocol.startswith("beyond_"))
     return [
         objection
         for protocol in protocols
@@ -89,34 +94,33 @@ def list_unsuitable_conditions(model: str, rows: Sequence[Mapping[str, Any]]) ->
     ]
 
 
-def describe_limit_cycles(model: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def describe_limit_cycles(model: str, rows: Sequence[HeadingRow]) -> list[str]:
     """Describe in how many noise-free simulations a policy has a limit cycle; empty if none."""
-    rows_by_model = {row["model"]: row for row in rows if row["protocol"] == "quiet"}
-    if not (policy_row := rows_by_model.get(model)) or not policy_row.get("cycling"):
+    rows_by_model = {row.model: row for row in rows if row.protocol == "quiet"}
+    policy_row = rows_by_model.get(model)
+    if policy_row is None or not policy_row.cycling or policy_row.rudder_swing is None:
         return []
     steady_laws = [
-        name
-        for name, row in rows_by_model.items()
-        if row["kind"] == "classical" and not row["cycling"]
+        name for name, row in rows_by_model.items() if row.kind == "classical" and not row.cycling
     ]
     return [
-        f"'{model}' has a limit cycle in {policy_row['cycling']} of {policy_row['n']} simulations"
+        f"'{model}' has a limit cycle in {policy_row.cycling} of {policy_row.n} simulations"
         " without noise, with a peak-to-peak"
-        f" command of up to {math.degrees(policy_row['rudder_swing']['max']):.3g} deg; "
+        f" command of up to {math.degrees(policy_row.rudder_swing.max):.3g} deg; "
         + (f"none with {', '.join(steady_laws)}." if steady_laws else "so has each tuned law.")
     ]
 
 
 def _describe_cheaper_law(
-    model: str, rows: Sequence[Mapping[str, Any]], protocol: str, condition_text: str
+    model: str, rows: Sequence[HeadingRow], protocol: str, condition_text: str
 ) -> list[str]:
     """Describe the cheapest tuned law if its cost is below the cost of a policy."""
     costs = {
-        row["model"]: (row["kind"], row["cost"]["mean"])
+        row.model: (row.kind, row.cost.mean)
         for row in rows
-        if row["protocol"] == protocol and "cost" in row
+        if row.protocol == protocol and row.cost is not None
     }
-    laws = {name: cost for name, (model_kind, cost) in costs.items() if model_kind == "classical"}
+    laws = {name: cost for name, (role, cost) in costs.items() if role == "classical"}
     if model not in costs or not laws:
         return []
     policy_cost = costs[model][1]
@@ -131,25 +135,38 @@ def _describe_cheaper_law(
 
 
 def _build_row(
-    controller: str, model_kind: str, protocol: str, metrics: Mapping[str, Tensor]
-) -> dict[str, Any]:
-    """Build a row of metrics.json with the distributions of metrics [B] by name."""
-    row = {"model": controller, "kind": model_kind, "split": "simulated", "protocol": protocol}
-    return row | {name: summarize_distribution(values) for name, values in metrics.items()}
+    controller: str,
+    role: ControllerKind,
+    protocol: str,
+    metrics: Mapping[str, Tensor],
+    **counts: int,
+) -> HeadingRow:
+    """Build a row of metrics.json with distributions of metrics [B] and counts, both by name."""
+    distributions = {name: summarize_distribution(values) for name, values in metrics.items()}
+    return HeadingRow.model_validate(
+        {
+            "model": controller,
+            "kind": role,
+            "split": "simulated",
+            "protocol": protocol,
+            **distributions,
+            **counts,
+        }
+    )
 
 
 def build_step_row(
     controller: str,
-    model_kind: str,
+    role: ControllerKind,
     protocol: str,
     trajectories: ClosedLoopTrajectories,
     tolerance: float,
-) -> dict[str, Any]:
+) -> HeadingRow:
     """Build a row of metrics.json with distributions and the number of unsettled simulations.
 
     Args:
         controller: name of the controller.
-        model_kind: role of the controller, such as `classical`.
+        role: role of the controller, such as `classical`.
         protocol: name of the test.
         trajectories: simulations of the test.
         tolerance: half width in rad of the band of the error in which a simulation has settled.
@@ -157,12 +174,14 @@ def build_step_row(
     is_finite = torch.isfinite(trajectories.states).all(dim=2).all(dim=1)
     is_unsettled = (trajectories.error[:, -1].abs() > tolerance) | ~is_finite
     return _build_row(
-        controller, model_kind, protocol, compute_run_metrics(trajectories, tolerance)
-    ) | {
-        "unsettled": int(is_unsettled.sum()),
-        "n": len(is_finite),
-        "diverged": int((~is_finite).sum()),
-    }
+        controller,
+        role,
+        protocol,
+        compute_run_metrics(trajectories, tolerance),
+        unsettled=int(is_unsettled.sum()),
+        n=len(is_finite),
+        diverged=int((~is_finite).sum()),
+    )
 
 
 def build_variation_grid(
@@ -270,8 +289,11 @@ def simulate_steps_in_waves(
 
 
 def build_sea_row(
-    controller: str, model_kind: str, trajectories: ClosedLoopTrajectories, start_time: float
-) -> dict[str, Any]:
+    controller: str,
+    role: ControllerKind,
+    trajectories: ClosedLoopTrajectories,
+    start_time: float,
+) -> HeadingRow:
     """Build a row of metrics.json with RMS values from `start_time` s on.
 
     The values are heading error, rudder and, for a vessel with roll, heel.
@@ -284,7 +306,7 @@ def build_sea_row(
         f"{key}_rms": signal[:, first_sample:].square().mean(1).sqrt()
         for key, signal in signals.items()
     }
-    return _build_row(controller, model_kind, "sea", rms_values) | {"n": len(trajectories.target)}
+    return _build_row(controller, role, "sea", rms_values, n=len(trajectories.target))
 
 
 def _nominal_variations(count: int) -> Tensor:
@@ -333,12 +355,12 @@ def draw_heading_changes(conditions: ConditionsConfig, n_runs: int, seed: int) -
 
 def evaluate_under_conditions(
     controller: str,
-    model_kind: str,
+    role: ControllerKind,
     protocol: str,
     run: ClosedLoopSimulation,
     conditions: ConditionsConfig,
     changes: HeadingStepBatch,
-) -> tuple[dict[str, Any], pd.DataFrame]:
+) -> tuple[HeadingRow, pd.DataFrame]:
     """Build a row of metrics.json, and a table with a line for each simulation, in SI units.
 
     A simulation with a NaN heading counts as diverged, with a heading error of 180 deg at all
@@ -346,7 +368,7 @@ def evaluate_under_conditions(
 
     Args:
         controller: name of the controller.
-        model_kind: role of the controller, such as `classical`.
+        role: role of the controller, such as `classical`.
         protocol: name of the test.
         run: closed loop of vessel and controller.
         conditions: conditions of the simulations, and weights of their cost.
@@ -374,17 +396,24 @@ def evaluate_under_conditions(
             **{name: values.numpy() for name, values in metrics.items()},
         }
     )
-    row = _build_row(controller, model_kind, protocol, available_metrics)
-    return row | {"n": len(is_finite), "diverged": int((~is_finite).sum())}, table
+    row = _build_row(
+        controller,
+        role,
+        protocol,
+        available_metrics,
+        n=len(is_finite),
+        diverged=int((~is_finite).sum()),
+    )
+    return row, table
 
 
 def evaluate_limit_cycles(
     controller: str,
-    model_kind: str,
+    role: ControllerKind,
     run: ClosedLoopSimulation,
     changes: HeadingStepBatch,
     settling_time: float,
-) -> dict[str, Any]:
+) -> HeadingRow:
     """Build the row of metrics.json of noise-free simulations: limit cycles at their end.
 
     Limit cycles are evaluated from `settling_time` s after the change of reference.
@@ -399,8 +428,14 @@ def evaluate_limit_cycles(
     # NaN fails the comparison and counts as a limit cycle
     is_steady = (heading_swing <= tolerances[0]) & (rudder_swing <= tolerances[1])
     swings = {"heading_swing": heading_swing, "rudder_swing": rudder_swing}
-    row = _build_row(controller, model_kind, "quiet", swings)
-    return row | {"cycling": int((~is_steady).sum()), "n": len(heading_swing)}
+    return _build_row(
+        controller,
+        role,
+        "quiet",
+        swings,
+        cycling=int((~is_steady).sum()),
+        n=len(heading_swing),
+    )
 
 
 @dataclass(frozen=True)
@@ -518,19 +553,23 @@ class CourseRun:
 
 def build_course_row(
     model: str,
-    model_kind: str,
+    role: ControllerKind,
     guidance: str,
     planned: PlannedCourse,
     run: CourseRun,
     acceptance_radius: float,
     service_speed: float,
-) -> dict[str, Any]:
-    """Return a row of metrics.json.
+) -> CourseRow:
+    """Return the row of metrics.json of the nominal vessel on a course.
 
-    `ratio` is the course time divided by the time for the length of the reference course at the
-    service speed; `ratio_turning` uses the speed in the tightest turn instead, for vessels that
-    slow down. `margin` is the smallest depth inside a circle that was entered, or the smallest
-    distance outside a circle that was passed.
+    Args:
+        model: name of the controller.
+        role: role of the controller.
+        guidance: `course`, or the kind of line of sight.
+        planned: the planned course.
+        run: simulation of the vessel on the course.
+        acceptance_radius: radius in m of the circles under the rule `enter`.
+        service_speed: speed in m/s for the duration of the reference course.
     """
     must_enter = planned.protocol == "enter"
     buoys = [
@@ -540,63 +579,68 @@ def build_course_row(
     closest_passages = find_passages(run.track, buoys)
     course_time = (len(run.track) - 1) * run.dt
     yaw_rate = np.abs(np.diff(run.heading)) / run.dt
-    metrics: dict[str, Any] = {
-        "model": model,
-        "kind": model_kind,
-        "guidance": guidance,
-        "split": "simulated",
-        "protocol": planned.protocol,
-        "finished": run.finished,
-        "course_time": course_time,
-        "reference_time": planned.reference_length / service_speed,
-        "ratio": course_time * service_speed / planned.reference_length,
-        "ratio_turning": course_time * planned.steady.speed / planned.reference_length,
-        "cross_track_rms": float(np.sqrt(np.mean(run.cross_track**2))),
-        "cross_track_max": float(np.abs(run.cross_track).max()),
-        "travel": float(abs(run.rudder[0]) + np.abs(np.diff(run.rudder)).sum()),
-        "tightest_turn": float((run.speed[:-1] / np.maximum(yaw_rate, 1e-9)).min()),
-        "distances": [passage.min_distance for passage in closest_passages],
-    }
     boundary_distances = [
         passage.min_distance - buoy.radius
         for passage, buoy in zip(closest_passages, buoys, strict=True)
     ]
     margins = [-distance for distance in boundary_distances] if must_enter else boundary_distances
-    n_cleared = sum(margin >= 0 for margin in margins)
+    n_cleared = sum(bool(margin >= 0) for margin in margins)
     n_on_correct_side = len(closest_passages)
-    if must_enter:
-        metrics |= {"entered": n_cleared}
-    else:
+    rule_counts: dict[str, Any] = {"entered": n_cleared}
+    if not must_enter:
         n_on_correct_side = sum(
             closest_passage.buoy_side == buoy.leave_to
             for closest_passage, buoy in zip(closest_passages, buoys, strict=True)
         )
-        metrics |= {"right_side": n_on_correct_side, "clear": n_cleared, "clearance": min(margins)}
-    return metrics | {
-        "passed": n_on_correct_side == n_cleared == len(closest_passages),
-        "margin": min(margins),
-        "n": len(closest_passages),
-    }
+        rule_counts = {
+            "right_side": n_on_correct_side,
+            "clear": n_cleared,
+            "clearance": float(min(margins)),
+        }
+    return CourseRow(
+        model=model,
+        kind=role,
+        guidance=guidance,
+        split="simulated",
+        protocol=planned.protocol,
+        finished=run.finished,
+        course_time=course_time,
+        reference_time=planned.reference_length / service_speed,
+        ratio=course_time * service_speed / planned.reference_length,
+        ratio_turning=course_time * planned.steady.speed / planned.reference_length,
+        cross_track_rms=float(np.sqrt(np.mean(run.cross_track**2))),
+        cross_track_max=float(np.abs(run.cross_track).max()),
+        travel=float(abs(run.rudder[0]) + np.abs(np.diff(run.rudder)).sum()),
+        tightest_turn=float((run.speed[:-1] / np.maximum(yaw_rate, 1e-9)).min()),
+        distances=tuple(float(passage.min_distance) for passage in closest_passages),
+        **rule_counts,
+        passed=n_on_correct_side == n_cleared == len(closest_passages),
+        margin=float(min(margins)),
+        n=len(closest_passages),
+    )
 
 
-def build_ensemble_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Build a row of metrics.json for an ensemble of simulations from their rows.
+def build_ensemble_row(rows: Sequence[CourseRow]) -> CourseEnsembleRow:
+    """Build the row of metrics.json of random vessels from the row of each simulation."""
 
-    `passed` and `finished` are fractions of the simulations. An unfinished simulation counts with
-    its duration.
-    """
-    ratios, margins = (np.array([row[name] for row in rows]) for name in ("ratio", "margin"))
-    summary = {
-        name: rows[0][name] for name in ("model", "kind", "guidance", "protocol", "reference_time")
-    }
-    return summary | {
-        "split": "spread",
-        "n": len(rows),
-        "passed": float(np.mean([row["passed"] for row in rows])),
-        "finished": float(np.mean([row["finished"] for row in rows])),
-        "ratio": float(np.median(ratios)),
-        "ratio_worst": float(ratios.max()),
-        "margin": float(np.median(margins)),
-        "margin_worst": float(margins.min()),
-        "cross_track_rms": float(np.median([row["cross_track_rms"] for row in rows])),
-    }
+    def mean_share(flags: Iterable[bool]) -> float:
+        return float(np.mean(list(flags)))
+
+    ratios = np.array([row.ratio for row in rows])
+    margins = np.array([row.margin for row in rows])
+    return CourseEnsembleRow(
+        model=rows[0].model,
+        kind=rows[0].kind,
+        guidance=rows[0].guidance,
+        protocol=rows[0].protocol,
+        reference_time=rows[0].reference_time,
+        split="spread",
+        n=len(rows),
+        passed=mean_share(row.passed for row in rows),
+        finished=mean_share(row.finished for row in rows),
+        ratio=float(np.median(ratios)),
+        ratio_worst=float(ratios.max()),
+        margin=float(np.median(margins)),
+        margin_worst=float(margins.min()),
+        cross_track_rms=float(np.median([row.cross_track_rms for row in rows])),
+    )

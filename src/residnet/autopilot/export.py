@@ -22,6 +22,7 @@ from residnet.autopilot.guidance import CourseGuidance, TrackKeeping
 from residnet.autopilot.heading.policies import MAX_DEPTH, SteeringPolicy
 from residnet.autopilot.heading.steering_variation import DEPTH, HEADING
 from residnet.core.errors import ExportError
+from residnet.core.records import Record
 from residnet.core.version import __version__
 from residnet.export.base import Exportable, LoadedExport, RoundingError
 from residnet.export.torchscript import get_size, require_shape, trace_function
@@ -419,7 +420,7 @@ class ExportedController(Exportable):
         *,
         fallback: FallbackCommand,
         description: Mapping[str, Any],
-        metrics: Sequence[Mapping[str, Any]],
+        metrics: Sequence[Record],
     ) -> None:
         self.name = name
         self.policy = policy
@@ -504,7 +505,7 @@ class ExportedController(Exportable):
             "versions": {"residnet": __version__, "torch": torch.__version__},
             "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             **self.description,
-            "metrics": [dict(row) for row in self.metrics],
+            "metrics": [row.model_dump(mode="json", exclude_unset=True) for row in self.metrics],
         }
 
     def check_parity(
@@ -617,7 +618,7 @@ class ExportedCoursePolicy(ExportedController):
         *,
         fallback: FallbackCommand,
         description: Mapping[str, Any],
-        metrics: Sequence[Mapping[str, Any]],
+        metrics: Sequence[Record],
     ) -> None:
         self.guidance = guidance
         self.course = course

@@ -50,6 +50,7 @@ _MEASURED: Final = ("psi", "r", "phi", "p")
 _FEATURE_SCALES: Final = (0.05, 0.02, 0.1, 0.1)
 """Typical magnitudes of the measured states in rad and rad/s."""
 _N_COMMANDS: Final = 2
+"""Commands of a policy: rudder and fins."""
 _MAX_NETWORK_SHARE: Final = 0.5
 """Largest contribution of the network as a share of the limits of rudder and fins."""
 

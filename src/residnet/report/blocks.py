@@ -18,9 +18,11 @@ CellMark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
 
 
 _PAGE_WIDTH = 700.0
+"""Text width of an A4 page in pixels."""
 _LETTER_WIDTH = 5.8
+"""Width of a bold letter in a table in pixels."""
 _CELL_PADDING = 6.0
-"""Text width of an A4 page, width of a bold letter in a table, and padding of a cell, in pixels."""
+"""Padding of a cell in pixels."""
 
 
 _MIN_WIDE_COLUMNS = 6
@@ -287,7 +289,7 @@ def build_table(
     """Build a table with one line for each element of `rows`.
 
     Args:
-        rows: mappings, or any objects that the functions of the columns accept.
+        rows: mappings or records, or any objects that the functions of the columns accept.
         columns: the first column holds the row labels.
         groups: titles that span several columns, see `Table`.
         caption: a sentence above the table.
@@ -326,9 +328,12 @@ def _build_cell(
 
 
 def _get_nested(row: object, keys: str) -> object:
+    """Return a key of a mapping or an attribute of a record; None if a part of the path is None."""
     value = row
     for key in keys.split("."):
-        value = value.get(key) if isinstance(value, Mapping) else None
+        if value is None:
+            return None
+        value = value.get(key) if isinstance(value, Mapping) else getattr(value, key)
     return value
 
 

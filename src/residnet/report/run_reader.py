@@ -263,22 +263,21 @@ class RunFiles:
         """The rows of metrics.json."""
         return self.metrics.rows
 
-    @cached_property
-    def task_metrics(self) -> JsonObject:
-        """The contents of metrics.json of a task other than a fit.
+    def read_task_metrics(self, kind: type[RecordT]) -> RecordT:
+        """Return the contents of metrics.json of a task other than a fit.
+
+        Args:
+            kind: class of the contents.
 
         Raises:
-            UsageError: if the folder has no such file.
-            DataError: if it cannot be read, or has no rows.
+            UsageError: if the folder has no such file, or it cannot be read.
         """
-        content: JsonObject = self.read_json("metrics.json")
-        if not content:
+        metrics = self.read_record(kind, "metrics.json")
+        if metrics is None:
             raise UsageError(
                 f"{self.path}: no metrics.json here; give the folder of a finished run"
             )
-        if not isinstance(content, dict) or not content.get("rows"):
-            raise DataError(f"{self.path / 'metrics.json'}: holds no rows")
-        return content
+        return metrics
 
     @cached_property
     def resolved_config(self) -> JsonObject:
@@ -349,7 +348,7 @@ class RunFiles:
 
     @property
     def description(self) -> str:
-        """Description of the run."""
+        """Sentence on the run from its config; empty without one."""
         return self.settings.description
 
     @cached_property

@@ -25,6 +25,7 @@ from residnet.autopilot.courses.turns import (
 )
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.heading.vessels import SteeredVessel
+from residnet.autopilot.records import BuoyFeasibility
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
 from residnet.core.errors import ConfigError
 
@@ -127,20 +128,18 @@ def smallest_turn(
     return simulate_steady_turn(vessel, limit, config.turning_time, step)
 
 
-def buoy_feasibility(
-    buoys: Sequence[BuoyConfig], min_radius: float
-) -> list[dict[str, float | bool]]:
+def buoy_feasibility(buoys: Sequence[BuoyConfig], min_radius: float) -> list[BuoyFeasibility]:
     """Describe how the radii of the buoys compare with the smallest turning radius in m.
 
     Both courses of Gouletas 2020 have radii below it (see G18 in docs/documents/corrections.md).
     """
     return [
-        {
-            "buoy": number,
-            "radius": buoy.radius,
-            "smallest": min_radius,
-            "possible": buoy.radius >= min_radius,
-        }
+        BuoyFeasibility(
+            buoy=number,
+            radius=buoy.radius,
+            smallest=min_radius,
+            possible=buoy.radius >= min_radius,
+        )
         for number, buoy in enumerate(buoys, start=1)
     ]
 

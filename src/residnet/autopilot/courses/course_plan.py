@@ -136,6 +136,7 @@ _INITIAL_SEARCHES = (
     _OutlineSearch(0.5, 1.0, 1),
     _OutlineSearch(0.0, 1.0, 1),
 )
+"""Searches of the first round: full, half and no straight lengths before and after turns."""
 _EXTENDED_SEARCHES = (
     _OutlineSearch(1.0, 1.5, 2),
     _OutlineSearch(1.0, 1.0, 2),

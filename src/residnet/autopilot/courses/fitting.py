@@ -33,8 +33,11 @@ _ACTIVE_SET_INTERVAL = 8
 _MIN_PREDICTED_GAIN = 2e-2
 """Predicted decrease of the merit function below which the solver stops."""
 _MIN_TRUST_RADIUS = 5e-4
+"""Trust radius, the largest change of a variable in a step, below which the solver stops."""
 _INITIAL_TRUST_RADIUS = 0.3
+"""Trust radius of the first iteration."""
 _MAX_TRUST_RADIUS = 1.0
+"""Largest trust radius."""
 _ACCEPTED_GAIN_RATIO = 0.05
 """Ratio of actual to predicted decrease of the merit function above which a step is accepted."""
 _SHRINKING_GAIN_RATIO = 0.3
@@ -54,10 +57,10 @@ its distance from its own turn.
 _ABEAM_SINE = 0.3
 """Sine of the bearing from ahead or astern below which a buoy counts as on neither side."""
 _OTHER_PART_RANGE = 2.0
-_OWN_PART_RANGE = 0.7
-"""Distances from a circle in turning radii within which other parts of the course, and the buoy's
-own turn, become constraints.
+"""Distance from a circle in turning radii within which other parts of the course are constraints.
 """
+_OWN_PART_RANGE = 0.7
+"""The same distance for the turn around the buoy of the circle."""
 _PARTS_PER_TURN = 4
 """Number of pieces of a turn that have separate constraints."""
 MAX_PASSING_DISTANCE = 0.3

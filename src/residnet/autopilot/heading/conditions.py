@@ -693,10 +693,11 @@ def compile_or_fallback(
 
 
 _SETTLED_TIME_FACTOR = 10.0 / 7.0
-_OBSERVED_TIME_FACTOR = 5.0 / 7.0
-"""Start and length of the interval that is checked for limit cycles without noise, as multiples of
-the cost interval (for 14 s: from 20 s on, over 10 s).
+"""Start of the interval that is checked for limit cycles without noise, as a multiple of the cost
+interval (for 14 s: from 20 s on).
 """
+_OBSERVED_TIME_FACTOR = 5.0 / 7.0
+"""Length of that interval, as a multiple of the cost interval (for 14 s: 10 s)."""
 _N_NOMINAL = 16
 """Number of additional simulations of the nominal vessel, half of them to each side."""
 

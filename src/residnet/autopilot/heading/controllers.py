@@ -347,6 +347,7 @@ _OBSERVER_RANGES = {
     "push_rate": SearchRange(0.08, 30.0, time_power=-1),
     "cross_rate": SearchRange(0.15, 150.0, time_power=-2),
 }
+"""Ranges of the search for the gains of the observer, which scale with the times of the vessel."""
 
 
 class ObservedConfig(TunableConfig, ABC):

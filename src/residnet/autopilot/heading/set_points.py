@@ -39,6 +39,7 @@ _N_LAGS: Final = 24
 _MIN_LOGS: Final = 3
 """Smallest number of logs for standard errors."""
 _MAX_FOLDS: Final = 6
+"""Largest number of groups of logs of the jackknife; bounds the computing time."""
 _HAUSMAN_LIMIT: Final = 2.0
 """Standard errors by which the estimates must differ for the direct one to be rejected (5 %)."""
 

@@ -48,7 +48,9 @@ class Axis(NamedTuple):
 
 
 HEADING = Axis("heading", "cmd_delta", "delta", ("v", "r"), "psi", "psi", "r", 1.0)
+"""Heading controlled by the rudder."""
 DEPTH = Axis("depth", "cmd_delta_s", "delta_s", ("w", "q"), "z", "theta", "q", -1.0)
+"""Depth controlled by the stern planes; a positive command pitches the bow down."""
 VARIATION = ("effect", "time", "bias")
 """Columns of a variation of the steering.
 

@@ -8,7 +8,17 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from residnet.autopilot.courses.config import BuoyCourseConfig
+from residnet.autopilot.courses.course_check import PassingRule
+from residnet.autopilot.records import (
+    AnyCourseRow,
+    CourseEnsembleRow,
+    CourseMetricsFile,
+    CourseRow,
+)
+from residnet.autopilot.tasks.course.config import CourseSpreadConfig
 from residnet.core.format import DEGREES_PER_RADIAN, format_number
 from residnet.report.blocks import Block, Cell, Column, Section, Table, Text, build_table, flag_cell
 from residnet.report.figure import (
@@ -23,7 +33,8 @@ from residnet.report.figure import (
     tick_labels,
 )
 from residnet.report.figure_files import figures_section, read_figures, write_figures
-from residnet.report.run_reader import JsonObject, RunFiles
+from residnet.report.run_reader import RunFiles
+from residnet.report.run_settings import ShownSettings, read_settings
 
 TRACKS_FILE = "tracks.parquet"
 """File of the simulations of the nominal vessel."""
@@ -51,7 +62,23 @@ _PANELS = (
 )
 
 
-def _iterate_course_figures(run: RunFiles) -> Iterator[Figure]:
+class CourseSettings(ShownSettings):
+    """Settings of a course run that its page shows.
+
+    Attributes:
+        course: buoys and settings of the planning.
+        protocols: rules for passing the buoys.
+        spread: random vessels and currents; None for none.
+    """
+
+    course: BuoyCourseConfig
+    protocols: tuple[PassingRule, ...]
+    spread: CourseSpreadConfig | None = None
+
+
+def _iterate_course_figures(
+    run: RunFiles, metrics: CourseMetricsFile, settings: CourseSettings
+) -> Iterator[Figure]:
     """Yield the figures of planned and steered courses."""
     tracks = run.read_required_parquet(TRACKS_FILE)
     plans = run.read_required_parquet(COURSES_FILE)
@@ -60,7 +87,7 @@ def _iterate_course_figures(run: RunFiles) -> Iterator[Figure]:
     yield Figure(
         "courses",
         "Flights past the buoys",
-        f"{' '.join(PROTOCOL_RULES[name] for name in run.resolved_config['protocols'])} North is"
+        f"{' '.join(PROTOCOL_RULES[name] for name in settings.protocols)} North is"
         " up, and scales of"
         " the track are equal. S and P name the side on which a buoy is left, dotted circles are"
         " those of the buoys, and the triangle is the start; dotted lines are the limits of the"
@@ -82,9 +109,14 @@ def _iterate_course_figures(run: RunFiles) -> Iterator[Figure]:
         ],
         [
             _protocol_case(
-                run, protocol, radii, *(t[t["protocol"] == protocol] for t in (tracks, plans))
+                settings.course,
+                protocol,
+                radii,
+                metrics.rudder,
+                tracks[tracks["protocol"] == protocol],
+                plans[plans["protocol"] == protocol],
             )
-            for protocol, radii in _circle_radii(run).items()
+            for protocol, radii in _circle_radii(settings, metrics.smallest.radius).items()
         ],
         "Protocol",
     )
@@ -108,36 +140,54 @@ def _run_styles(runs: Any, column: str) -> dict[str, GlyphStyle]:
     }
 
 
-def _circle_radii(run: RunFiles) -> dict[str, list[float]]:
-    """Return the radii in m of the buoys' circles by protocol."""
-    course = run.resolved_config["course"]
-    min_radius = run.task_metrics["smallest"]["radius"]
+def _circle_radii(settings: CourseSettings, min_radius: float) -> dict[str, list[float]]:
+    """Return the radii in m of the buoys' circles by protocol.
+
+    Args:
+        settings: buoys and protocols.
+        min_radius: radius in m of the smallest turn, to which smaller circles are widened.
+    """
+    course = settings.course
     return {
         protocol: [
-            course["acceptance"] if protocol == "enter" else max(buoy["radius"], min_radius)
-            for buoy in course["buoys"]
+            course.acceptance if protocol == "enter" else max(buoy.radius, min_radius)
+            for buoy in course.buoys
         ]
-        for protocol in run.resolved_config["protocols"]
+        for protocol in settings.protocols
     }
 
 
 def _protocol_case(
-    run: RunFiles, protocol: str, radii: Sequence[float], tracks: Any, plan: Any
+    course: BuoyCourseConfig,
+    protocol: str,
+    radii: Sequence[float],
+    rudder_limit: float,
+    tracks: pd.DataFrame,
+    plan: pd.DataFrame,
 ) -> Case:
-    """Return the track and the signals of all controllers under one passing rule."""
-    course = run.resolved_config["course"]
-    east, north = (np.array([buoy[name] for buoy in course["buoys"]]) for name in ("east", "north"))
+    """Return the track and the signals of all controllers under one passing rule.
+
+    Args:
+        course: buoys and start.
+        protocol: name of the rule.
+        radii: radius of each buoy's circle in m.
+        rudder_limit: largest rudder angle in rad.
+        tracks: simulations of the nominal vessel under the rule.
+        plan: the planned course.
+    """
+    east = np.array([buoy.east for buoy in course.buoys])
+    north = np.array([buoy.north for buoy in course.buoys])
     angle = np.linspace(0.0, 2.0 * np.pi, 37)
     circles = [
         (x + r * np.sin(angle), y + r * np.cos(angle))
         for x, y, r in zip(east, north, radii, strict=True)
     ]
-    limit = DEGREES_PER_RADIAN * np.array([-1.0, 1.0]) * run.task_metrics["rudder"]
+    limit = DEGREES_PER_RADIAN * np.array([-1.0, 1.0]) * rudder_limit
     track: dict[str, Curve] = {
         "plan": (plan["east"].to_numpy(float), plan["north"].to_numpy(float)),
         "circles": join_with_gaps(circles),
         "buoys": (east, north),
-        "start": (np.array([course["start"][1]]), np.array([course["start"][0]])),
+        "start": (np.array([course.start[1]]), np.array([course.start[0]])),
     }
     panels: list[dict[str, Curve]] = [track, *({} for _ in _PANELS)]
     panels[2]["limits"] = (np.zeros(2), limit)
@@ -148,7 +198,7 @@ def _protocol_case(
     ]
     margin = 0.3 * max(map(np.ptp, plan_coordinates)) + max(radii)
     for (controller, guidance), run_track in tracks.groupby(["controller", "guidance"], sort=False):
-        name = f"{controller}{_GUIDANCE_SUFFIXES[guidance]}"
+        name = f"{controller}{_GUIDANCE_SUFFIXES[str(guidance)]}"
         values = {key: run_track[key].to_numpy(float) for key in ("east", "north", "t")}
         is_outside = np.zeros(len(run_track), dtype=bool)
         for key, coordinates in zip(("east", "north"), plan_coordinates, strict=True):
@@ -162,8 +212,8 @@ def _protocol_case(
         for panel, (quantity, _, factor) in zip(panels[1:], _PANELS, strict=True):
             panel[name] = (values["t"], factor * run_track[quantity].to_numpy(float))
     side_labels = [
-        (0, float(x), float(y), f"{number}{buoy['leave_to'][0].upper()}")
-        for number, (x, y, buoy) in enumerate(zip(east, north, course["buoys"], strict=True), 1)
+        (0, float(x), float(y), f"{number}{buoy.leave_to[0].upper()}")
+        for number, (x, y, buoy) in enumerate(zip(east, north, course.buoys, strict=True), 1)
     ]
     return Case(protocol, panels, PROTOCOL_RULES[protocol], texts=side_labels)
 
@@ -239,11 +289,11 @@ def sections(run: RunFiles) -> list[Section]:
     Raises:
         UsageError: if the folder has no metrics.json.
     """
-    write_figures(run.path / "figures", _iterate_course_figures(run))
+    metrics = run.read_task_metrics(CourseMetricsFile)
+    settings = read_settings(run.path, CourseSettings)
+    write_figures(run.path / "figures", _iterate_course_figures(run, metrics, settings))
     sections_written: list[Section] = []
-    for protocol, (nominal_rows, spread_rows) in _rows_by_protocol(
-        run.task_metrics["rows"]
-    ).items():
+    for protocol, (nominal_rows, spread_rows) in _rows_by_protocol(metrics.rows).items():
         nominal_results = nominal_table(nominal_rows)
         blocks: list[Block] = [Text(_rule_text(nominal_rows)), nominal_results]
         if not sections_written:
@@ -254,27 +304,32 @@ def sections(run: RunFiles) -> list[Section]:
         if spread_rows:
             blocks.append(Section("Spread of vessels and currents", [spread_table(spread_rows)]))
         sections_written.append(Section(f"Protocol {protocol}", blocks))
-    sections_written.append(Section("What the numbers mean", [Text(_course_definitions(run))]))
+    sections_written.append(
+        Section("What the numbers mean", [Text(_course_definitions(metrics, settings))])
+    )
     return [*sections_written, *figures_section(run.path / "figures")]
 
 
 def _rows_by_protocol(
-    rows: Sequence[JsonObject],
-) -> dict[str, tuple[list[JsonObject], list[JsonObject]]]:
+    rows: Sequence[AnyCourseRow],
+) -> dict[str, tuple[list[CourseRow], list[CourseEnsembleRow]]]:
     """Return the rows of the nominal vessel and of the random vessels by protocol."""
-    rows_by_protocol: dict[str, tuple[list[JsonObject], list[JsonObject]]] = {}
+    rows_by_protocol: dict[str, tuple[list[CourseRow], list[CourseEnsembleRow]]] = {}
     for row in rows:
-        nominal_rows, spread_rows = rows_by_protocol.setdefault(row["protocol"], ([], []))
-        (spread_rows if row["split"] == "spread" else nominal_rows).append(row)
+        nominal_rows, spread_rows = rows_by_protocol.setdefault(row.protocol, ([], []))
+        if isinstance(row, CourseRow):
+            nominal_rows.append(row)
+        else:
+            spread_rows.append(row)
     return rows_by_protocol
 
 
-def _rule_text(rows: Sequence[JsonObject]) -> str:
-    reference_text = f"The reference takes {rows[0]['reference_time']:.2f} s."
-    return f"{PROTOCOL_RULES[rows[0]['protocol']]} {reference_text}"
+def _rule_text(rows: Sequence[CourseRow]) -> str:
+    reference_text = f"The reference takes {rows[0].reference_time:.2f} s."
+    return f"{PROTOCOL_RULES[rows[0].protocol]} {reference_text}"
 
 
-def tables_text(rows: Sequence[JsonObject]) -> str:
+def tables_text(rows: Sequence[AnyCourseRow]) -> str:
     """Return the tables of a course run for the terminal, from the rows of metrics.json."""
     texts = []
     for nominal_rows, spread_rows in _rows_by_protocol(rows).values():
@@ -283,18 +338,18 @@ def tables_text(rows: Sequence[JsonObject]) -> str:
     return "\n".join(texts)
 
 
-def nominal_table(rows: Sequence[JsonObject]) -> Table:
+def nominal_table(rows: Sequence[CourseRow]) -> Table:
     """Return the table of time, margin and cross-track error of the nominal vessel."""
 
-    def count_column(key: str) -> Any:
-        return lambda row: flag_cell(f"{row[key]} of {row['n']}", row[key] != row["n"])
+    def count_cell(count: int | None, row: CourseRow) -> Cell:
+        return flag_cell(f"{count} of {row.n}", count != row.n)
 
-    passing_columns: list[Column[JsonObject]] = [
-        ("on its side", count_column("right_side")),
-        ("clear", count_column("clear")),
+    passing_columns: list[Column[CourseRow]] = [
+        ("on its side", lambda row: count_cell(row.right_side, row)),
+        ("clear", lambda row: count_cell(row.clear, row)),
     ]
-    if rows[0]["protocol"] == "enter":
-        passing_columns = [("entered", count_column("entered"))]
+    if rows[0].protocol == "enter":
+        passing_columns = [("entered", lambda row: count_cell(row.entered, row))]
     return build_table(
         rows,
         [
@@ -309,13 +364,13 @@ def nominal_table(rows: Sequence[JsonObject]) -> Table:
             ("cross-track, rms [m]", "cross_track_rms", 3),
             ("cross-track, largest [m]", "cross_track_max", 3),
             ("rudder travel [deg]", "travel", 1, DEGREES_PER_RADIAN),
-            ("finished", lambda row: Cell("yes") if row["finished"] else flag_cell("no", True)),
+            ("finished", lambda row: Cell("yes") if row.finished else flag_cell("no", True)),
         ],
         is_selected=_is_policy_on_course,
     )
 
 
-def spread_table(rows: Sequence[JsonObject]) -> Table:
+def spread_table(rows: Sequence[CourseEnsembleRow]) -> Table:
     """Return the table of fractions and medians over the random vessels of one protocol."""
     return build_table(
         rows,
@@ -331,21 +386,20 @@ def spread_table(rows: Sequence[JsonObject]) -> Table:
             ("cross-track, rms [m]", "cross_track_rms", 3),
         ],
         is_selected=_is_policy_on_course,
-        caption=f"{rows[0]['n']} vessels and currents for each controller and guidance.",
+        caption=f"{rows[0].n} vessels and currents for each controller and guidance.",
     )
 
 
-def _is_policy_on_course(row: JsonObject) -> bool:
-    return bool(row["kind"] == "policy" and row["guidance"] == "course")
+def _is_policy_on_course(row: AnyCourseRow) -> bool:
+    return row.kind == "policy" and row.guidance == "course"
 
 
-def _course_definitions(run: RunFiles) -> list[str]:
-    metrics = run.task_metrics
-    steady_turn = run.task_metrics["smallest"]
+def _course_definitions(metrics: CourseMetricsFile, settings: CourseSettings) -> list[str]:
+    steady_turn = metrics.smallest
     tight_buoys = [
-        f"buoy {entry['buoy']} ({format_number(entry['radius'], 4)} m)"
-        for entry in metrics["feasibility"]
-        if not entry["possible"]
+        f"buoy {entry.buoy} ({format_number(entry.radius, 4)} m)"
+        for entry in metrics.feasibility
+        if not entry.possible
     ]
     feasibility_text = (
         f"The circles of {', '.join(tight_buoys)} are tighter than that; they are widened to it."
@@ -353,36 +407,35 @@ def _course_definitions(run: RunFiles) -> list[str]:
         else "Every circle can be followed."
     )
     texts = [
-        f"At {math.degrees(metrics['rudder']):.3g} deg of rudder the vessel turns with a radius of"
-        f" {steady_turn['radius']:.2f} m at {steady_turn['speed']:.3g} m/s. {feasibility_text}",
+        f"At {math.degrees(metrics.rudder):.3g} deg of rudder the vessel turns with a radius of"
+        f" {steady_turn.radius:.2f} m at {steady_turn.speed:.3g} m/s. {feasibility_text}",
         "The reference is the shortest course that was found of straight lines and arcs of this"
         " radius, for a vessel that yaws at once and keeps no margin. Ratio:"
-        f" course time over its length at the service speed of {metrics['speed']:.3g} m/s. Ratio,"
+        f" course time over its length at the service speed of {metrics.speed:.3g} m/s. Ratio,"
         " turning: the same at the speed that the vessel keeps in its smallest turn.",
         "On its side and clear: number of buoys left on their side, and outside their circles."
         " Margin: how far inside the circle that is entered least, or outside the one that is"
         " passed most closely. Tightest turn: smallest radius of a flight. The cross-track error is"
         " that from the plan, which a flight by line of sight does not follow.",
     ]
-    return [*texts, _spread_text(run)]
+    return [*texts, _spread_text(settings.spread)]
 
 
-def _spread_text(run: RunFiles) -> str:
-    spread_config = run.resolved_config.get("spread")
+def _spread_text(spread_config: CourseSpreadConfig | None) -> str:
     if spread_config is None:
         return ""
-    (lower_effect, upper_effect) = spread_config["effect"]
-    (lower_time, upper_time) = spread_config["time"]
+    lower_effect, upper_effect = spread_config.effect
+    lower_time, upper_time = spread_config.time
     bias = (
-        f", a rudder bias of at most {math.degrees(spread_config['bias']):.3g} deg"
-        if spread_config["bias"] > 0
+        f", a rudder bias of at most {math.degrees(spread_config.bias):.3g} deg"
+        if spread_config.bias > 0
         else ""
     )
     return (
-        f"Spread: {spread_config['flights']} vessels with {lower_effect:g} to {upper_effect:g}"
+        f"Spread: {spread_config.flights} vessels with {lower_effect:g} to {upper_effect:g}"
         " times the rudder's effect,"
         f" {lower_time:g} to {upper_time:g} times the time constants{bias}, in currents of"
-        f" {spread_config['current']:g} m/s from all directions. Ratios of course times do not"
+        f" {spread_config.current:g} m/s from all directions. Ratios of course times do not"
         " allow for"
         " the current. Passed: share of the flights that passed all buoys as demanded."
     )

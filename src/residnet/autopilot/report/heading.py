@@ -10,11 +10,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from pydantic import Field
 
 from residnet.autopilot.evaluation import describe_limit_cycles, list_unsuitable_conditions
-from residnet.autopilot.heading.conditions import settled_time
+from residnet.autopilot.heading.conditions import ConditionsConfig, settled_time
+from residnet.autopilot.records import AutopilotMetricsFile, ControllersFile, HeadingRow
+from residnet.autopilot.tasks.autopilot.config import EvaluationConditions, StepTestConfig
 from residnet.core.format import DEGREES_PER_RADIAN, format_signed
-from residnet.report.blocks import Block, Code, Column, Section, Table, Text, build_table, flag_cell
+from residnet.report.blocks import (
+    Block,
+    Cell,
+    Code,
+    Column,
+    Section,
+    Table,
+    Text,
+    build_table,
+    flag_cell,
+)
 from residnet.report.figure import (
     ZERO_LINE_STYLE,
     Case,
@@ -28,6 +41,7 @@ from residnet.report.figure import (
 )
 from residnet.report.figure_files import figures_section, read_figures, write_figures
 from residnet.report.run_reader import JsonObject, RunFiles
+from residnet.report.run_settings import ShownSettings, parse_settings
 
 RESPONSES_FILE = "flights.parquet"
 """File of the responses at the corners of the parameter ranges."""
@@ -61,21 +75,45 @@ _HEADING_WORDS = AxisWords("heading", "deg", DEGREES_PER_RADIAN, "yaw rate", "ru
 _DEPTH_WORDS = AxisWords("depth", "m", 1.0, "pitch rate", "stern planes", ("z", "q"))
 
 
-def _config_as_run(run: RunFiles) -> Mapping[str, Any]:
-    """Return the config with all times scaled by its pace, as simulated."""
-    return {**run.resolved_config, **run.task_metrics.get("flown", {})}
+class PolicySettings(ShownSettings):
+    """Whether a policy was trained.
+
+    Attributes:
+        training: settings of the training; None for a tuned law.
+    """
+
+    training: object = None
 
 
-def axis_words(test: Mapping[str, Any]) -> AxisWords:
-    """Return the words for the controlled axis of a run, by its `test`."""
-    return _DEPTH_WORDS if test.get("depth") else _HEADING_WORDS
+class AutopilotSettings(ShownSettings):
+    """Settings of an autopilot run that its page shows.
+
+    Attributes:
+        rudder: rudder limit of the controllers in rad.
+        test: step test of all controllers.
+        conditions: operating conditions of tuning, training and evaluation; None for none.
+        policies: the policies by name.
+    """
+
+    rudder: float
+    test: StepTestConfig
+    conditions: EvaluationConditions | None = None
+    policies: dict[str, PolicySettings] = Field(default_factory=dict)
 
 
-def _step_and_band(test: Mapping[str, Any]) -> tuple[float, float]:
-    """Return the step of the reference and its band in rad, or in m of depth."""
-    if depth := test.get("depth"):
-        return float(depth["change"]), float(depth["band"])
-    return float(test["heading"]), float(test["band"])
+RowsByProtocol = Mapping[str, HeadingRow]
+"""Rows of one controller by the name of the test."""
+
+
+def _read_simulated_settings(run: RunFiles, metrics: AutopilotMetricsFile) -> AutopilotSettings:
+    """Return the settings with all times scaled by the pace, as simulated."""
+    content = {**run.resolved_config, **metrics.flown}
+    return parse_settings(content, AutopilotSettings, run.path / "resolved.yaml")
+
+
+def axis_words(test: StepTestConfig | ConditionsConfig) -> AxisWords:
+    """Return the words for the controlled axis of a test or of conditions."""
+    return _HEADING_WORDS if test.depth is None else _DEPTH_WORDS
 
 
 _KIND_LABELS = {
@@ -91,24 +129,17 @@ _KIND_LABELS = {
 }
 
 
-def _iterate_autopilot_figures(run: RunFiles) -> Iterator[Figure]:
+def _iterate_autopilot_figures(
+    run: RunFiles, metrics: AutopilotMetricsFile, settings: AutopilotSettings
+) -> Iterator[Figure]:
     conditioned_kinds = {
-        row["model"]: row["kind"]
-        for row in run.task_metrics["rows"]
-        if row["protocol"] == "conditions"
+        row.model: row.kind for row in metrics.rows if row.protocol == "conditions"
     }
-    nominal_kinds = {
-        row["model"]: row["kind"]
-        for row in run.task_metrics["rows"]
-        if row["protocol"] == "nominal"
-    }
+    nominal_kinds = {row.model: row.kind for row in metrics.rows if row.protocol == "nominal"}
     yield _response_figure(
-        run.read_required_parquet(RESPONSES_FILE),
-        nominal_kinds,
-        _config_as_run(run)["test"],
-        run.title,
+        run.read_required_parquet(RESPONSES_FILE), nominal_kinds, settings.test, run.title
     )
-    axis_labels = axis_words(_config_as_run(run)["test"])
+    axis_labels = axis_words(settings.test)
     yield _distribution_figure(
         run.read_required_parquet(VESSELS_FILE), nominal_kinds, run.title, axis_labels
     )
@@ -117,9 +148,9 @@ def _iterate_autopilot_figures(run: RunFiles) -> Iterator[Figure]:
         yield _cost_figure(conditioned, conditioned_kinds, run.title, axis_labels)
     fit_notes = {
         name: run.read_json(f"models/{name}/fit.json")
-        for name, policy in (run.resolved_config.get("policies") or {}).items()
+        for name, policy in settings.policies.items()
         # a tuned law has no training
-        if policy.get("training") is not None
+        if policy.training is not None
     }
     if fit_notes:
         yield _learning_figure(fit_notes, run.title)
@@ -134,11 +165,11 @@ def _controller_styles(kinds: Mapping[str, str]) -> dict[str, GlyphStyle]:
 
 
 def _response_figure(
-    series: pd.DataFrame, kinds: Mapping[str, str], test: JsonObject, name: str
+    series: pd.DataFrame, kinds: Mapping[str, str], test: StepTestConfig, name: str
 ) -> Figure:
     """Draw a step of the nominal vessel; for policies also the corners of the ranges, shaded."""
     axis_labels = axis_words(test)
-    (change, settling_band) = _step_and_band(test)
+    change, settling_band = test.step_and_tolerance
     value, rate = axis_labels.columns
     series = series.assign(error=change - series[value])
     styles = _controller_styles(kinds)
@@ -330,14 +361,13 @@ def sections(run: RunFiles) -> list[Section]:
     Raises:
         UsageError: if the folder has no metrics.json.
     """
-    write_figures(run.path / "figures", _iterate_autopilot_figures(run))
-    test = _config_as_run(run)["test"]
-    axis_labels = axis_words(test)
-    settling_comparison = settling_table(
-        run.task_metrics["rows"], run.task_metrics.get("floor"), axis_labels
-    )
-    conditions = _config_as_run(run).get("conditions")
-    costs = cost_table(run.task_metrics["rows"], axis_labels) if conditions else None
+    metrics = run.read_task_metrics(AutopilotMetricsFile)
+    settings = _read_simulated_settings(run, metrics)
+    write_figures(run.path / "figures", _iterate_autopilot_figures(run, metrics, settings))
+    axis_labels = axis_words(settings.test)
+    settling_comparison = settling_table(metrics.rows, metrics.floor, axis_labels)
+    conditions = settings.conditions
+    costs = None if conditions is None else cost_table(metrics.rows, axis_labels)
     previews = [figure.preview() for figure in read_figures(run.path / "figures", "responses")]
     # settling of the nominal vessel and of the spread, or the cost of a change
     opening_table = (
@@ -349,36 +379,36 @@ def sections(run: RunFiles) -> list[Section]:
             "Controllers compared",
             [
                 settling_comparison,
-                Text(_autopilot_definitions(_config_as_run(run)), is_secondary=True),
+                Text(_autopilot_definitions(settings), is_secondary=True),
             ],
         ),
         Section(
             "Effort",
             [
-                effort_table(run.task_metrics["rows"], axis_labels),
-                Text(_effort_text(test), is_secondary=True),
+                effort_table(metrics.rows, axis_labels),
+                Text(_effort_text(settings.test), is_secondary=True),
             ],
         ),
         *figures_section(run.path / "figures"),
     ]
-    if costs is not None and conditions:
+    if costs is not None and conditions is not None:
         blocks: list[Block] = [costs, Text(_conditions_text(conditions), is_secondary=True)]
-        extrapolation = extrapolation_table(run.task_metrics["rows"])
+        extrapolation = extrapolation_table(metrics.rows)
         if extrapolation is not None:
             blocks += [Text(["Outside the conditions of tuning and training:"]), extrapolation]
         sections_written.insert(1, Section("Under the stated conditions", blocks))
-    if controllers := run.read_json("controllers.json"):
-        sections_written.append(
-            Section("Controllers", [Code(json.dumps(controllers, indent=1))], is_folded=True)
-        )
+    controllers = run.read_record(ControllersFile, "controllers.json")
+    if controllers is not None:
+        text = json.dumps(controllers.to_content(), indent=1)
+        sections_written.append(Section("Controllers", [Code(text)], is_folded=True))
     return sections_written
 
 
-def _rows_by_model(rows: Sequence[JsonObject], protocol: str) -> dict[str, dict[str, JsonObject]]:
+def _rows_by_model(rows: Sequence[HeadingRow], protocol: str) -> dict[str, RowsByProtocol]:
     """Return the rows of the controllers with a row of a protocol, by model and protocol."""
-    rows_by_model: dict[str, dict[str, JsonObject]] = {}
+    rows_by_model: dict[str, dict[str, HeadingRow]] = {}
     for row in rows:
-        rows_by_model.setdefault(row["model"], {})[row["protocol"]] = row
+        rows_by_model.setdefault(row.model, {})[row.protocol] = row
     return {
         model: rows_by_protocol
         for model, rows_by_protocol in rows_by_model.items()
@@ -387,7 +417,7 @@ def _rows_by_model(rows: Sequence[JsonObject], protocol: str) -> dict[str, dict[
 
 
 def settling_table(
-    rows: Sequence[JsonObject], reference_controller: str | None, axis_labels: AxisWords
+    rows: Sequence[HeadingRow], reference_controller: str | None, axis_labels: AxisWords
 ) -> Table:
     """Return the table of settling time, overshoot and steady errors by controller.
 
@@ -396,21 +426,21 @@ def settling_table(
     """
     rows_by_model = _rows_by_model(rows, "nominal")
 
-    def unsettled_cell(row: JsonObject) -> Any:
-        n_unsettled = sum(
-            row[protocol]["unsettled"] for protocol in ("corners", "random", "nominal")
-        )
+    def unsettled_cell(row: RowsByProtocol) -> Cell:
+        protocols = ("corners", "random", "nominal")
+        n_unsettled = sum(row[protocol].unsettled or 0 for protocol in protocols)
         return flag_cell(n_unsettled, n_unsettled)
 
-    def max_overshoot(row: JsonObject) -> float:
-        return max(float(row[protocol]["overshoot"]["max"]) for protocol in ("corners", "random"))
+    def max_overshoot(row: RowsByProtocol) -> float:
+        overshoots = (row[protocol].overshoot for protocol in ("corners", "random"))
+        return max(overshoot.max for overshoot in overshoots if overshoot is not None)
 
-    columns: list[Column[Mapping[str, JsonObject]]] = [
+    columns: list[Column[RowsByProtocol]] = [
         ("controller", "nominal.model"),
         ("nominal [s]", "nominal.settling.max", 2),
     ]
     if reference_controller:
-        reference_settling = rows_by_model[reference_controller]["nominal"]["settling"]["max"]
+        reference_settling = rows_by_model[reference_controller]["nominal"].max_settling
         columns.append(
             (
                 f"over {reference_controller} [-]",
@@ -426,23 +456,23 @@ def settling_table(
         (f"overshoot [{axis_labels.unit}]", max_overshoot, 3, axis_labels.scale),
         (f"bias [{axis_labels.unit}]", "bias.error_end", 4, axis_labels.scale),
     ]
-    if any(row["protocol"] == "wind" for row in rows):
+    if any(row.protocol == "wind" for row in rows):
         columns.append((f"wind [{axis_labels.unit}]", "wind.error_end", 4, axis_labels.scale))
     return build_table(
         rows_by_model.values(),
         [*columns, ("not settled", unsettled_cell)],
-        is_selected=lambda row: row["nominal"]["kind"] == "policy",
+        is_selected=lambda row: row["nominal"].kind == "policy",
     )
 
 
-def effort_table(rows: Sequence[JsonObject], axis_labels: AxisWords) -> Table:
+def effort_table(rows: Sequence[HeadingRow], axis_labels: AxisWords) -> Table:
     """Return the table of control effort: of a change over random vessels, and in waves."""
     groups = [
         (f"absolute error [{axis_labels.unit} s]", 2),
         (f"{axis_labels.rudder} travel [deg]", 2),
     ]
     groups.append(("energy [deg² s]", 2))
-    columns: list[Column[Mapping[str, JsonObject]]] = [("controller", "random.model")]
+    columns: list[Column[RowsByProtocol]] = [("controller", "random.model")]
     for quantity, scale in (
         ("iae", axis_labels.scale),
         ("travel", DEGREES_PER_RADIAN),
@@ -452,11 +482,11 @@ def effort_table(rows: Sequence[JsonObject], axis_labels: AxisWords) -> Table:
             ("mean", f"random.{quantity}.mean", 2, scale),
             ("95 %", f"random.{quantity}.p95", 2, scale),
         ]
-    if sea_rows := [row for row in rows if row["protocol"] == "sea"]:
+    if sea_rows := [row for row in rows if row.protocol == "sea"]:
         sea_angles = [
             "heading",
             "rudder",
-            *(["heel"] if any("heel_rms" in row for row in sea_rows) else []),
+            *(["heel"] if any(row.heel_rms is not None for row in sea_rows) else []),
         ]
         columns += [(name, f"sea.{name}_rms.mean", 3, DEGREES_PER_RADIAN) for name in sea_angles]
         groups.append(("sea, root mean square [deg]", len(sea_angles)))
@@ -464,98 +494,94 @@ def effort_table(rows: Sequence[JsonObject], axis_labels: AxisWords) -> Table:
         _rows_by_model(rows, "random").values(),
         columns,
         groups=groups,
-        is_selected=lambda row: row["random"]["kind"] == "policy",
+        is_selected=lambda row: row["random"].kind == "policy",
     )
 
 
-def _autopilot_definitions(config: Mapping[str, Any]) -> list[str]:
-    test = config["test"]
-    axis_labels = axis_words(config["test"])
-    change, band = (axis_labels.scale * value for value in _step_and_band(test))
+def _autopilot_definitions(settings: AutopilotSettings) -> list[str]:
+    test = settings.test
+    axis_labels = axis_words(test)
+    change, band = (axis_labels.scale * value for value in test.step_and_tolerance)
     return [
         f"One definition holds for all controllers: a step of {change:.3g} {axis_labels.unit}"
         " without"
-        f" prefilter, with the {axis_labels.rudder} within {math.degrees(config['rudder']):.3g}"
+        f" prefilter, with the {axis_labels.rudder} within {math.degrees(settings.rudder):.3g}"
         " deg. A"
         f" change has settled at its last entry into {band:.3g} {axis_labels.unit}.",
         "Worst: over the corners of the spread. Random: over"
-        f" {test['plants']} vessels drawn from it. Overshoot: the largest over both. Bias: largest"
-        f" error after {test['bias_time']:g} s under {math.degrees(test['bias']):.3g} deg of"
+        f" {test.plants} vessels drawn from it. Overshoot: the largest over both. Bias: largest"
+        f" error after {test.bias_time:g} s under {math.degrees(test.bias):.3g} deg of"
         f" constant bias of the {axis_labels.rudder}. Not settled: number of changes outside the"
         " band at"
         " their end.",
         "Peers are tuned by the cost under the stated conditions."
-        if config.get("conditions")
+        if settings.conditions is not None
         else "The constants of the peers are given.",
     ]
 
 
-def _effort_text(test: JsonObject) -> list[str]:
+def _effort_text(test: StepTestConfig) -> list[str]:
     texts = [
-        f"Mean and 95th percentile over the {test['plants']} random vessels: integral of the"
+        f"Mean and 95th percentile over the {test.plants} random vessels: integral of the"
         f" absolute {axis_words(test).value} error, travel of the {axis_words(test).rudder}"
         " command,"
         " and its energy (the integral of its square)."
     ]
-    if test.get("wind"):
+    if test.wind:
         texts.append(
-            f"Wind: largest error after {test['bias_time']:g} s in {test['wind']:g} m/s from eight"
+            f"Wind: largest error after {test.bias_time:g} s in {test.wind:g} m/s from eight"
             " directions."
         )
-    if sea := test.get("sea"):
+    if sea := test.sea:
         texts.append(
-            f"Sea: root mean squares over {test['sea_time']:g} s after the step, on a course of"
-            f" {math.degrees(test['heading']):.3g} deg, mean over eight realisations. The waves"
-            f" have {sea['significant_height']:g} m significant height and"
-            f" {sea['peak_period']:g} s peak period ({sea['spectrum']['kind']}) and travel towards"
-            f" {math.degrees(sea['direction']):.3g} deg."
+            f"Sea: root mean squares over {test.sea_time:g} s after the step, on a course of"
+            f" {math.degrees(test.heading):.3g} deg, mean over eight realisations. The waves"
+            f" have {sea.significant_height:g} m significant height and"
+            f" {sea.peak_period:g} s peak period ({sea.spectrum.kind}) and travel towards"
+            f" {math.degrees(sea.direction):.3g} deg."
         )
     return texts
 
 
-def best_classical_row(rows: Sequence[JsonObject]) -> JsonObject:
+def best_classical_row(rows: Sequence[HeadingRow]) -> HeadingRow:
     """Return the row of the classical controller with the smallest mean cost."""
-    of_conditions = [row for row in rows if row["protocol"] == "conditions"]
-    classical = [row for row in of_conditions if row["kind"] == "classical"]
-    return min(classical or of_conditions, key=_mean_cost)
+    condition_rows = [row for row in rows if row.protocol == "conditions"]
+    classical_rows = [row for row in condition_rows if row.kind == "classical"]
+    return min(classical_rows or condition_rows, key=lambda row: row.mean_cost)
 
 
-def _mean_cost(row: JsonObject) -> float:
-    return float(row["cost"]["mean"])
-
-
-def cost_sentences(rows: Sequence[JsonObject]) -> list[str]:
+def cost_sentences(rows: Sequence[HeadingRow]) -> list[str]:
     """Return a sentence for each learned policy on its cost and that of the best classical law.
 
     It is empty without operating conditions.
     """
-    rows_by_model = {row["model"]: row for row in rows if row["protocol"] == "conditions"}
+    rows_by_model = {row.model: row for row in rows if row.protocol == "conditions"}
     if not rows_by_model:
         return []
     best_row = best_classical_row(rows)
     sentences = [
-        f"Under the stated conditions the tuned law '{name}' costs {_mean_cost(row):.3f} s a"
-        f" change; the best classical law, '{best_row['model']}', costs"
-        f" {_mean_cost(best_row):.3f} s."
+        f"Under the stated conditions the tuned law '{name}' costs {row.mean_cost:.3f} s a"
+        f" change; the best classical law, '{best_row.model}', costs"
+        f" {best_row.mean_cost:.3f} s."
         for name, row in rows_by_model.items()
-        if row["kind"] == "law"
+        if row.kind == "law"
     ]
-    for row in sorted(rows_by_model.values(), key=_mean_cost):
-        if row["kind"] not in ("policy", "network"):
+    for row in sorted(rows_by_model.values(), key=lambda row: row.mean_cost):
+        if row.kind not in ("policy", "network"):
             continue
-        name = row["model"]
-        switched_off = rows_by_model.get(f"{row['model']} network off")
-        cost = row["cost"]["mean"]
-        best_cost = best_row["cost"]["mean"]
+        name = row.model
+        switched_off = rows_by_model.get(f"{name} network off")
+        cost = row.mean_cost
+        best_cost = best_row.mean_cost
         network_text = (
             "; it has no law inside"
             if switched_off is None
-            else f"; with its network switched off it costs {switched_off['cost']['mean']:.3f} s"
+            else f"; with its network switched off it costs {switched_off.mean_cost:.3f} s"
         )
         sentences.append(
             f"Under the stated conditions '{name}' costs {cost:.3f} s a change,"
             f" {100 * abs(cost / best_cost - 1):.1f} % {'below' if cost < best_cost else 'above'}"
-            f" '{best_row['model']}', the best classical law, with {best_cost:.3f} s{network_text}."
+            f" '{best_row.model}', the best classical law, with {best_cost:.3f} s{network_text}."
         )
         if objections := list_unsuitable_conditions(name, rows):
             sentences.append(f"Do not use '{name}' there: {'; '.join(objections)}.")
@@ -563,19 +589,19 @@ def cost_sentences(rows: Sequence[JsonObject]) -> list[str]:
     return sentences
 
 
-def cost_table(rows: Sequence[JsonObject], axis_labels: AxisWords) -> Table:
+def cost_table(rows: Sequence[HeadingRow], axis_labels: AxisWords) -> Table:
     """Return cost, overshoot and travel under the stated conditions by controller."""
     best_row = best_classical_row(rows)
     rows_by_model = _rows_by_model(rows, "conditions")
     return build_table(
-        sorted(rows_by_model.values(), key=lambda row: _mean_cost(row["conditions"])),
+        sorted(rows_by_model.values(), key=lambda row: row["conditions"].mean_cost),
         [
             ("controller", "conditions.model"),
-            ("what it is", lambda row: _KIND_LABELS[row["conditions"]["kind"]]),
+            ("what it is", lambda row: _KIND_LABELS[row["conditions"].kind]),
             ("mean [s]", "conditions.cost.mean", 3),
             (
-                f"over {best_row['model']} [%]",
-                lambda row: 100 * (_mean_cost(row["conditions"]) / _mean_cost(best_row) - 1),
+                f"over {best_row.model} [%]",
+                lambda row: 100 * (row["conditions"].mean_cost / best_row.mean_cost - 1),
                 lambda value: format_signed(value, 1),
             ),
             ("95 % [s]", "conditions.cost.p95", 2),
@@ -593,18 +619,16 @@ def cost_table(rows: Sequence[JsonObject], axis_labels: AxisWords) -> Table:
             ("diverged", "conditions.diverged", lambda lost: flag_cell(lost, lost)),
         ],
         groups=[("", 1), ("cost", 3), ("", 1), ("overshoot", 2), ("", 1), ("swing, most", 2)],
-        is_selected=lambda row: row["conditions"]["kind"] in ("policy", "network"),
+        is_selected=lambda row: row["conditions"].kind in ("policy", "network"),
     )
 
 
-def extrapolation_table(rows: Sequence[JsonObject]) -> Table | None:
+def extrapolation_table(rows: Sequence[HeadingRow]) -> Table | None:
     """Return the table of costs outside the conditions of training; None without simulations."""
-    tests = list(
-        dict.fromkeys(row["protocol"] for row in rows if row["protocol"].startswith("beyond_"))
-    )
+    tests = list(dict.fromkeys(row.protocol for row in rows if row.protocol.startswith("beyond_")))
     if not tests:
         return None
-    columns: list[Column[Mapping[str, JsonObject]]] = [("controller", f"{tests[0]}.model")]
+    columns: list[Column[RowsByProtocol]] = [("controller", f"{tests[0]}.model")]
     for test in tests:
         columns += [
             ("mean [s]", f"{test}.cost.mean", 3),
@@ -615,60 +639,58 @@ def extrapolation_table(rows: Sequence[JsonObject]) -> Table | None:
         _rows_by_model(rows, tests[0]).values(),
         columns,
         groups=[(test.removeprefix("beyond_"), 3) for test in tests],
-        is_selected=lambda row: row[tests[0]]["kind"] == "policy",
+        is_selected=lambda row: row[tests[0]].kind == "policy",
     )
 
 
-def _conditions_text(evaluation: Mapping[str, Any]) -> list[str]:
+def _conditions_text(evaluation: EvaluationConditions) -> list[str]:
     """Return sentences that describe the operating conditions of the evaluation."""
-    conditions = evaluation["stated"]
-    depth = conditions.get("depth")
+    conditions = evaluation.stated
+    depth = conditions.depth
     axis_labels = axis_words(conditions)
-    step_range = depth["change"] if depth else conditions["heading"]
+    step_range = depth.change if depth else conditions.heading
     lower, upper, band = (
-        axis_labels.scale * value for value in (*step_range, (depth or conditions)["band"])
+        axis_labels.scale * value for value in (*step_range, (depth or conditions).band)
     )
-    noise = (
-        f"{math.degrees(conditions['noise_psi']):.3g} deg on the {'pitch' if depth else 'heading'}"
-    )
+    noise = f"{math.degrees(conditions.noise_psi):.3g} deg on the {'pitch' if depth else 'heading'}"
     if depth:
-        noise = f"{depth['noise']:.3g} m on the depth, {noise}"
+        noise = f"{depth.noise:.3g} m on the depth, {noise}"
     texts = [
-        f"{evaluation['flights']} changes of {axis_labels.value} of {lower:.3g} to {upper:.3g}"
+        f"{evaluation.flights} changes of {axis_labels.value} of {lower:.3g} to {upper:.3g}"
         f" {axis_labels.unit},"
         " which no tuning or training has seen, the same for all controllers. The vessel's K lies"
-        f" within {conditions['effect'][0]:g} to {conditions['effect'][1]:g} and its T within"
-        f" {conditions['time'][0]:g} to {conditions['time'][1]:g} of the nominal one; commands"
+        f" within {conditions.effect[0]:g} to {conditions.effect[1]:g} and its T within"
+        f" {conditions.time[0]:g} to {conditions.time[1]:g} of the nominal one; commands"
         " arrive"
-        f" {conditions['delay'][0]:g} to {conditions['delay'][1]:g} s late; the"
+        f" {conditions.delay[0]:g} to {conditions.delay[1]:g} s late; the"
         f" {axis_labels.rudder} has a bias of"
-        f" up to {math.degrees(conditions['bias']):.3g} deg and a slow push of"
-        f" {math.degrees(conditions['push']):.3g} deg; the noise is {noise} and"
-        f" {math.degrees(conditions['noise_r']):.3g} deg/s on the {axis_labels.rate}.",
+        f" up to {math.degrees(conditions.bias):.3g} deg and a slow push of"
+        f" {math.degrees(conditions.push):.3g} deg; the noise is {noise} and"
+        f" {math.degrees(conditions.noise_r):.3g} deg/s on the {axis_labels.rate}.",
         f"Cost: the integral of |e| / (|e| + {band:.3g} {axis_labels.unit}) over"
-        f" {conditions['duration']:g} s from the change on, plus"
-        f" {conditions['overshoot_weight']:g} s per"
-        f" {'decimetre' if depth else 'deg'} of overshoot and {conditions['travel_weight']:g} s"
+        f" {conditions.duration:g} s from the change on, plus"
+        f" {conditions.overshoot_weight:g} s per"
+        f" {'decimetre' if depth else 'deg'} of overshoot and {conditions.travel_weight:g} s"
         " per deg"
         f" of {axis_labels.rudder} travel. Swing: largest movement, peak to"
-        f" peak, from {settled_time(conditions['duration']):.3g} s after a change on in flights"
+        f" peak, from {settled_time(conditions.duration):.3g} s after a change on in flights"
         " without"
         " noise and slow push. Classical controllers are tuned by the same cost, by differential"
         " evolution.",
     ]
-    if conditions["wind"] or conditions["current"]:
+    if conditions.wind or conditions.current:
         wind = (
-            f"wind of {conditions['wind'][0]:g} to {conditions['wind'][1]:g} m/s"
-            if conditions["wind"]
+            f"wind of {conditions.wind[0]:g} to {conditions.wind[1]:g} m/s"
+            if conditions.wind
             else ""
         )
-        current = f"current of up to {conditions['current']:g} m/s" if conditions["current"] else ""
+        current = f"current of up to {conditions.current:g} m/s" if conditions.current else ""
         weather_text = " and ".join(text for text in (wind, current) if text)
         texts.append(f"There is {weather_text}, from all directions.")
-    if conditions.get("waves"):
+    if conditions.waves:
         texts.append(
             "Heading and yaw rate are measured with the motion in waves, of up to"
-            f" {math.degrees(conditions['waves']):.3g} deg (standard deviation) and peak periods of"
-            f" {conditions['wave_period'][0]:g} to {conditions['wave_period'][1]:g} s."
+            f" {math.degrees(conditions.waves):.3g} deg (standard deviation) and peak periods of"
+            f" {conditions.wave_period[0]:g} to {conditions.wave_period[1]:g} s."
         )
     return texts

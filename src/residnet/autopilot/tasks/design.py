@@ -247,8 +247,9 @@ _DEFAULT_DELAY = (0.0, 0.4)
 _DEFAULT_NOISE_DEG = 0.1
 """Noise in deg and deg/s of a magnetic compass and a MEMS gyro, if unknown."""
 _DEFAULT_BIAS_DEG = 1.0
+"""Typical rudder offset in deg; used unless the logs have a larger one."""
 _DEFAULT_PUSH_DEG = 0.5
-"""Typical rudder offset and slow push in deg; used unless the logs have a larger offset."""
+"""Typical standard deviation of the slow disturbance, as a rudder angle in deg."""
 _DEFAULT_WAVES_DEG = 0.5
 """Wave-frequency heading motion in deg if the logs have none.
 

@@ -26,6 +26,7 @@ from residnet.autopilot.heading.predictive import DocumentConfig, PredictiveConf
 from residnet.autopilot.heading.steering_variation import DEPTH, HEADING, Axis
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.heading.vessels import SteeredModel, SteeredPlant
+from residnet.autopilot.records import ControllerKind
 from residnet.autopilot.training.config import PolicyTraining
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
 from residnet.core.errors import ConfigError, FitError
@@ -73,7 +74,7 @@ class PolicyConfig(Config):
     training: PolicyTraining | None = PolicyTraining()
 
     @property
-    def role(self) -> str:
+    def role(self) -> ControllerKind:
         """Role in the rows of metrics.json: policy, network, constants, or law."""
         if self.training is None:
             return "law"
@@ -480,6 +481,7 @@ class AutopilotConfig(PackageTask, ComputingTask):
 _PUSH_STD_FACTOR = 2.0
 """Number of standard deviations of the slow disturbance that the rudder must compensate."""
 _REFERENCE_STEP = math.radians(30.0)
+"""Change of heading in rad whose minimum time defines the pace of a vessel."""
 REFERENCE_STEERING = NomotoModel(3.47, 3.94, 3.2), math.radians(5.0)
 """K, T and rudder of the vessel of Gouletas 2020; times in configs refer to it at a pace of one."""
 

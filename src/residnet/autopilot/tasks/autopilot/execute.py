@@ -50,6 +50,14 @@ from residnet.autopilot.heading.controllers import (
 )
 from residnet.autopilot.heading.policies import LOS_CONSTANTS, DepthPolicy, ObserverPolicy
 from residnet.autopilot.heading.vessels import SteeredPlant
+from residnet.autopilot.records import (
+    AutopilotMetricsFile,
+    ControllerKind,
+    ControllerNotes,
+    ControllersFile,
+    HeadingRow,
+    TurningParameters,
+)
 from residnet.autopilot.report.heading import (
     CONDITIONS_FILE,
     RESPONSES_FILE,
@@ -62,7 +70,6 @@ from residnet.autopilot.report.heading import (
 )
 from residnet.autopilot.training.fit import train_policy
 from residnet.autopilot.training.predictor import train_or_resume_controller
-from residnet.core.files import read_json
 from residnet.core.progress import begin_stage, log_message, report_progress
 from residnet.dynamics.store import rebuild_module
 from residnet.engine.compiled import CompiledRollout
@@ -80,7 +87,7 @@ if TYPE_CHECKING:
         EvaluationConditions,
     )
 
-Controllers = dict[str, tuple[str, Policy]]
+Controllers = dict[str, tuple[ControllerKind, Policy]]
 """Role (policy, classical, floor and others) and controller by name."""
 
 
@@ -95,32 +102,38 @@ def execute(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
     )
     steering = ControlTask(vessel, nomoto, config.rudder, config.test.dt)
     controllers: Controllers = {}
-    notes: dict[str, Any] = {}
+    notes: dict[str, ControllerNotes] = {}
     tuned_peers: dict[str, AnyController] = {}
     for name, peer in config.peers.items():
         tuned_peers[name], notes[name] = _tune_peer(name, peer, steering, config)
-        role = "floor" if name == config.floor else "classical"
+        role: ControllerKind = "floor" if name == config.floor else "classical"
         controllers[name] = (role, tuned_peers[name].build(steering))
     for name, settings in config.predictive.items():
-        predictive_policy, notes[name] = train_or_resume_controller(
+        predictive_policy, training_notes = train_or_resume_controller(
             name, settings, steering, config.seed, folder
         )
+        notes[name] = ControllerNotes.model_validate(training_notes)
         controllers[name] = ("predictive", predictive_policy)
     ablations: Controllers = {}
     for name, policy_config in config.policies.items():
         base_law = None if policy_config.start is None else tuned_peers[policy_config.start]
-        policy, notes[name], untrained_policy = _train_policy_or_resume(
+        policy, training_notes, untrained_policy = _train_policy_or_resume(
             name, base_law, steering, config, folder
         )
+        notes[name] = ControllerNotes.model_validate(training_notes)
         controllers = {name: (policy_config.role, policy), **controllers}
         # references of the comparison: the untrained policy, and the policy without its network
         if policy_config.units > 0:
             ablations[f"{name} untrained"] = ("untrained", untrained_policy)
             if isinstance(policy, ObserverPolicy | DepthPolicy):
                 ablations[f"{name} network off"] = ("network_off", policy.without_network())
-    folder.write_json(
+    folder.write_record(
         folder.path / "controllers.json",
-        {"schema": "residnet.controllers/1", "turning": nomoto.to_json(), "controllers": notes},
+        ControllersFile(
+            schema="residnet.controllers/1",
+            turning=TurningParameters.model_validate(nomoto.to_json()),
+            controllers=notes,
+        ),
     )
     rows, corner_trajectories, plants = _run_step_tests(controllers, vessel, config)
     if config.conditions is not None:
@@ -137,20 +150,20 @@ def execute(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
     depth_units = {"rad": "m", "rad s": "m s"} if config.test.depth else {}
     for name in ("overshoot", "iae", "heading_swing", "error_end"):
         channels[name] = depth_units.get(channels[name], channels[name])
-    folder.write_json(
+    folder.write_record(
         folder.metrics,
-        {
-            "schema": SCHEMA,
-            "run": config.name,
-            "channels": channels,
-            "floor": config.floor,
-            "flown": config.model_dump(mode="json", include={"test", "conditions"}),
-            "rows": rows,
-        },
+        AutopilotMetricsFile(
+            schema=SCHEMA,
+            run=config.name,
+            channels=channels,
+            floor=config.floor,
+            flown=config.model_dump(mode="json", include={"test", "conditions"}),
+            rows=tuple(rows),
+        ),
     )
     folder.write_table(folder.path / RESPONSES_FILE, corner_trajectories)
     folder.write_table(folder.path / VESSELS_FILE, plants)
-    axis_labels = axis_words(config.test.model_dump())
+    axis_labels = axis_words(config.test)
     tables = [settling_table(rows, config.floor, axis_labels), effort_table(rows, axis_labels)]
     if config.conditions is not None:
         tables.insert(0, cost_table(rows, axis_labels))
@@ -166,11 +179,11 @@ def execute(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
 
 def _tune_peer(
     name: str, peer: AnyController, steering: ControlTask, config: AutopilotConfig
-) -> tuple[AnyController, dict[str, Any]]:
+) -> tuple[AnyController, ControllerNotes]:
     """Tune the missing constants of a classical law; return it and notes."""
     evaluation_conditions = config.conditions
     if not isinstance(peer, TunableConfig) or None not in peer.parameter_values().values():
-        return peer, {"config": peer.model_dump(mode="json")}
+        return peer, ControllerNotes(config=peer.model_dump(mode="json"))
     assert evaluation_conditions is not None
     start_time = time.time()
     begin_stage(f"tuning {name}")
@@ -187,12 +200,12 @@ def _tune_peer(
     constants = ", ".join(f"{key} {value:.4g}" for key, value in tuning.parameters.items())
     log_message(f"  tuned {name}: {constants}, cost {tuning.cost:.3f} s")
     tuned_peer = peer.with_parameters(tuning.parameters)
-    return tuned_peer, {
-        "config": tuned_peer.model_dump(mode="json"),
-        "cost": tuning.cost,
-        "tried": tuning.n_candidates,
-        "seconds": round(time.time() - start_time, 1),
-    }
+    return tuned_peer, ControllerNotes(
+        config=tuned_peer.model_dump(mode="json"),
+        cost=tuning.cost,
+        tried=tuning.n_candidates,
+        seconds=round(time.time() - start_time, 1),
+    )
 
 
 def _build_vessel_for_conditions(
@@ -306,7 +319,7 @@ def load_trained_policy(
 
 def _run_step_tests(
     controllers: Controllers, vessel: SteeredPlant, config: AutopilotConfig
-) -> tuple[list[dict[str, Any]], pd.DataFrame, pd.DataFrame]:
+) -> tuple[list[HeadingRow], pd.DataFrame, pd.DataFrame]:
     """Return rows of metrics.json, time series of the corners, and metrics of random vessels."""
     test = config.test
     main_conditions = _main_conditions(config)
@@ -319,7 +332,7 @@ def _run_step_tests(
         [[1.0, 1.0, test.bias], [1.0, 1.0, -test.bias]], dtype=torch.float64
     )
     plant = load_vessel(config.vessel).build()
-    rows: list[dict[str, Any]] = []
+    rows: list[HeadingRow] = []
     corner_tables = []
     random_tables = []
     begin_stage("step tests")
@@ -359,8 +372,9 @@ def _run_step_tests(
                 plant, policy, test.wind, test.heading, **timing
             )
         rows += [
-            build_step_row(name, role, key, trajectories, settling_band)
-            | {"error_end": float(trajectories.error[:, -1].abs().max())}
+            build_step_row(name, role, key, trajectories, settling_band).model_copy(
+                update={"error_end": float(trajectories.error[:, -1].abs().max())}
+            )
             for key, trajectories in disturbed_runs.items()
         ]
         if test.sea is not None:
@@ -382,7 +396,7 @@ def _main_conditions(config: AutopilotConfig) -> ConditionsConfig:
 
 def _evaluate_under_conditions(
     controllers: Controllers, config: AutopilotConfig, evaluation_conditions: EvaluationConditions
-) -> tuple[list[dict[str, Any]], pd.DataFrame]:
+) -> tuple[list[HeadingRow], pd.DataFrame]:
     """Return rows of metrics.json and a table of the simulations under the conditions."""
     vessel = _build_vessel_for_conditions(config, evaluation_conditions)
     conditions_by_protocol = {
@@ -404,7 +418,7 @@ def _evaluate_under_conditions(
     max_delay = max(
         1, *(int(changes.delay_steps.max()) for _, changes in sampled_conditions.values())
     )
-    rows = []
+    rows: list[HeadingRow] = []
     tables = []
     for number, (name, (role, policy)) in enumerate(controllers.items()):
         report_progress("judging", number, len(controllers))
@@ -434,19 +448,19 @@ def _evaluate_under_conditions(
 
 
 def _summarize(
-    config: AutopilotConfig, rows: list[dict[str, Any]]
+    config: AutopilotConfig, rows: list[HeadingRow]
 ) -> tuple[list[str], dict[str, SummaryMetric]]:
     """Return the verdict and the main figures: settling on the nominal vessel, and worst corner."""
     settling_by_model = {
-        (row["model"], row["protocol"]): row["settling"] for row in rows if "settling" in row
+        (row.model, row.protocol): row.settling.max for row in rows if row.settling is not None
     }
     sentences = cost_sentences(rows)
     summary_metrics = dict[str, SummaryMetric]()
     reference_change, _ = config.test.step_and_tolerance
-    axis_labels = axis_words(config.test.model_dump())
+    axis_labels = axis_words(config.test)
     for name in config.policies or config.predictive:
-        nominal = settling_by_model[name, "nominal"]["max"]
-        slowest = settling_by_model[name, "corners"]["max"]
+        nominal = settling_by_model[name, "nominal"]
+        slowest = settling_by_model[name, "corners"]
         summary_metrics[f"{name}_settling_nominal"] = SummaryMetric(nominal, "s")
         summary_metrics[f"{name}_settling_worst"] = SummaryMetric(slowest, "s")
         sentences.append(
@@ -461,11 +475,11 @@ def _summarize(
     if config.floor is not None:
         sentences.append(
             f"The fastest possible change of the nominal vessel, by '{config.floor}' that knows it"
-            f" exactly, takes {settling_by_model[config.floor, 'nominal']['max']:.2f} s."
+            f" exactly, takes {settling_by_model[config.floor, 'nominal']:.2f} s."
         )
     for row in rows:
-        if row["protocol"] == "conditions" and row["model"] in config.policies:
-            summary_metrics[f"{row['model']}_cost"] = SummaryMetric(row["cost"]["mean"], "s")
+        if row.protocol == "conditions" and row.model in config.policies:
+            summary_metrics[f"{row.model}_cost"] = SummaryMetric(row.mean_cost, "s")
     return sentences, summary_metrics
 
 
@@ -490,7 +504,7 @@ def export_model(config: AutopilotConfig, request: ExportRequest) -> Path:
         ExportError: if the file does not reproduce the policy.
     """
     name = request.resolve_model_name(config.policies)
-    rows = read_json(request.run.metrics)["rows"]
+    rows = AutopilotMetricsFile.read(request.run.metrics).rows
     scaled_config = config.with_scaled_times()
     card_fields = {
         "vessel": config.vessel,
@@ -508,6 +522,6 @@ def export_model(config: AutopilotConfig, request: ExportRequest) -> Path:
         load_trained_policy(config, request.run.models, name, scaled_config.test.dt),
         fallback=config.safe,
         description=card_fields,
-        metrics=[row for row in rows if row["model"] == name],
+        metrics=[row for row in rows if row.model == name],
     )
     return request.write(exported, list_policy_objections(name, rows))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -36,12 +36,20 @@ from residnet.autopilot.heading.controllers import ControlTask
 from residnet.autopilot.heading.policies import SteeringPolicy
 from residnet.autopilot.heading.steering_variation import NOMINAL, Vessels
 from residnet.autopilot.heading.turning import NomotoModel
+from residnet.autopilot.records import (
+    AnyCourseRow,
+    ControllerKind,
+    ControllerNotes,
+    ControllersFile,
+    CourseMetricsFile,
+    CourseRow,
+    SmallestTurn,
+)
 from residnet.autopilot.report.course import COURSES_FILE, SPREAD_FILE, TRACKS_FILE, tables_text
 from residnet.autopilot.tasks.autopilot.config import AnyController, AutopilotConfig
 from residnet.autopilot.tasks.autopilot.execute import load_trained_policy
 from residnet.autopilot.training.predictor import load_predictive_controller
 from residnet.core.errors import ExportError
-from residnet.core.files import read_json
 from residnet.core.progress import log_message
 from residnet.dynamics.simulated import InAmbientCurrent
 from residnet.engine.rollout import Rollout
@@ -76,10 +84,10 @@ def execute(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
     steady_turn = autopilot_run.steady_turn
     radius_feasibility = buoy_feasibility(config.course.buoys, steady_turn.radius)
     for circle in radius_feasibility:
-        if not circle["possible"]:
+        if not circle.possible:
             log_message(
-                f"buoy {circle['buoy']}: {circle['radius']:.4g} m cannot be followed; the smallest"
-                f" radius possible is {circle['smallest']:.2f} m"
+                f"buoy {circle.buoy}: {circle.radius:.4g} m cannot be followed; the smallest"
+                f" radius possible is {circle.smallest:.2f} m"
             )
     controllers = _load_controllers(config, autopilot_run)
     results = _CourseResults([], [], [])
@@ -105,16 +113,19 @@ def execute(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
                 )
         request = ExportRequest(folder, f"{config.policy}_{protocol}")
         exports[request.model] = partial(export_model, config, request, (planned_course, guidance))
-    metrics_json = {
-        "schema": SCHEMA,
-        "run": config.name,
-        "channels": _COLUMN_UNITS,
-        "speed": steering.nomoto.speed,
-        "rudder": steering.limit,
-        "smallest": vars(steady_turn),
-        "feasibility": radius_feasibility,
-    }
-    folder.write_json(folder.metrics, metrics_json | {"rows": results.rows})
+    folder.write_record(
+        folder.metrics,
+        CourseMetricsFile(
+            schema=SCHEMA,
+            run=config.name,
+            channels=_COLUMN_UNITS,
+            speed=steering.nomoto.speed,
+            rudder=steering.limit,
+            smallest=SmallestTurn.model_validate(vars(steady_turn)),
+            feasibility=tuple(radius_feasibility),
+            rows=tuple(results.rows),
+        ),
+    )
     folder.write_table(folder.path / TRACKS_FILE, pd.concat(results.tracks, ignore_index=True))
     folder.write_table(folder.path / COURSES_FILE, pd.concat(plans, ignore_index=True))
     if results.spread_tables:
@@ -141,7 +152,7 @@ def _load_controllers(config: CourseTaskConfig, autopilot_run: AutopilotRun) -> 
         else:
             # the constants as the autopilot run tuned them
             policies[name] = controller_adapter.validate_python(
-                autopilot_run.peer_notes[name]["config"]
+                autopilot_run.peer_notes[name].config
             ).build(autopilot_run.steering)
     policies |= {
         name: policy.build(autopilot_run.steering) for name, policy in config.others.items()
@@ -153,27 +164,29 @@ def _load_controllers(config: CourseTaskConfig, autopilot_run: AutopilotRun) -> 
 
 
 def _summarize_policy(
-    config: CourseTaskConfig, rows: list[dict[str, Any]]
+    config: CourseTaskConfig, rows: list[AnyCourseRow]
 ) -> tuple[list[str], dict[str, SummaryMetric]]:
     """Return sentences and metrics of the policy on the nominal vessel along each plan."""
     verdict = []
     summary_metrics = dict[str, SummaryMetric]()
     for result_row in rows:
-        row_key = (result_row["model"], result_row["guidance"], result_row["split"])
-        if row_key != (config.policy, "course", "simulated"):
+        # random vessels have their own table
+        if not isinstance(result_row, CourseRow):
             continue
-        protocol = result_row["protocol"]
-        summary_metrics[f"{protocol}_course_time"] = SummaryMetric(result_row["course_time"], "s")
-        summary_metrics[f"{protocol}_ratio"] = SummaryMetric(result_row["ratio"])
+        if (result_row.model, result_row.guidance) != (config.policy, "course"):
+            continue
+        protocol = result_row.protocol
+        summary_metrics[f"{protocol}_course_time"] = SummaryMetric(result_row.course_time, "s")
+        summary_metrics[f"{protocol}_ratio"] = SummaryMetric(result_row.ratio)
         summary_metrics[f"{protocol}_cross_track_rms"] = SummaryMetric(
-            result_row["cross_track_rms"], "m"
+            result_row.cross_track_rms, "m"
         )
-        passing_text = "and passes all" if result_row["passed"] else "but does NOT pass all"
+        passing_text = "and passes all" if result_row.passed else "but does NOT pass all"
         verdict.append(
-            f"{protocol}: '{config.policy}' needs {result_row['course_time']:.1f} s,"
-            f" {result_row['ratio']:.3f} times the time of the reference, {passing_text}"
+            f"{protocol}: '{config.policy}' needs {result_row.course_time:.1f} s,"
+            f" {result_row.ratio:.3f} times the time of the reference, {passing_text}"
             f" {len(config.course.buoys)} buoys as the protocol requires."
-            if result_row["finished"]
+            if result_row.finished
             else f"{protocol}: '{config.policy}' did not reach the end of the course."
         )
     return verdict, summary_metrics
@@ -187,14 +200,14 @@ class AutopilotRun(NamedTuple):
         run: folder of the autopilot run.
         steering: vessel, K and T, rudder limit and time step.
         steady_turn: smallest steady turn of the vessel.
-        peer_notes: tuned configs of the peers by name.
+        peer_notes: notes on the controllers by name, with the tuned configs of the peers.
     """
 
     autopilot: AutopilotConfig
     run: RunFolder
     steering: ControlTask
     steady_turn: SteadyTurn
-    peer_notes: dict[str, Any]
+    peer_notes: dict[str, ControllerNotes]
 
 
 def open_autopilot_run(config: CourseTaskConfig, folder: RunFolder) -> AutopilotRun:
@@ -207,10 +220,10 @@ def open_autopilot_run(config: CourseTaskConfig, folder: RunFolder) -> Autopilot
     run_folder = RunFolder.open(
         config.autopilot if config.autopilot.is_dir() else folder.path / "autopilot"
     )
-    notes = read_json(run_folder.path / "controllers.json")
+    notes = ControllersFile.read(run_folder.path / "controllers.json")
     steering = ControlTask(
         autopilot.steered_vessel,
-        NomotoModel.from_json(notes["turning"]),
+        NomotoModel.from_json(notes.turning.model_dump()),
         autopilot.rudder,
         config.dt,
     )
@@ -219,7 +232,7 @@ def open_autopilot_run(config: CourseTaskConfig, folder: RunFolder) -> Autopilot
         run_folder,
         steering,
         smallest_turn(config.course, steering.vessel, steering.nomoto, steering.limit),
-        notes["controllers"],
+        notes.controllers,
     )
 
 
@@ -271,7 +284,7 @@ def make_course_guidance(
 class _CourseResults(NamedTuple):
     """Rows of metrics.json, tracks of the nominal vessel, and results of the random vessels."""
 
-    rows: list[dict[str, Any]]
+    rows: list[AnyCourseRow]
     tracks: list[pd.DataFrame]
     spread_tables: list[pd.DataFrame]
 
@@ -286,11 +299,11 @@ def _run_controller(
     results: _CourseResults,
 ) -> None:
     """Simulate the nominal vessel and the random ones with one controller and guidance."""
-    role = "policy" if name == config.policy else "classical"
+    role: ControllerKind = "policy" if name == config.policy else "classical"
     guidance = "course" if line_of_sight is None else line_of_sight.kind
     loop_parts = _build_loop_parts(config, planned_course, steering, policy, line_of_sight)
 
-    def simulate_vessels(vessels: Vessels) -> tuple[list[CourseRun], list[dict[str, Any]]]:
+    def simulate_vessels(vessels: Vessels) -> tuple[list[CourseRun], list[CourseRow]]:
         course_runs = simulate_course(
             steering, *loop_parts, planned_course, config.course.lookahead, config.duration, vessels
         )
@@ -427,7 +440,7 @@ _TRACK_INTERVAL = 0.1
 """Seconds between the stored samples of a track."""
 
 
-def tabulate_spread(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFrame:
+def tabulate_spread(rows: Sequence[CourseRow], vessels: Vessels) -> pd.DataFrame:
     """Return one line for each simulation of the varied vessels."""
     columns = (
         "model",
@@ -450,7 +463,7 @@ def tabulate_spread(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFram
         "current_east": vessels.current[:, 1],
     }
     return pd.DataFrame(
-        {name: [row[name] for row in rows] for name in columns}
+        {name: [getattr(row, name) for row in rows] for name in columns}
         | {name: values.numpy() for name, values in sampled_values.items()}
     )
 
@@ -517,7 +530,7 @@ def export_model(
     planned_course, guidance = existing_plan or _replan_and_verify(
         config, autopilot_run, run, protocol
     )
-    rows = [row for row in read_json(run.metrics)["rows"] if row["model"] == config.policy]
+    metrics = CourseMetricsFile.read(run.metrics)
     exported = ExportedCoursePolicy(
         config.policy,
         load_policy(autopilot_run, config.policy),
@@ -529,6 +542,8 @@ def export_model(
             "course": config.course.model_dump(mode="json"),
             "protocol": protocol,
         },
-        metrics=[row for row in rows if row["protocol"] == protocol],
+        metrics=[
+            row for row in metrics.rows if row.model == config.policy and row.protocol == protocol
+        ],
     )
     return request.write(exported, stem=name)

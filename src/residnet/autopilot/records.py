@@ -1,0 +1,331 @@
+"""Typed contents of the JSON files that the tasks `autopilot` and `course` write.
+
+The keys are a contract with other programs; values are in SI units and rad.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field
+
+from residnet.core.records import FileRecord, Record
+
+ControllerKind = Literal[
+    "policy",
+    "network",
+    "constants",
+    "law",
+    "untrained",
+    "network_off",
+    "classical",
+    "predictive",
+    "floor",
+]
+"""Roles of controllers in a comparison."""
+
+# metrics.json of the task `autopilot`
+
+
+class Distribution(Record):
+    """Distribution of a metric over simulations.
+
+    Attributes:
+        mean: arithmetic mean.
+        median: median.
+        p95: 95th percentile.
+        max: largest value.
+    """
+
+    mean: float
+    median: float
+    p95: float
+    max: float
+
+
+class HeadingRow(Record):
+    """Metrics of one controller of heading or depth in the simulations of one test.
+
+    Metrics of the heading error are in rad; those of a depth error are in m.
+
+    Attributes:
+        model: name of the controller.
+        kind: role of the controller.
+        split: `simulated`.
+        protocol: name of the test: nominal, corners, random, bias, wind, sea, quiet, conditions, or
+            `beyond_` and the name of further conditions.
+        cost: cost of a change under the conditions in s.
+        time_outside: part of the cost for the time outside the band in s.
+        settling: time in s of the last entry into the band.
+        overshoot: overshoot.
+        iae: integral of the absolute error.
+        travel: travel of the rudder command in rad.
+        energy: integral of the square of the rudder command in rad^2 s.
+        heading_rms: root mean square of the heading error in waves.
+        rudder_rms: root mean square of the rudder in waves.
+        heel_rms: root mean square of the roll angle in waves, for vessels that roll.
+        heading_swing: peak-to-peak error at the end of noise-free simulations.
+        rudder_swing: peak-to-peak rudder command at the end of noise-free simulations.
+        unsettled: number of simulations that end outside the band.
+        cycling: number of noise-free simulations with a limit cycle.
+        n: number of simulations.
+        diverged: number of simulations with a NaN.
+        error_end: largest absolute error at the end of the simulations.
+    """
+
+    model: str
+    kind: ControllerKind
+    split: Literal["simulated"]
+    protocol: str
+    cost: Distribution | None = None
+    time_outside: Distribution | None = None
+    settling: Distribution | None = None
+    overshoot: Distribution | None = None
+    iae: Distribution | None = None
+    travel: Distribution | None = None
+    energy: Distribution | None = None
+    heading_rms: Distribution | None = None
+    rudder_rms: Distribution | None = None
+    heel_rms: Distribution | None = None
+    heading_swing: Distribution | None = None
+    rudder_swing: Distribution | None = None
+    unsettled: int | None = None
+    cycling: int | None = None
+    n: int
+    diverged: int | None = None
+    error_end: float | None = None
+
+    @property
+    def mean_cost(self) -> float:
+        """Mean cost of a change in s, for a row of simulations under conditions."""
+        assert self.cost is not None
+        return self.cost.mean
+
+    @property
+    def max_settling(self) -> float:
+        """Longest settling time in s, for a row of a step test."""
+        assert self.settling is not None
+        return self.settling.max
+
+
+class AutopilotMetricsFile(FileRecord):
+    """metrics.json of the task `autopilot`: metrics of all controllers in all tests.
+
+    Attributes:
+        run: name of the run.
+        channels: unit of each metric.
+        floor: name of the controller that knows the vessel exactly; None without one.
+        flown: settings `test` and `conditions` of the config as simulated, with all times scaled by
+            `pace`.
+        rows: metrics of one controller in one test each.
+    """
+
+    schema_name: Literal["residnet.metrics/1"] = Field(alias="schema")
+    run: str
+    channels: dict[str, str]
+    floor: str | None
+    flown: dict[str, Any]
+    rows: tuple[HeadingRow, ...] = Field(min_length=1)
+
+
+# controllers.json of the task `autopilot`
+
+
+class TurningParameters(Record):
+    """Parameters of Nomoto's model of the vessel.
+
+    Attributes:
+        gain: K in 1/s.
+        time: T in s.
+        speed: speed in m/s at which they hold.
+        righting: restoring of the pitch angle for vessels that dive, in 1/s^2.
+    """
+
+    gain: float
+    time: float
+    speed: float
+    righting: float
+
+
+class ControllerNotes(Record):
+    """Notes on the tuning or training of a controller; trained ones have further keys.
+
+    Attributes:
+        config: config of a classical law with its tuned constants.
+        cost: mean cost of the tuned law in s.
+        tried: number of candidates that the tuning simulated.
+        seconds: duration of the tuning or training in s.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    config: dict[str, Any] | None = None
+    cost: float | None = None
+    tried: int | None = None
+    seconds: float | None = None
+
+
+class ControllersFile(FileRecord):
+    """controllers.json: the controllers of a run of the task `autopilot` with their constants.
+
+    Attributes:
+        turning: Nomoto's model of the vessel.
+        controllers: notes by the name of the controller.
+    """
+
+    schema_name: Literal["residnet.controllers/1"] = Field(alias="schema")
+    turning: TurningParameters
+    controllers: dict[str, ControllerNotes]
+
+
+# metrics.json of the task `course`
+
+
+class CourseRow(Record):
+    """Metrics of one controller and guidance with the nominal vessel on one course.
+
+    Attributes:
+        model: name of the controller.
+        kind: role of the controller.
+        guidance: `course` for the guidance along the plan, or the kind of line of sight.
+        split: `simulated`.
+        protocol: rule for passing the buoys.
+        finished: whether the end of the course was reached within the duration.
+        course_time: duration of the course in s.
+        reference_time: duration in s of the reference course at the service speed.
+        ratio: course time divided by the reference time.
+        ratio_turning: the same with the speed in the tightest turn, for vessels that slow down.
+        cross_track_rms: root mean square of the cross-track error in m.
+        cross_track_max: largest absolute cross-track error in m.
+        travel: travel of the rudder command in rad.
+        tightest_turn: smallest radius of the track in m.
+        distances: smallest distance to each buoy in m.
+        entered: number of circles that were entered, under the rule `enter`.
+        right_side: number of buoys passed on their side, under the rule `sides`.
+        clear: number of buoys passed outside their circles, under the rule `sides`.
+        clearance: smallest distance in m outside a circle, under the rule `sides`.
+        passed: whether all buoys were passed according to the rule.
+        margin: smallest depth in m inside a circle that was entered, or smallest distance in m
+            outside a circle that was passed.
+        n: number of buoys.
+    """
+
+    model: str
+    kind: ControllerKind
+    guidance: str
+    split: Literal["simulated"]
+    protocol: str
+    finished: bool
+    course_time: float
+    reference_time: float
+    ratio: float
+    ratio_turning: float
+    cross_track_rms: float
+    cross_track_max: float
+    travel: float
+    tightest_turn: float
+    distances: tuple[float, ...]
+    entered: int | None = None
+    right_side: int | None = None
+    clear: int | None = None
+    clearance: float | None = None
+    passed: bool
+    margin: float
+    n: int
+
+
+class CourseEnsembleRow(Record):
+    """Metrics of one controller and guidance with random vessels and currents on one course.
+
+    An unfinished simulation counts with its duration.
+
+    Attributes:
+        model: name of the controller.
+        kind: role of the controller.
+        guidance: `course` for the guidance along the plan, or the kind of line of sight.
+        protocol: rule for passing the buoys.
+        reference_time: duration in s of the reference course at the service speed.
+        split: `spread`.
+        n: number of simulations.
+        passed: fraction of the simulations that passed all buoys according to the rule.
+        finished: fraction of the simulations that reached the end of the course.
+        ratio: median of the course time divided by the reference time.
+        ratio_worst: largest of these ratios.
+        margin: median of the margins in m.
+        margin_worst: smallest margin in m.
+        cross_track_rms: median of the root mean square cross-track errors in m.
+    """
+
+    model: str
+    kind: ControllerKind
+    guidance: str
+    protocol: str
+    reference_time: float
+    split: Literal["spread"]
+    n: int
+    passed: float
+    finished: float
+    ratio: float
+    ratio_worst: float
+    margin: float
+    margin_worst: float
+    cross_track_rms: float
+
+
+AnyCourseRow = Annotated[CourseRow | CourseEnsembleRow, Field(discriminator="split")]
+"""A row of metrics.json of the task `course`."""
+
+
+class SmallestTurn(Record):
+    """The smallest steady turn of the vessel, at full rudder.
+
+    Attributes:
+        radius: radius of the track in m.
+        speed: speed in the turn in m/s.
+        yaw_rate: yaw rate in rad/s.
+        step: time step of its simulation in s.
+    """
+
+    radius: float
+    speed: float
+    yaw_rate: float
+    step: float
+
+
+class BuoyFeasibility(Record):
+    """Comparison of the radius of a buoy's circle with the smallest turn of the vessel.
+
+    Attributes:
+        buoy: number of the buoy, from 1 on.
+        radius: radius of the circle in m.
+        smallest: radius of the smallest steady turn in m.
+        possible: whether the vessel can follow the circle.
+    """
+
+    buoy: int
+    radius: float
+    smallest: float
+    possible: bool
+
+
+class CourseMetricsFile(FileRecord):
+    """metrics.json of the task `course`: metrics of all controllers on all courses.
+
+    Attributes:
+        run: name of the run.
+        channels: unit of each metric.
+        speed: service speed of the vessel in m/s.
+        rudder: rudder limit in rad.
+        smallest: the smallest steady turn.
+        feasibility: comparison of each buoy's circle with this turn.
+        rows: metrics of one controller on one course each.
+    """
+
+    schema_name: Literal["residnet.metrics/1"] = Field(alias="schema")
+    run: str
+    channels: dict[str, str]
+    speed: float
+    rudder: float
+    smallest: SmallestTurn
+    feasibility: tuple[BuoyFeasibility, ...]
+    rows: tuple[AnyCourseRow, ...] = Field(min_length=1)
