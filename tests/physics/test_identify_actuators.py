@@ -87,7 +87,8 @@ def test_rate_limit_and_dead_time() -> None:
 
 
 def thrust(n: np.ndarray) -> np.ndarray:
-    return UNIT.thruster_forces.thrust_at(torch.from_numpy(n)[:, None])[:, 0].numpy()  # type: ignore[no-any-return]
+    forces = UNIT.thruster_forces.thrust_at(torch.from_numpy(n)[:, None])
+    return np.asarray(forces[:, 0])
 
 
 def bollard_test(seed: int = 0, noise: float = 5.0) -> Trial:

@@ -20,11 +20,13 @@ from residnet.core.errors import ConfigError
 KeyPath = tuple[str | int, ...]
 """Path to a value of a config: keys of mappings and indices of lists."""
 
-# limits on values, nesting levels and digits of a number: no config is near them, and a file far
-# beyond them would occupy the parser for minutes
+# no config is near these limits, and a file far beyond them would occupy the parser for minutes
 _MAX_VALUES = 200_000
+"""Largest number of values in a file."""
 _MAX_DEPTH = 60
+"""Largest number of nested mappings and lists."""
 _MAX_DIGITS = 400
+"""Largest number of digits of a whole number."""
 _TAG_PREFIX = "tag:yaml.org,2002:"
 # the first match counts: a whole number is also a valid float
 _SCALAR_TAGS: tuple[tuple[str, str, str], ...] = (

@@ -462,6 +462,7 @@ SURGE_SWAY_YAW = DegreesOfFreedom()
 POSE = PLANAR_LAYOUT.pose_columns
 VELOCITIES = PLANAR_LAYOUT.velocity_columns
 MOTION = slice(0, len(PLANAR_LAYOUT.state_names))
+"""Columns of pose and velocities of a planar vessel."""
 ACCELERATIONS = slice(MOTION.stop, MOTION.stop + PLANAR_LAYOUT.n_dof)
 """Columns of the accelerations of a motion, behind pose and velocities."""
 ACTUATORS = slice(MOTION.stop, None)
@@ -470,6 +471,7 @@ DYNAMIC_STATES = slice(POSE.stop, None)
 EXTRA_STATES = slice(MOTION.stop, None)
 """Columns of the dynamic states of a free run behind u, v and r."""
 POSITION = slice(0, PLANAR_LAYOUT.pose.index("psi"))
+"""Columns of the horizontal position."""
 HEADING = PLANAR_LAYOUT.state_names.index("psi")
 SURGE = PLANAR_LAYOUT.state_names.index("u")
 SWAY = PLANAR_LAYOUT.state_names.index("v")

@@ -18,9 +18,11 @@ from typing import Any
 from residnet.core.errors import FitError
 from residnet.core.trust import is_trusted, set_trusted
 
-# parameter numbers of `mallopt` in malloc.h of the GNU C library, which Python does not define
+# numbers of the parameters of `mallopt` in malloc.h of the GNU C library, not defined in Python
 _TRIM_THRESHOLD = -1
+"""M_TRIM_THRESHOLD: bytes of free memory above which it is returned to the system."""
 _MMAP_THRESHOLD = -3
+"""M_MMAP_THRESHOLD: size in bytes from which a block is allocated and returned separately."""
 _MAX_KEPT_BYTES = 128 << 20
 """Freed memory in bytes that the process retains at most."""
 _MAX_REUSED_BYTES = 64 << 20

@@ -57,10 +57,11 @@ READ_NAMES = frozenset(
 )
 """Files at the top of a run folder or model that are read; `RunFiles` checks the others itself."""
 _MAX_ENTRIES = 1_000_000
-_MAX_DEPTH = 32
-"""Maximum number of files and folders in a run folder, and of nested folders. A run has far fewer;
-the limits bound the time that the folder of somebody else can take.
+"""Largest number of files and folders in a run folder. A run has far fewer; the limit bounds the
+time that an untrusted folder can take.
 """
+_MAX_DEPTH = 32
+"""Largest depth of nested folders, for the same reason."""
 _ACCEPT = "if you trust where it comes from, accept it as it is with: residnet trust"
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import accumulate
-from typing import final
+from typing import cast, final
 
 import torch
 from torch import Tensor, nn
@@ -62,14 +62,18 @@ class MeanHead(ResidualHead):
         return torch.stack(residuals).mean(dim=0), torch.cat(memories, dim=-1)
 
     def teacher_forced_residuals(self, z: Tensor) -> Tensor:
-        residuals = [member.teacher_forced_residuals(z) for member in self.members]  # type: ignore[operator]
+        # ModuleList has no type of its members
+        members = cast("Sequence[ResidualHead]", self.members)
+        residuals = [member.teacher_forced_residuals(z) for member in members]
         return torch.stack(residuals).mean(dim=0)
 
     def warmup(self, z: Tensor) -> Tensor:
-        return torch.cat([member.warmup(z) for member in self.members], dim=-1)  # type: ignore[operator]
+        members = cast("Sequence[ResidualHead]", self.members)
+        return torch.cat([member.warmup(z) for member in members], dim=-1)
 
     def memory_bounds(self) -> tuple[Tensor, Tensor]:
-        bounds = [member.memory_bounds() for member in self.members]  # type: ignore[operator]
+        members = cast("Sequence[ResidualHead]", self.members)
+        bounds = [member.memory_bounds() for member in members]
         lower, upper = zip(*bounds, strict=True)
         return torch.cat(lower), torch.cat(upper)
 

@@ -311,7 +311,7 @@ class _SharedPart:
     theta_indices: Sequence[int]
 
     def matrix_of(self, node: Node) -> Node | None:
-        """Return the shared matrix that a node multiplies rows with; None for other nodes."""
+        """Return the matrix of this part that a node multiplies rows with; None for other nodes."""
         return _find_shared_matrix(node, self.nodes)
 
     def bind_to(self, theta: Any) -> dict[Node, Any]:

@@ -49,7 +49,9 @@ from residnet.physics.similarity import (
 
 _AXES = ("X", "Y", "N")
 _FORCE_DIMENSIONS = (Dimension(1, 1, -2), Dimension(1, 1, -2), Dimension(1, 2, -2))
+"""Dimensions of X and Y (N) and of N (N m)."""
 _ACCELERATION_DIMENSIONS = (Dimension(0, 1, -2), Dimension(0, 1, -2), Dimension(0, 0, -2))
+"""Dimensions of the accelerations in surge, sway (m/s^2) and yaw (rad/s^2)."""
 _SYSTEMS: tuple[SystemName, ...] = ("prime_i", "prime_ii", "bis")
 _NORMAL_95 = 1.959964
 """Quantile of the standard normal distribution for 95 % intervals."""

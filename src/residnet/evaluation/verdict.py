@@ -128,8 +128,11 @@ Both limits apply to the upper limit of the prediction interval; twice the noise
 any case. The values are a convention of residnet, and the verdict states them.
 """
 _MAX_LIMITED_DISTANCE_SHARE = 0.25
+"""Largest position error of a model of limited use, as a share of the distance travelled."""
 _MAX_LIMITED_ANGLE_ERROR = math.radians(30.0)
-"""The same for a model of limited use; it must be better than constant velocity, too."""
+"""Largest heading error of a model of limited use in rad; it must be better than constant velocity,
+too.
+"""
 _POSE_ERROR_SUFFIXES = {"depth": " of depth", "attitude": " of attitude"}
 """Suffixes of pose errors other than horizontal position and heading."""
 _MAX_RATIO_TO_BEST = 1.5

@@ -180,8 +180,9 @@ class SklearnHead(ClosedFormHead):
         return torch.from_numpy(np.stack(predictions, axis=1)).to(x)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        standardised_residual: Tensor = _PredictFunction.apply(self.features(z), self)  # type: ignore[no-untyped-call]
-        return self.scale(standardised_residual), s
+        # Any: PyTorch does not type the method `apply`
+        predict: Any = _PredictFunction.apply
+        return self.scale(predict(self.features(z), self)), s
 
     def parameter_counts(self) -> list[float]:
         """Return the number of training samples per axis, which bounds the degrees of freedom."""

@@ -40,7 +40,9 @@ their scale in a direction count as if they varied by 1 %.
 _MAX_SAMPLES: Final = 200_000
 """Samples of all logs that are used, about; they bound time and memory of the estimate."""
 _MIN_SAMPLES_PER_LOG: Final = 1_000
+"""Samples of a log that are used at least, even if there are very many logs."""
 _MAX_FOLDS: Final = 10
+"""Largest number of folds of the cross-validation over logs."""
 _MIN_LOGS: Final = 3
 """Number of logs below which parts of logs, not complete logs, are held out."""
 _NEW_EXTREME_SHARE: Final = 0.01

@@ -72,7 +72,7 @@ class FittedModel:
 
     @property
     def name(self) -> str:
-        """Name of the model."""
+        """Name in the config, in tables and in file names."""
         return self.spec.name
 
 

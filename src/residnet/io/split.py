@@ -491,6 +491,7 @@ def hash_measured_rows(log: Log, channels: Sequence[str]) -> np.ndarray:
 
 
 _ROWS_PER_HASH_CHUNK = 250_000
+"""Number of rows that are hashed at once; bounds the memory for copies of the channels."""
 
 
 def hash_rows(log: Log, channels: Sequence[str]) -> np.ndarray:

@@ -77,7 +77,7 @@ class Helm:
 
     @classmethod
     def from_plant(cls, plant: Plant) -> Helm:
-        """Return the helm of a plant."""
+        """Build the conversion of demands to commands for the actuators of a plant."""
         import torch
 
         from residnet.physics.actuators.base import ForceActuators

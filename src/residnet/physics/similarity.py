@@ -70,6 +70,7 @@ class Dimension(NamedTuple):
 
 
 DIMENSIONLESS = Dimension(0, 0, 0)
+"""Dimension of ratios and angles."""
 _DIMENSION_OF_UNIT = {
     "-": DIMENSIONLESS,
     "rad": DIMENSIONLESS,

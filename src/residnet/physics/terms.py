@@ -50,7 +50,7 @@ class Factor(NamedTuple):
 
     @property
     def term_text(self) -> str:
-        """Text of the factor in a term."""
+        """Channel or function with magnitude and power, such as `|v|^2`."""
         base = f"|{self.name}|" if self.magnitude else self.symbol
         return base if self.power == 1 else f"{base}^{self.power}"
 

@@ -25,9 +25,11 @@ from residnet.preprocessing.compatibility.sensors import CURRENT_NAMES, Sensor, 
 from residnet.quality.records import CompatibilityRow, CurrentTest, InstrumentErrorRow
 
 _MAX_NODES = 300
+"""Largest number of nodes of a reconstruction; bounds the computing time of the check."""
 _STEP_SHARE = 0.3
 """Step between nodes over the time scale of the yaw rate."""
 _MAX_CURRENT_P_VALUE = 1e-3
+"""Largest p-value of a significant current."""
 _MIN_CURRENT_SHARE = 0.02
 """Smallest current that is listed as significant, as a share of the speed."""
 

@@ -60,7 +60,9 @@ POLYNOMIAL_PREFERENCE = 0.95
 # (scripts/bench/fleets.py --seed 1, 2)
 MAX_SCORE_TEST = 4.8
 MAX_RMSE_RATIO = 1.8
+"""Ratio of a log's error to that of the other logs above which it can be an outlier."""
 MAX_RMSE_Z = 5.5
+"""The same limit for the logarithm of this ratio, in its standard deviations among the logs."""
 USUAL_SCORE_TEST = 1.3
 """Expected score test of a correct model: mean of the largest of three chi over their size."""
 MIN_LOG_RMSE_STD = 0.1
@@ -835,9 +837,11 @@ class Hypothesis:
 
 
 SCALE_FACTORS = (0.2, 0.33, 0.5, 0.67, 0.8, 1.25, 1.5, 2.0, 3.0, 5.0)
+"""Candidate scale errors of a channel."""
 SHIFTS = (-2.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 2.0)
 """Candidate delays in block lengths, and offsets in standard deviations of the input."""
 HEADING_STEP = math.radians(10.0)
+"""Step in rad between candidate offsets of the heading."""
 MANY_PARAMETERS_PENALTY = 2.0
 """Factor on the deviance of `vessel`, whose several factors fit more by chance than one."""
 LINKED_CORRELATION = 0.9
@@ -1144,6 +1148,7 @@ MIN_UNSTEERED_SHARE = 0.3
 # straight runs; in steered fleets at least three of ten logs do it.
 MIN_SWING = math.radians(20.0)
 MIN_WEAVING_SHARE = 0.2
+"""Share of logs with such a heading from which a fleet was steered."""
 
 
 def find_dead_steering(consensus: Consensus) -> tuple[list[str], float]:

@@ -423,9 +423,10 @@ def _section_bounds(n_rows: int) -> np.ndarray:
     return section_indices * section_length + np.minimum(section_indices, n_longer)
 
 
-# shortest block in samples and in s
 _MIN_BLOCK_SAMPLES = 16
+"""Smallest number of samples of a block."""
 _MIN_BLOCK_DURATION = 3.0
+"""Shortest duration of a block in s."""
 # number of blocks that overlap each sample
 _BLOCK_OVERLAP = 4
 # largest number of blocks, evenly spread over a long log

@@ -397,9 +397,10 @@ def _moves_after_run(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
     return np.asarray((stops < changes.size - 3) & is_large_step)
 
 
-# smallest share of repeated rows that is reported, and the longest run of repeats in rows
 _MIN_REPEATED_SHARE = 0.1
+"""Smallest share of repeated rows that is reported."""
 _MAX_REPEAT = 5
+"""Number of repeats in succession from which the check of frozen sensors applies instead."""
 
 
 @check(
@@ -448,9 +449,10 @@ def check_repeated_positions(log: LogStatistics, make_finding: Check) -> Iterato
     )
 
 
-# shortest straight stretch, in samples and in s
 _MIN_STRAIGHT_SAMPLES = 8
+"""Smallest number of samples of a straight stretch."""
 _MIN_STRAIGHT_DURATION = 1.0
+"""Shortest duration of a straight stretch in s."""
 # largest straight share; above it, straight lines are the normal behaviour of the channel
 _MAX_STRAIGHT_SHARE = 0.4
 

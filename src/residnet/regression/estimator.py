@@ -300,7 +300,7 @@ def require_overdetermined(x: Regressors, subject: str) -> None:
 
 
 def default_fold_count(groups: Tensor) -> int | None:
-    """Return `DEFAULT_FOLDS`, or the number of groups if it is lower; None for a single group."""
+    """Return the default number of folds for samples with these group numbers [N]."""
     return count_default_folds(torch.unique(groups).numel())
 
 

@@ -162,7 +162,7 @@ def _accumulate_r_factor(
 
 
 def _qr_factor(matrix: Tensor) -> Tensor:
-    """Return the R factor of a QR factorisation."""
+    """Return the upper triangular R of a matrix = Q R; Q is not computed."""
     factor: Tensor = torch.linalg.qr(matrix, mode="r")[1]
     return factor
 

@@ -9,8 +9,9 @@ import numpy as np
 import scipy
 
 SIGN_LEVEL = 0.05
+"""Significance level of the test for a wrong sign."""
 GAIN_LEVEL = 0.001
-"""Significance levels of a wrong sign and of different gains.
+"""Significance level of the test for different gains.
 
 Gains are tested at a stricter level than usual, because the linear model is only approximately that
 of a vessel and its errors change a gain slightly, but never a sign.
@@ -20,6 +21,7 @@ _MAX_ROWS = 20_000
 _MAX_RATIO = 4.0
 """Largest ratio of gains that is searched; a larger one is a failed actuator."""
 _N_RATIOS = 25
+"""Number of ratios of gains in the grid search, spaced logarithmically."""
 _MIN_ASTERN_SHARE = 0.05
 """Share of samples of each sign from which thrust astern has coefficients of its own.
 

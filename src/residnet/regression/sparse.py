@@ -206,7 +206,7 @@ def merge_similar_columns(reduced: ReducedProblem, resolution: float) -> Reduced
 
 
 def _r_factor(x: np.ndarray) -> np.ndarray:
-    """Return the R factor of a QR factorisation."""
+    """Return the upper triangular R of x = Q R; Q is not computed."""
     return np.asarray(np.linalg.qr(x, mode="r"))
 
 

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 _FONT = "12px"
 _LETTER_WIDTH = 6.5
+"""Width in pixels of a letter in this font."""
 _MIN_PANEL_WIDTH = 260.0
-"""Font of texts, width of a letter in this font, and minimum width of the area between the axes of
-a panel (on a phone), in pixels.
-"""
+"""Smallest width in pixels of the area between the axes of a panel, on a phone."""
 _DASHES: dict[str, Any] = {"long": [10, 4], "short": [4, 3], "dense": [8, 3, 2, 3, 2, 3]}
+"""Lengths in pixels of dashes and gaps by the names of the line styles of `GlyphStyle`."""
 _MARKERS = {"o": "circle", "s": "square", "x": "x", "^": "triangle"}
 
 

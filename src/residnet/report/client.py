@@ -31,6 +31,7 @@ CLIENT_TEMPLATE = "client"
 """Name of the template that comes with residnet."""
 _LOGO_SUFFIXES = (".svg", ".png", ".jpg", ".jpeg", ".pdf")
 _MAX_LOGO_BYTES = 5_000_000
+"""Size in bytes above which a logo is refused; it is copied into the report."""
 _FIGURES = {
     "track": "Free runs on held-out records: measured track and track of the model.",
     "booklet_zigzags_1": (

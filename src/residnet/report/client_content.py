@@ -50,6 +50,7 @@ _MAIN_INDICES = {
 _COMPARED_INDICES = ("advance", "tactical_diameter", "steady_diameter", "first_overshoot",
                      "second_overshoot", "period")  # fmt: skip
 _SHIP_EXPONENTS = {"m": 1.0, "s": 0.5, "m/s": 0.5, "rad/s": -0.5}
+"""Exponents of the length ratio by unit, from model scale to the ship at equal Froude number."""
 _MAX_DERIVATIVES = 30
 """Largest number of rows of the table of derivatives; further ones are in derivatives.json."""
 

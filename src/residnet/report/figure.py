@@ -74,11 +74,14 @@ MAX_PREVIEW_HEIGHT = 280
 of a table on the screen of a phone.
 """
 MEASURED_STYLE = GlyphStyle("measured", width=0.7, z_order=2)
+"""Style of measured values, thin below the curves of models."""
 SOLID_STYLE = GlyphStyle("", BLUE, width=1.6)
+"""Style of the first of two curves that are compared."""
 DASHED_STYLE = GlyphStyle("", ORANGE, "dashed", 1.6, z_order=4)
-"""Styles of two curves that are compared, distinguished by colour and line style."""
+"""Style of the second of them, distinguished by colour and line style."""
 MASKED_STYLE = GlyphStyle("masked", "#E0E0E0", kind="vspan", alpha=0.8, z_order=0)
 START_STYLE = GlyphStyle("start", kind="points", size=6, is_hollow=True, z_order=6)
+"""Style of the start of a track, a ring above all curves."""
 ZERO_LINE_STYLE = GlyphStyle("", "#666666", width=0.8, kind="hline", z_order=1)
 
 

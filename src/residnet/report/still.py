@@ -24,6 +24,7 @@ pt.
 INLINE_WIDTH = 3.7
 """Width of a drawing of the first screen in inches, that of a phone: text has at least 11 px."""
 _INLINE_MAP_HEIGHT = 1.9
+"""Height in inches of a map in a drawing of the first screen."""
 _MAX_INLINE_WIDTH = 5.0
 """Width in inches to which a drawing grows on a large screen."""
 _MAP_HEIGHT = 4.2
@@ -37,6 +38,7 @@ _DASHES: dict[str, Any] = {
     "short": (0, (2, 1)),
     "dense": (0, (4, 1, 1, 1)),
 }
+"""Line styles of matplotlib by the names of the line styles of `GlyphStyle`."""
 # Any: matplotlib types the keys as a closed set of literals
 RC_PARAMS: Any = {
     # names of logs may hold a dollar sign

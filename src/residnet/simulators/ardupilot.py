@@ -25,6 +25,7 @@ from residnet.core.progress import log_message
 from residnet.simulators.vehicle import Vehicle
 
 _PACKET_FORMATS = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
+"""Formats of a packet by its first number: 16 or 32 servo outputs."""
 _GRAVITY = 9.80665
 """Standard gravity in m/s^2, as used by ArduPilot for accelerometers."""
 _PULSE_RANGE = (800, 2200)

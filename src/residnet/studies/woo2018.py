@@ -50,6 +50,7 @@ MODEL_STYLES = {
     "lstm_rate": GlyphStyle("LSTM as printed, rate 1e-3", VERMILLION, "long", 1.3),
     "lstm": GlyphStyle("LSTM, free-run training", BLUE, width=1.3),
 }
+"""Style of each model of the config in the figures."""
 MANOEUVRE_KINDS = ("zigzag", "acceleration_deceleration", "three_two_one_one")
 """Kinds of manoeuvre that the figures show."""
 _SIMPLE_MODELS = ("nomoto", "nomoto_side_slip", "baseline")

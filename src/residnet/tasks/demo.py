@@ -56,6 +56,7 @@ DEMO_TRIALS: dict[str, Any] = {
     "identification": {"zigzag": 6, "constant": 3, "three_two_one_one": 3},
     "validation": {"zigzag": 2, "constant": 1, "three_two_one_one": 1},
 }
+"""Config of the simulated trials of the demonstration logs."""
 COLUMN_NAMES = {
     "x": ("north [m]", 1.0),
     "y": ("east [m]", 1.0),
@@ -68,6 +69,7 @@ COLUMN_NAMES = {
     "wind_speed": ("true wind speed [kn]", 3600.0 / 1852.0),
     "wind_dir": ("true wind direction [deg]", 180.0 / np.pi),
 }
+"""Column of each channel in the demonstration logs, and the factor from SI to its unit."""
 BASIN_FOLDER = "basin"
 """Folder of the workbooks of a model basin."""
 BASIN_SCALE = 50.0

@@ -65,6 +65,7 @@ _CONFIG_UNIONS: dict[str, Any] = {
     "formats": EXPORT_FORMATS,
 }
 _AGE_UNITS = (("d", 86_400.0), ("h", 3_600.0), ("min", 60.0), ("s", 1.0))
+"""Units in which the age of a run is shown, with their length in s; the first below it is used."""
 
 
 def load_task(path: Path, overrides: Sequence[str] = ()) -> Task:

@@ -86,6 +86,7 @@ EXAMPLE_TIME_STEP = 0.1
 
 
 _DERIVATIVE_SETTINGS = {"kind": "savitzky_golay", "window": 1.1, "order": 2}
+"""Derivative of the example samples: parabolas over 11 samples."""
 
 
 @functools.cache
@@ -922,6 +923,7 @@ _FREE_STEPS = 8
 _BAD_STEP_INDEX = 3
 """Index of the step with bad values; all other steps have valid values."""
 _FAR_VALUES = (1e38, -1e38, 1e20, -1e20, 1e9, -1e9, 1e5)
+"""Finite values far outside any range, up to the largest ones of single precision."""
 _BAD_VALUES = (float("nan"), float("inf"), float("-inf"), *_FAR_VALUES)
 """Bad values of an entry, in addition to random multiples of the limits of its range."""
 

@@ -37,8 +37,9 @@ _MIN_ROUND_GAIN = 0.1
 _CONVERGED_STEP = 1e-4
 """Largest change of a current in m/s at which Gauss-Newton has converged."""
 _MAX_P_VALUE = 0.01
+"""Largest p-value of a significant current, for all logs together (Bonferroni)."""
 _MIN_SPEED_SHARE = 0.02
-"""Largest p-value and smallest share of the speed of a significant current."""
+"""Smallest speed of a significant current, as a share of the speed of the vessel."""
 
 
 def estimate_currents(

@@ -438,8 +438,9 @@ def find_depth_channels(columns: Sequence[str], known_channels: Collection[str])
 
 
 _MIN_SUBMERGED_SHARE = 0.9
+"""Share of negative samples above which a vertical position of a diving vessel points up."""
 _MIN_SUBMERGED_DEPTH = 0.1
-"""Share of the samples, and median in m, below zero of a vertical position that points up."""
+"""Smallest depth in m of its median, so that a vessel at the surface does not count as diving."""
 
 
 def is_vertical_axis_up(
@@ -1188,7 +1189,7 @@ class ChannelMapper:
         return str(scaling.settings["unit"])
 
     def _make_entry(self, name: str) -> dict[str, Any]:
-        """Return the entry of a channel."""
+        """Return column, unit and frame of a channel for the channel map of a reader."""
         column = self._names[name]
         entry: dict[str, Any] = {"column": column}
         if self._degrees_per_count and name in ("x", "y"):

@@ -97,6 +97,7 @@ _DOTTED_TIME_PATTERN = r"^\d\d?\.\d\d\.\d\d[.,]"
 """Start of a time of day with points between its parts."""
 _ANGLE_FORMS: tuple[AngleForm, ...] = ("number", "ddmm")
 _MAX_ANGLE = {"latitude": 90.0, "longitude": 180.0}
+"""Largest absolute value of a coordinate in deg."""
 _HEMISPHERES = {"latitude": {"N", "S"}, "longitude": {"E", "W", "O"}}
 ColumnSettings = Mapping[str, Mapping[str, Any]]
 """Column -> further settings of its entry in a channel map."""
@@ -944,7 +945,8 @@ _FORCE_AXES = {
 
 
 _WRENCH_PATTERN = re.compile(
-    r"(?P<stem>(?:.*[\W_])?)(?P<quantity>force|torque|moment)s?[\W_]*(?P<axis>[xyz])(?:[\W_]*\[.*\])?",
+    r"(?P<stem>(?:.*[\W_])?)(?P<quantity>force|torque|moment)s?[\W_]*(?P<axis>[xyz])"
+    r"(?:[\W_]*\[.*\])?",
     re.IGNORECASE,
 )
 _WRENCH_AXES = {("force", "x"): "tau_x", ("force", "y"): "tau_y", ("moment", "z"): "tau_n"}

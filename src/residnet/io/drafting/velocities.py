@@ -28,13 +28,17 @@ _MIN_IMPROVEMENT = 0.5
 _CONSISTENT_SHARE = 0.1
 """Unexplained share below which columns have the meaning of their names."""
 _MAX_COMPARED_LOGS = 2
+"""Largest number of logs in the comparison by evidence, those with most yaw."""
 _MAX_NODES = 300
+"""Largest number of nodes of a log in that comparison; bounds its computing time."""
 _NODE_STEP = 0.5
-"""Logs, nodes and smallest step in s of the comparison by evidence."""
+"""Smallest step between nodes in s."""
 _N_WINDOWS = 12
 """Windows of a log over which velocities are integrated."""
 _MIN_HEADING_OFFSET = np.radians(2.0)
+"""Heading offset in rad below which none is reported."""
 _MAX_HEADING_OFFSET = np.radians(40.0)
+"""Angle between velocities and positions in rad above which it is no offset of a compass."""
 
 
 class Meaning(NamedTuple):

@@ -26,6 +26,7 @@ _ANGLE_PATTERN = (
     r"[\s,]*(?P<tail>[NSEWOnsewo])?\s*$"
 )
 _HEMISPHERE_SIGNS = {"n": 1.0, "e": 1.0, "s": -1.0, "w": -1.0}
+"""Sign of a coordinate by the letter of its hemisphere."""
 _HEMISPHERES_OF_CHANNEL = {"latitude": "ns", "longitude": "ew"}
 _ACCEPTED_FORMS = (
     "; accepted are 59.90535, 59°54.321'N, 59 54 19.3 N and, with `form: ddmm`, 5954.321"

@@ -33,8 +33,9 @@ from residnet.preprocessing.statistics import OverlappingBlocks
 _MIN_OVERLAP = 0.5
 """Smallest overlap of two logs while a clock offset is searched, as share of the shorter one."""
 _COARSE_STEP = 0.5
+"""Step in s of the coarse search of a clock offset."""
 _FINE_STEP = 0.05
-"""Steps in s of the coarse search of a clock offset, and of the fine search around its optimum."""
+"""Step in s of the fine search around the optimum of the coarse one."""
 _MIN_VARIANCE_RATIO = 1.5
 """Smallest ratio of unexplained variances, of the best alternative offset to the optimum."""
 _MIN_ALTERNATIVE_OFFSET = 3.0

@@ -39,8 +39,12 @@ _MAX_UNIT_LINES = 3
 # chunks of this size stay in the processor's cache while they are parsed
 _CHUNK_ROWS = 20_000
 _HEAD_BYTES = 1 << 16
+"""Number of bytes at the start from which the format is detected, and at the end for the last line.
+"""
 _BLOCK_BYTES = 1 << 18
+"""Size in bytes of the blocks in which a file is split into lines."""
 _SCAN_BYTES = 1 << 20
+"""Size in bytes of the blocks in which a file is searched for bytes that are not UTF-8."""
 _COMMENT_SIGNS = (b"#", b"%", b"//")
 _COMMENT_PREFIX = re.compile(r"\s*(?:#|%|//)\s+")
 _NUMBER = re.compile(

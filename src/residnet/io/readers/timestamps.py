@@ -24,10 +24,13 @@ DateOrder = Literal["dmy", "mdy", "ymd"]
 
 _NS_PER_SECOND = 10**9
 _DAY_NS = 86_400 * _NS_PER_SECOND
-# Unix time of 1990 and 2090, s
+"""Length of a day in ns."""
 _UNIX_MIN = 631_152_000
+"""Unix time in s of the year 1990; smaller numbers are no dates."""
 _UNIX_MAX = 3_786_912_000
+"""Unix time in s of the year 2090; larger numbers are no dates."""
 _TICKS_PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
+"""Number of units per second by the unit of a Unix time."""
 _DATE_PARTS = (
     r"(?:(?P<a>\d{1,4})\s*(?P<mark>[-./年])\s*(?P<b>\d{1,2}|[^\W\d_]{3,9}\.?)\s*[-./月]\s*"
     r"(?P<c>\d{1,4})日?|(?P<packed>\d{8}))"

@@ -24,12 +24,14 @@ _QUARTER_HOUR = 900.0
 _PROMPT_QUANTILE = 0.01
 # smaller offsets are delays of the transport, not offsets of a clock, s
 _MIN_OFFSET = 0.1
-# limits for the correction of unordered rows by sorting: their share, and the step back in s
 _MAX_UNORDERED_SHARE = 0.01
+"""Largest share of unordered rows that sorting corrects."""
 _MAX_BACKWARD_STEP = 1.0
-# a gap is longer than both: so many median steps, and so many seconds
+"""Longest backward step of the time in s that sorting corrects."""
 _GAP_STEPS = 5.0
+"""Length in median steps above which a step is a gap, if it is also longer than `_GAP_SECONDS`."""
 _GAP_SECONDS = 0.5
+"""Length in s above which a step can be a gap."""
 # fewest rows for checks of publishers, lags and lever arms
 _MIN_ROWS = 100
 # shortest step of the grid on which lags are estimated, s

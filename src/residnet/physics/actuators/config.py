@@ -253,7 +253,7 @@ class ActuatorConfig(Config, ABC):
 
     @abstractmethod
     def command_names(self) -> tuple[str, ...]:
-        """Return the names of the commands."""
+        """Return the channels that command the actuators, such as `cmd_delta`."""
 
     @property
     def can_dive(self) -> bool:
@@ -267,7 +267,7 @@ class ActuatorConfig(Config, ABC):
 
     @abstractmethod
     def build(self) -> ActuatorSystem:
-        """Build the actuators."""
+        """Build the model of the forces and the dynamics of the actuators."""
 
 
 class CommandSpec(NamedTuple):

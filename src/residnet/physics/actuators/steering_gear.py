@@ -30,6 +30,7 @@ _MAX_DELAY = 5.0
 _MAX_SAMPLES = 20_000
 """Largest number of samples of a fit; further logs are left out."""
 _NORMAL_95 = 1.959964
+"""Quantile of the standard normal distribution for 95 % intervals."""
 
 
 class GearParameter(NamedTuple):

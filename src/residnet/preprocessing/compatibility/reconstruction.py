@@ -38,14 +38,15 @@ from residnet.preprocessing.compatibility.sensors import (
 )
 
 _COMPLEX_STEP = 1e-20
+"""Imaginary step of complex-step derivatives, whose error is of the order of its square."""
 _STUDENT_DOF = 5.0
 """Degrees of freedom of the Student distribution of the measurement noise."""
 _MAX_ITERATIONS = 25
+"""Largest number of Gauss-Newton iterations."""
 _CURVATURE_ITERATIONS = (4, 8)
+"""Iterations in which the gradient of the curvature is updated."""
 _CURVATURE_STEP = 1e-3
-"""Maximum number of iterations, iterations in which the gradient of the curvature is updated, and
-step of its difference quotient.
-"""
+"""Step of the difference quotient of this gradient."""
 _N_PROBES = 3
 """Number of random vectors per noise level in the stochastic estimate of a trace."""
 _N_SECTIONS = 20
@@ -65,12 +66,13 @@ _MAX_GROWTH = 3.0
 _STANDARD_ERROR_FACTOR = 1.2
 """Factor on standard errors for coverage of 95 % in simulated draws (scripts/bench/coverage.py)."""
 _MAX_NODES = 20_000
+"""Largest number of nodes."""
 _MIN_SAMPLES = 20
+"""Smallest number of samples of a sensor."""
 _HEADING_WINDOW = 1.0
+"""Window in s of the polynomials for the initial heading and yaw rate."""
 _VELOCITY_WINDOW = 2.0
-"""Largest number of nodes, smallest number of samples of a sensor, and windows in s of the
-polynomials for the initial heading and velocities.
-"""
+"""Window in s of the polynomials for the initial velocities."""
 _POSE_TOLERANCES = (1e-7, 2e-6)
 """Standard deviations in rad and m of the integration over a step, so that it is invertible."""
 

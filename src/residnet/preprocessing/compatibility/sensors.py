@@ -14,6 +14,7 @@ import numpy as np
 
 X, Y, PSI, U, V, R, U_DOT, V_DOT, R_DOT = range(9)
 N_STATES = 9
+"""Number of states of a node: pose, velocities and accelerations of a planar vessel."""
 DERIVATIVE_OF = {PSI: R, U: U_DOT, V: V_DOT, R: R_DOT}
 
 SensorKind = Literal[

@@ -73,12 +73,11 @@ _MAX_SEPARATE_FLIGHTS = 12
 of each kind has them.
 """
 _MAX_CASES = 30
+"""Largest number of manoeuvres in the interactive figure; limits the page to a few megabytes."""
 _MAX_PANELS = 12
+"""Largest number of panels in the interactive figure, for the same reason."""
 _MAX_ZIGZAGS = 6
-"""Maximum number of manoeuvres and panels in the interactive figure and of zigzags in an image.
-
-They limit the page to a few megabytes and an image to one page.
-"""
+"""Largest number of zigzags in an image, so that it fits on one page."""
 _INDEX_TITLES = {
     "time_90": "time to 90 deg",
     "time_180": "time to 180 deg",

@@ -38,6 +38,7 @@ added to one curve.
 """
 _SPLITS = ("train", "validation")
 _RING_STYLE = GlyphStyle("", kind="points", size=7, is_hollow=True, z_order=5)
+"""Style of the rings that mark the selected point of a curve."""
 _MIN_WHITE_NOISE_P = 0.05
 """Smallest p-value at which residuals count as white noise."""
 

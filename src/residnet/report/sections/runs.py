@@ -40,12 +40,11 @@ from residnet.report.run_reader import RunFiles, StoredWindow
 DisplayUnits: TypeAlias = Mapping[str, tuple[str, str, float]]
 """SI unit, display unit and factor from SI to the display unit, by channel."""
 _MAX_CASES = 12
+"""Largest number of windows in the interactive figure; limits the page to a few megabytes."""
 _MAX_STATIC_IMAGES = 6
+"""Largest number of windows with an image, for the same reason."""
 _MAX_TIME_BINS = 60
-"""Maximum number of windows in the interactive figure and in images, and points of an error curve.
-
-They limit the page to a few megabytes and keep the curve smooth.
-"""
+"""Largest number of points of an error curve, so that it is smooth."""
 _TRACK_PANEL = Panel("north [m]", "east [m]", kind="map", height=380)
 _N_OPENING_PANELS = 3
 """Number of motion panels on the first screen: surge, sway and yaw rate of a planar vessel."""

@@ -31,8 +31,9 @@ _MAX_OPEN_COMBINATION = 1e-3
 
 
 _MASS = 5e3
+"""Typical mass in kg, the scale of the parameters with this unit."""
 _INERTIA = 2e4
-"""Typical mass in kg and typical moment of inertia in kg m^2."""
+"""Typical moment of inertia in kg m^2, the scale of the parameters with this unit."""
 PARAMETERS: dict[str, tuple[float, float, float]] = {
     "I_z": (1e3, 1e7, _INERTIA),
     "X_udot": (-1e6, 0.0, _MASS),

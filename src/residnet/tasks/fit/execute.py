@@ -307,7 +307,7 @@ def scale_run(
     overwrite: bool,
 ) -> FinishedRun:
     """Write the run of another scale; see `FitConfig.scale_run`."""
-    from residnet.tasks.fit.scaling import scale_run as write_scaled_run
+    from residnet.tasks.fit.scaling import write_scaled_run
 
     return write_scaled_run(
         config, run, output_folder, scaling, effects, model_names, overwrite=overwrite

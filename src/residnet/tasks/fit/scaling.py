@@ -44,7 +44,7 @@ LOG_FOLDER = "logs"
 """Folder of the scaled logs in the run folder."""
 
 
-def scale_run(
+def write_scaled_run(
     config: FitConfig,
     run: RunFolder,
     output_folder: Path,
@@ -54,7 +54,7 @@ def scale_run(
     *,
     overwrite: bool = False,
 ) -> FinishedRun:
-    """Write a run whose models and logs are those of another run at another scale.
+    """Scale the models and logs of a fit and write them into a new run folder.
 
     Args:
         config: config of the fit.

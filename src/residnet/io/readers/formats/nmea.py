@@ -42,6 +42,7 @@ _TIME_PREFIX = re.compile(
     r"|\d{1,2}:\d\d:\d\d[\d.,]*|\d{9,}(?:\.\d+)?"
 )
 _UNIT_FACTORS = {"rate_of_turn": 1.0 / 60.0}
+"""Factors to the unit of a channel by field: NMEA 0183 has the rate of turn in deg/min."""
 _DAY_NS = 86_400 * 10**9
 _HEAD_BYTES = 1024
 """Number of bytes from which the encoding is detected (a dozen sentences)."""

@@ -180,7 +180,7 @@ class _TopicBuffer:
         self.buffer.add(arrival, field_values)
 
     def to_raw_series(self) -> RawSeries:
-        """Return the series of the topic."""
+        """Return the appended messages as arrays, with a remark if time stamps are missing."""
         stamps = np.frombuffer(self._stamp, dtype=np.int64)
         sender = None
         if len(self._senders) > 1 or next(iter(self._senders), ""):

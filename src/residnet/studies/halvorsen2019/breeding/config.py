@@ -16,12 +16,14 @@ SettingValue = int | float | str
 Matrix = tuple[tuple[float | None, ...], ...]
 SignalRecord = dict[str, np.ndarray]
 CHANNELS = ("x", "u", "tau_x")
+# The system m x_ddot + d x_dot + k x = tau (4.1) with the values of section 5.3, (5.13); the system
+# of (4.3) has other values: 20 kg, 10 kg/s, 12 N/m (see H24 in docs/documents/corrections.md).
 MASS = 10.0
+"""Mass m in kg."""
 DAMPING = 13.0
+"""Damping d in kg/s."""
 STIFFNESS = 5.0
-"""The system m x_ddot + d x_dot + k x = tau (4.1) in kg, kg/s and N/m (section 5.3, (5.13)); the
-system of (4.3) has other values: 20 kg, 10 kg/s, 12 N/m (see H24 in docs/documents/corrections.md).
-"""
+"""Stiffness k in N/m."""
 TRUE_COEFFICIENTS = {"tau_x": 1.0 / MASS, "u": -DAMPING / MASS, "x": -STIFFNESS / MASS}
 """True coefficients of u_dot (4.2) by term."""
 

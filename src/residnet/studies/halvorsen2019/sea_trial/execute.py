@@ -83,6 +83,7 @@ SET_NAMES = {
     SPEED_REGIMES[2]: "planing phase",
     ALL: "all phases",
 }
+"""Names of the sets of samples in sentences."""
 _LEAST_SAMPLES = 500
 """Smallest number of samples of a phase for a fit and an evaluation."""
 _STANDARD_PARAMETERS = (4.0, 8.0, 8.0)

@@ -75,15 +75,13 @@ from residnet.studies.study import (
     join_numbers,
 )
 
+# a model is invalid on an axis if it exceeds the first two limits in this share of the segments
 _MAX_RESIDUAL_GROWTH = 4.0
+"""Largest ratio of the mean square residual to that of the log of the identification."""
 _MIN_VARIANCE_SHARE = 0.02
+"""Mean square residual, as a share of the variance of the force, below which it is negligible."""
 _MIN_SEGMENT_SHARE = 0.5
-"""Criteria for an invalid model on one axis.
-
-Growth of the mean square residual, smallest share of the variance of the force, and share of
-segments in which both are exceeded. The share of segments excludes a single event such as a gust or
-a wake.
-"""
+"""Share of segments, so that a single event such as a gust or a wake does not count."""
 _DIVERGENCE_FACTOR = 3.0
 """A free run has diverged above this multiple of the largest velocities of the true ferry."""
 

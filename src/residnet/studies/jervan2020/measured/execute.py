@@ -73,9 +73,11 @@ from residnet.studies.study import (
 )
 
 _FORCE_UNITS = tuple((label, 1.0) for label in ("surge [N]", "sway [N]", "yaw [N m]"))
+"""Labels of the panels with forces, and factors from SI."""
 _ACCELERATION_UNITS = tuple(
     (label, 1.0) for label in ("surge [m/s²]", "sway [m/s²]", "yaw [rad/s²]")
 )
+"""Labels of the panels with accelerations, and factors from SI."""
 
 
 def check(config: ForceResidualConfig) -> None:
