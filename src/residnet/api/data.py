@@ -444,29 +444,13 @@ def prepare(
                 prepared, settings_from.signals, settings_from.prepare, settings_from.evaluation
             )
         splits, source = _resolve_splits(logs)
-        velocities = settings.get("velocities")
-        dof_of_logs = [
-            DegreesOfFreedom.from_channels(log.channels)
-            for members in splits.values()
-            for log in members
-        ]
-        dof = DegreesOfFreedom.intersection(dof_of_logs)
-        if velocities is not None:
-            dof = validate_config(
-                {"inputs": [], "velocities": to_builtin(velocities)}, SignalsConfig, "prepare"
-            ).dof
+        dof = _find_velocities(splits, settings.get("velocities"))
         complete_logs = {
             name: [complete_motion(log, MotionConfig(), dof) for log in members]
             for name, members in splits.items()
         }
         all_logs = [log for members in complete_logs.values() for log in members]
-        input_names = choose_inputs(all_logs, DraftNotes()) if inputs is None else inputs
-        if inputs is None and not input_names:
-            raise UsageError(
-                "prepare: inputs: no channel of the logs is a rudder, a propeller or another"
-                " command; pass the inputs of the vessel; the first log has"
-                f" {', '.join(all_logs[0].channels)} (an empty list: a model without commands)"
-            )
+        input_names = _find_inputs(all_logs) if inputs is None else inputs
         common_inputs = [
             name for name in input_names if all(name in log.channels for log in all_logs)
         ]
@@ -483,33 +467,23 @@ def prepare(
         }
         if settings.get("protocols") is not None:
             if not isinstance(settings["protocols"], Mapping):
-                velocities = describe_type(settings["protocols"])
+                given_type = describe_type(settings["protocols"])
                 raise UsageError(
-                    f"prepare: protocols: expected a mapping by name, given {velocities}"
+                    f"prepare: protocols: expected a mapping by name, given {given_type}"
                 )
             evaluation_settings["selection"] = next(iter(settings["protocols"]), "")
-        signals = {
+        signals: dict[str, Any] = {
             "inputs": input_names if isinstance(input_names, str) else list(input_names),
             "exogenous": preparation_recipe.wind_channels,
             "velocities": dof.velocities,
         }
-        # a key of no section is reported as an unknown key of `prepare`
-        sections: Any = (
+        sections = (
             (SignalsConfig, signals),
             (EvaluationConfig, evaluation_settings),
             (PrepareConfig, preparation_settings),
         )
-        for key, value in settings.items():
-            section = next(
-                (
-                    section_settings
-                    for config_class, section_settings in sections
-                    if key in config_class.model_fields
-                ),
-                preparation_settings,
-            )
-            if value is not None:
-                section[key] = value
+        # a key of no section is reported as an unknown key of `prepare`
+        _assign_to_sections(settings, sections, default_section=preparation_settings)
         signals_config = validate_config(to_builtin(signals), SignalsConfig, "prepare")
         preparation = validate_config(to_builtin(preparation_settings), PrepareConfig, "prepare")
         prepared = _prepare_splits(splits, signals_config, preparation)
@@ -530,6 +504,62 @@ def prepare(
         )
         evaluation = validate_config(to_builtin(evaluation_settings), EvaluationConfig, "prepare")
         return Dataset(prepared, signals_config, preparation, evaluation, source)
+
+
+def _find_velocities(splits: Mapping[str, Sequence[Log]], velocities: Any) -> DegreesOfFreedom:
+    """Return the velocities of a model: the setting, or those that all logs measure.
+
+    Raises:
+        ConfigError: if the setting is wrong.
+    """
+    if velocities is not None:
+        settings = {"inputs": [], "velocities": to_builtin(velocities)}
+        return validate_config(settings, SignalsConfig, "prepare").dof
+    return DegreesOfFreedom.intersection(
+        [
+            DegreesOfFreedom.from_channels(log.channels)
+            for members in splits.values()
+            for log in members
+        ]
+    )
+
+
+def _find_inputs(logs: Sequence[Log]) -> Sequence[str]:
+    """Return the inputs of a model from names and values of the channels.
+
+    Raises:
+        UsageError: if there are none.
+    """
+    input_names = choose_inputs(logs, DraftNotes())
+    if not input_names:
+        raise UsageError(
+            "prepare: inputs: no channel of the logs is a rudder, a propeller or another command;"
+            " pass the inputs of the vessel; the first log has"
+            f" {', '.join(logs[0].channels)} (an empty list: a model without commands)"
+        )
+    return input_names
+
+
+def _assign_to_sections(
+    settings: Mapping[str, Any],
+    sections: Sequence[tuple[type[Config], dict[str, Any]]],
+    default_section: dict[str, Any],
+) -> None:
+    """Add settings to the first section of a config that has a key of their name.
+
+    Args:
+        settings: settings by key; those that are None are skipped.
+        sections: class and settings of each section.
+        default_section: section of unknown keys.
+    """
+    for key, value in settings.items():
+        if value is None:
+            continue
+        section = next(
+            (content for config_class, content in sections if key in config_class.model_fields),
+            default_section,
+        )
+        section[key] = value
 
 
 def _validate_masks(masks: Any, function_name: str) -> tuple[MaskRule, ...]:

@@ -143,6 +143,7 @@ _VECTOR_FUNCTIONS = {
     torch.float32: _write_vector_functions(7, 23, 127, 89.0, 6),
     torch.float64: _write_vector_functions(13, 52, 1023, 710.0, 12),
 }
+"""Vectorised functions in C for single and double precision (mantissa, exponent: IEEE 754)."""
 _N_ACCUMULATORS = 8
 """Number of entries of a matrix product that are computed together, in registers."""
 
@@ -349,34 +350,12 @@ def _write_source(
         the cotangents of products.
     """
     step = to_scalar_function(parts.function)
-    if not step.is_a("SXFunction") or step.n_instructions() > _MAX_INSTRUCTIONS:
-        raise ExportError(
-            f"the step has more than {_MAX_INSTRUCTIONS:,} operations or looks up a long table, so"
-            " that it is not compiled for many rows"
-        )
+    _require_compilable(step)
     products = dict(enumerate(parts.products))
     matrices = [k for k, product in products.items() if not product.activation]
     table_offsets = [0, *accumulate(product.matrix_size for product in parts.products)]
-    sizes_by_name = {
-        f"{name}_{k}{suffix}": product.n_repeats * count
-        for k, product in products.items()
-        for name, count in (("product", product.n_outputs), ("factor", product.n_inputs))
-        for suffix in ("", "_cotangent")
-    }
-    strides = dict.fromkeys(
-        ("x", "w", "s", "q", "row_values", "x_after", "s_after", "q_after", "a"), "stride"
-    )
-
-    def build_layout(array: str, names: Sequence[str]) -> tuple[dict[str, slice], dict[str, str]]:
-        """Return the layout of quantities in an array, and declarations of pointers to them."""
-        offsets = [0, *accumulate(sizes_by_name[name] for name in names)]
-        return (
-            {name: slice(*pair) for name, pair in zip(names, pairwise(offsets), strict=True)},
-            {
-                name: f"REAL *{name} = {array} + {begin} * LANES;"
-                for name, begin in zip(names, offsets, strict=False)
-            },
-        )
+    sizes_by_name = _count_entries(products)
+    strides = dict.fromkeys(_STRIDED_ARRAYS, "stride")
 
     def cotangent_of(k: int) -> str:
         return shared_cotangents.get(name := f"product_{k}_cotangent", name)
@@ -405,29 +384,24 @@ def _write_source(
         vjp_function, shared_cotangents = _vector_jacobian_function(
             step, sizes, len(products), trained_indices, single_products
         )
-        symbols = _make_symbols(vjp_function)
-        jacobian = ca.veccat(*vjp_function.call(symbols))
-        # the gradient does not depend on products of affine layers: these are not stored
-        is_needed = {f"product_{k}": bool(product.activation) for k, product in products.items()}
-        is_needed |= {
-            name: is_needed[name] or ca.depends_on(jacobian, product)
-            for name, product in zip(vjp_function.name_in(), symbols, strict=True)
-            if name in is_needed
-        }
-        forward_storage, stored_pointers = build_layout(
+        is_needed = _find_needed_products(vjp_function, products)
+        forward_storage, stored_pointers = _build_layout(
+            sizes_by_name,
             "history",
             [name for name, needed in is_needed.items() if needed]
             + [f"factor_{k}" for k in sorted(matrices, key=cotangent_of)],
         )
-        backward_storage, declarations = build_layout(
-            "product_cotangents", [*dict.fromkeys(map(cotangent_of, matrices))]
+        backward_storage, declarations = _build_layout(
+            sizes_by_name, "product_cotangents", [*dict.fromkeys(map(cotangent_of, matrices))]
         )
         backward_storage |= {
             f"product_{k}_cotangent": backward_storage[cotangent_of(k)] for k in matrices
         }
         declarations |= {name: stored_pointers.get(name, "") for name in is_needed}
         declarations |= {
-            n: local(n) for n in sizes_by_name if n.endswith("_cotangent") and n not in declarations
+            name: local(name)
+            for name in sizes_by_name
+            if name.endswith("_cotangent") and name not in declarations
         }
         backward = [
             _write_function(
@@ -440,9 +414,9 @@ def _write_source(
             )
         ]
     forward = stored_pointers | {
-        n: local(n)
-        for n in sizes_by_name
-        if n not in stored_pointers and not n.endswith("_cotangent")
+        name: local(name)
+        for name in sizes_by_name
+        if name not in stored_pointers and not name.endswith("_cotangent")
     }
     step_code = _write_function(
         "step",
@@ -452,31 +426,118 @@ def _write_source(
         forward,
     )
     n_theta = len(trained_indices or ())
-    outer = "".join(
-        "outer(STORED(history, N_HISTORY, k)"
-        f" + {forward_storage[f'factor_{k}'].start + r * product.n_inputs} * LANES,"
-        f" {product.n_inputs}, STORED(product_cotangents, N_PRODUCT_COTANGENTS, k)"
-        f" + {backward_storage[f'product_{k}_cotangent'].start + r * product.n_outputs} * LANES,"
-        f" {product.n_outputs},"
-        f" gradient + at * N_GRADIENT + {n_theta + table_offsets[k]} * LANES);\n"
-        for k, product in products.items()
-        for r in range(product.n_repeats)
-        if has_row_gradients and not product.activation
-    )
     counts = dict(sizes) | {
         "history": _storage_size(forward_storage),
         "product_cotangents": _storage_size(backward_storage),
         "gradient": n_theta + has_row_gradients * table_offsets[-1],
     }
-    text = "".join(f"#define N_{name.upper()} {value}L\n" for name, value in counts.items())
+    definitions = [f"#define N_{name.upper()} {value}L\n" for name, value in counts.items()]
     if trained_indices is not None:
+        outer = (
+            _write_outer_products(
+                products,
+                forward_storage,
+                backward_storage,
+                [n_theta + offset for offset in table_offsets],
+            )
+            if has_row_gradients
+            else ""
+        )
         backward.append(BACKWARD_LOOP.replace("OUTER\n", outer))
-    return (
-        "".join(
-            (_write_prelude(dtype), text, step_code, *backward[:1], FORWARD_LOOP, *backward[1:])
-        ),
-        forward_storage,
-        backward_storage,
+    # the loop over the steps follows the functions that it calls
+    code = (_write_prelude(dtype), *definitions, step_code, *backward[:1], FORWARD_LOOP)
+    return "".join((*code, *backward[1:])), forward_storage, backward_storage
+
+
+_STRIDED_ARRAYS = ("x", "w", "s", "q", "row_values", "x_after", "s_after", "q_after", "a")
+"""Arguments and results of a step in arrays of all rows, whose entries are `stride` apart."""
+
+
+def _require_compilable(step: ca.Function) -> None:
+    """Refuse a step whose compilation would take minutes.
+
+    Raises:
+        ExportError: if the step has too many operations or looks up a long table.
+    """
+    if not step.is_a("SXFunction") or step.n_instructions() > _MAX_INSTRUCTIONS:
+        raise ExportError(
+            f"the step has more than {_MAX_INSTRUCTIONS:,} operations or looks up a long table, so"
+            " that it is not compiled for many rows"
+        )
+
+
+def _count_entries(products: Mapping[int, RowProduct]) -> dict[str, int]:
+    """Return the number of entries of products, factors and their cotangents by name."""
+    return {
+        f"{name}_{k}{suffix}": product.n_repeats * count
+        for k, product in products.items()
+        for name, count in (("product", product.n_outputs), ("factor", product.n_inputs))
+        for suffix in ("", "_cotangent")
+    }
+
+
+def _find_needed_products(
+    vjp_function: ca.Function, products: Mapping[int, RowProduct]
+) -> dict[str, bool]:
+    """Return by name whether the gradient of a step needs the value of a product.
+
+    It does not depend on products of affine layers: these are not stored.
+    """
+    symbols = _make_symbols(vjp_function)
+    jacobian = ca.veccat(*vjp_function.call(symbols))
+    is_needed = {f"product_{k}": bool(product.activation) for k, product in products.items()}
+    return is_needed | {
+        name: is_needed[name] or ca.depends_on(jacobian, product)
+        for name, product in zip(vjp_function.name_in(), symbols, strict=True)
+        if name in is_needed
+    }
+
+
+def _build_layout(
+    sizes_by_name: Mapping[str, int], array: str, names: Sequence[str]
+) -> tuple[dict[str, slice], dict[str, str]]:
+    """Return the layout of quantities in an array, and declarations of pointers to them.
+
+    Args:
+        sizes_by_name: number of entries of each quantity.
+        array: name of the array in C.
+        names: the quantities, in their order in the array.
+    """
+    offsets = [0, *accumulate(sizes_by_name[name] for name in names)]
+    layout = {name: slice(*pair) for name, pair in zip(names, pairwise(offsets), strict=True)}
+    declarations = {
+        name: f"REAL *{name} = {array} + {begin} * LANES;"
+        for name, begin in zip(names, offsets, strict=False)
+    }
+    return layout, declarations
+
+
+def _write_outer_products(
+    products: Mapping[int, RowProduct],
+    forward_storage: Mapping[str, slice],
+    backward_storage: Mapping[str, slice],
+    gradient_offsets: Sequence[int],
+) -> str:
+    """Return the calls in C that add the gradients of the matrices of each row.
+
+    The gradient of a matrix is the outer product of the cotangent of its product and its factor.
+
+    Args:
+        products: the products by number; activations have no matrix.
+        forward_storage: layout of the stored factors.
+        backward_storage: layout of the cotangents of the products.
+        gradient_offsets: offset of the gradient of each matrix.
+    """
+    return "".join(
+        "outer(STORED(history, N_HISTORY, k)"
+        f" + {forward_storage[f'factor_{k}'].start + r * product.n_inputs} * LANES,"
+        f" {product.n_inputs}, STORED(product_cotangents, N_PRODUCT_COTANGENTS, k)"
+        f" + {backward_storage[f'product_{k}_cotangent'].start + r * product.n_outputs} * LANES,"
+        f" {product.n_outputs},"
+        f" gradient + at * N_GRADIENT + {gradient_offsets[k]} * LANES);\n"
+        for k, product in products.items()
+        for r in range(product.n_repeats)
+        if not product.activation
     )
 
 

@@ -754,17 +754,8 @@ class ChangeDetector:
                 f" monitor needs at least {_MIN_GROUPS} to estimate the scatter of innovations"
             )
         log_of_group = np.array([k for k, _ in indexed_groups])
-        max_states = np.max(
-            [
-                np.abs(window.y).max(axis=0)
-                for _, windows_of_group in indexed_groups
-                for window in windows_of_group
-            ],
-            axis=0,
-        )
-        max_states[HEADING] = _MAX_HEADING_INNOVATION
-        self.divergence_limits = (
-            _DIVERGENCE_FACTOR * max_states[[*self.innovation_columns.values()]]
+        self.divergence_limits = self._find_divergence_limits(
+            [window for _, windows_of_group in indexed_groups for window in windows_of_group]
         )
         self.part_counts = (
             [1, _N_WINDOW_PARTS] if self.window_steps >= _MIN_PART_STEPS * _N_WINDOW_PARTS else [1]
@@ -796,6 +787,56 @@ class ChangeDetector:
             )
             for i, parts in enumerate(self.part_counts)
         ]
+        # groups of one log are correlated, so that folds consist of whole logs if there are enough
+        fold_of_group = (
+            log_of_group
+            if len(set(log_of_group)) >= _N_FOLDS
+            else np.arange(len(innovations_by_group))
+        ) % _N_FOLDS
+        self.bias_by_fold, cross_validated_groups = self._cross_validate(
+            innovations_by_group, model_bias, log_of_group, fold_of_group, np.diag(prior_precisions)
+        )
+        groups_per_stretch = max(round(config.stretch / config.group), 1)
+        self.score_distribution = replace(
+            fit_score_distribution(cross_validated_groups),
+            inflation_factor=estimate_score_inflation(
+                cross_validated_groups, np.sort(fold_of_group), groups_per_stretch
+            ),
+        )
+        # two-sided threshold with a Bonferroni correction over tests in time and hypotheses
+        n_looks = config.false_alarm / config.stretch * _LOOKS_PER_STRETCH * len(self.hypotheses)
+        self.threshold = float(scipy.stats.t.isf(0.5 / n_looks, len(innovations_by_group) - 1))
+
+    def _find_divergence_limits(self, clean_windows: Sequence[MeasuredWindow]) -> np.ndarray:
+        """Return the innovations above which a free run has diverged, by innovation column."""
+        max_states = np.max([np.abs(window.y).max(axis=0) for window in clean_windows], axis=0)
+        max_states[HEADING] = _MAX_HEADING_INNOVATION
+        return np.asarray(_DIVERGENCE_FACTOR * max_states[[*self.innovation_columns.values()]])
+
+    def _cross_validate(
+        self,
+        innovations_by_group: Sequence[Sequence[_InnovationsAndEffects]],
+        model_bias: list[np.ndarray],
+        log_of_group: np.ndarray,
+        fold_of_group: np.ndarray,
+        prior_precision: np.ndarray,
+    ) -> tuple[list[tuple[list[np.ndarray], np.ndarray]], GroupScores]:
+        """Estimate biases with all groups and without each fold, and the scores of each fold.
+
+        In service the bias is estimated from other logs than those tested, so that scores scatter
+        more than on the clean logs themselves.
+
+        Args:
+            innovations_by_group: innovations and effects of each group and division of windows.
+            model_bias: model bias of all groups for each division of windows.
+            log_of_group: number of the log of each group [G].
+            fold_of_group: number of the fold of each group [G].
+            prior_precision: prior precision of the sizes of the changes [Q, Q].
+
+        Returns:
+            Model bias and size bias [Q] of all groups and without each fold; the scores of each
+            group with the biases of the other folds.
+        """
 
         def estimate_size_bias(
             model_bias: list[np.ndarray], is_used: np.ndarray
@@ -809,50 +850,29 @@ class ChangeDetector:
                 ],
             )
             # the prior regularises changes with similar effects, such as damping and gain
-            regularized_information = group_scores.information[is_used].sum(axis=0) + np.diag(
-                prior_precisions
-            )
-            size_bias = np.linalg.solve(
-                regularized_information, group_scores.score[is_used].sum(axis=0)
-            )
+            information = group_scores.information[is_used].sum(axis=0) + prior_precision
+            size_bias = np.linalg.solve(information, group_scores.score[is_used].sum(axis=0))
             return size_bias, group_scores.subtract_bias(size_bias)
 
-        self.bias_by_fold = [(model_bias, estimate_size_bias(model_bias, log_of_group >= 0)[0])]
-        # groups of one log are correlated, so that folds consist of whole logs if there are enough
-        fold_of_group = (
-            log_of_group
-            if len(set(log_of_group)) >= _N_FOLDS
-            else np.arange(len(innovations_by_group))
-        ) % _N_FOLDS
+        biases = [(model_bias, estimate_size_bias(model_bias, log_of_group >= 0)[0])]
         held_out_groups = []
-        # cross-validation: in service the bias is estimated from other logs than those tested, so
-        # that scores scatter more than on the clean logs themselves
-        for k in range(_N_FOLDS):
-            model_bias = self._estimate_bias(
+        for fold in range(_N_FOLDS):
+            fold_model_bias = self._estimate_bias(
                 [
-                    item
-                    for item, innovations_of_group in zip(
+                    innovations_of_group
+                    for innovations_of_group, group_fold in zip(
                         innovations_by_group, fold_of_group, strict=True
                     )
-                    if innovations_of_group != k
+                    if group_fold != fold
                 ]
             )
-            bias, groups = estimate_size_bias(model_bias, fold_of_group != k)
-            self.bias_by_fold.append((model_bias, bias))
-            held_out_groups.append(vars(groups[fold_of_group == k]).values())
+            size_bias, groups = estimate_size_bias(fold_model_bias, fold_of_group != fold)
+            biases.append((fold_model_bias, size_bias))
+            held_out_groups.append(vars(groups[fold_of_group == fold]).values())
         cross_validated_groups = GroupScores(
             *(np.concatenate(parts) for parts in zip(*held_out_groups, strict=True))
         )
-        groups_per_stretch = max(round(config.stretch / config.group), 1)
-        self.score_distribution = replace(
-            fit_score_distribution(cross_validated_groups),
-            inflation_factor=estimate_score_inflation(
-                cross_validated_groups, np.sort(fold_of_group), groups_per_stretch
-            ),
-        )
-        # two-sided threshold with a Bonferroni correction over tests in time and hypotheses
-        n_looks = config.false_alarm / config.stretch * _LOOKS_PER_STRETCH * len(self.hypotheses)
-        self.threshold = float(scipy.stats.t.isf(0.5 / n_looks, len(innovations_by_group) - 1))
+        return biases, cross_validated_groups
 
     def _estimate_bias(
         self, innovations_by_group: Sequence[Sequence[_InnovationsAndEffects]]

@@ -391,27 +391,9 @@ def plan_trials(
             )
         )
     trials.sort(key=lambda trial: -trial.uncertainty_reduction / trial.duration_minutes)
-    selected_trials: list[CandidateTrial] = []
-    current_covariance = refit_uncertainty.covariance
-    for _ in range(min(trial_limits.count, len(trials))):
-        current_uncertainty = compute_expected_uncertainty(current_covariance, goal_weights)
-
-        # the gain of a trial depends on the previous ones: two equal trials add little
-        def gain(
-            trial: CandidateTrial,
-            covariance: Tensor = current_covariance,
-            uncertainty: float = current_uncertainty,
-        ) -> float:
-            return (
-                uncertainty
-                - compute_expected_uncertainty(
-                    update_covariance(covariance, trial.information), goal_weights
-                )
-            ) / trial.duration_minutes
-
-        best_trial = max((trial for trial in trials if trial not in selected_trials), key=gain)
-        selected_trials.append(best_trial)
-        current_covariance = update_covariance(current_covariance, best_trial.information)
+    selected_trials = _select_trials(
+        trials, trial_limits.count, refit_uncertainty.covariance, goal_weights
+    )
     total_information = sum(
         (trial.information for trial in selected_trials), torch.zeros_like(goal_weights)
     )
@@ -424,6 +406,36 @@ def plan_trials(
         )
         / initial_uncertainty,
     )
+
+
+def _select_trials(
+    trials: Sequence[CandidateTrial], count: int, covariance: Tensor, goal_weights: Tensor
+) -> list[CandidateTrial]:
+    """Select trials greedily by their reduction of the uncertainty per minute.
+
+    Args:
+        trials: the candidates.
+        count: largest number of selected trials.
+        covariance: covariance [P, P] of the parameters before the trials.
+        goal_weights: weights [P, P] of the parameters in the predictions.
+    """
+    selected_trials: list[CandidateTrial] = []
+    for _ in range(min(count, len(trials))):
+        uncertainty = compute_expected_uncertainty(covariance, goal_weights)
+
+        # the gain of a trial depends on the previous ones: two equal trials add little
+        def compute_gain(
+            trial: CandidateTrial, covariance: Tensor = covariance, uncertainty: float = uncertainty
+        ) -> float:
+            next_covariance = update_covariance(covariance, trial.information)
+            next_uncertainty = compute_expected_uncertainty(next_covariance, goal_weights)
+            return (uncertainty - next_uncertainty) / trial.duration_minutes
+
+        remaining_trials = [trial for trial in trials if trial not in selected_trials]
+        best_trial = max(remaining_trials, key=compute_gain)
+        selected_trials.append(best_trial)
+        covariance = update_covariance(covariance, best_trial.information)
+    return selected_trials
 
 
 def _simulate_manoeuvres(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from residnet.preprocessing.derivatives import DerivativeConfig, SavitzkyGolay
 from residnet.preprocessing.masks import (
     HARD_PREFIX,
     MaskConfig,
+    MaskRule,
     apply_masks,
     find_scored_samples,
     number_log_segments,
@@ -154,55 +155,26 @@ def prepare_log(
     """
     is_on_disk = paged.is_memory_mapped(log.t)
     # channels that the model does not use must not change the result
-    required_channels = {*dof.state_names, *input_names}
-    for name in (*dof.state_names, *input_names):
-        if name in log.channels:
-            implausible_indices = np.flatnonzero(is_implausible(log[name], log.units[name]))
-            if implausible_indices.size:
-                raise DataError(
-                    f"log {log.name}: {name} is {log[name][implausible_indices[0]]:g}"
-                    f" {log.units[name]} at t = {log.t[implausible_indices[0]]:.2f} s, which no"
-                    f" vessel reaches ({implausible_indices.size} such samples); correct them, or"
-                    " set them to NaN"
-                )
+    channel_names = (*dof.state_names, *input_names)
+    required_channels = set(channel_names)
+    _require_plausible_values(log, channel_names)
     log = bridge_spikes(log, required_channels)
     completed_log = complete_motion(log, config.motion, dof)
-    filled_log = fill_sparse(completed_log, (*dof.state_names, *input_names), config.grid.held)
+    filled_log = fill_sparse(completed_log, channel_names, config.grid.held)
     # masks are applied to the samples as recorded: interpolation hides a frozen sensor
-    recorded_channels = (
+    recorded_log = (
         filled_log
         if completed_log is log
         else completed_log.replace(channels=completed_log.channels | log.channels)
     )
-    # inactive states are constant zero and must not be marked as a frozen sensor
-    checked_channels = {*(dof.state_names if dof.is_complete else dof.active_states), *input_names}
-    checked_channels |= {
-        name for mask in config.masks for name in mask.model_dump().get("channels", ())
-    }
-    checked_values = {
-        name: values
-        for name, values in recorded_channels.channels.items()
-        if name in checked_channels
-    }
-    masks = apply_masks(recorded_channels.replace(channels=checked_values), config.masks).masks
+    masks = _apply_masks_of_model(recorded_log, input_names, config.masks, dof)
     log = align_to_grid(filled_log.replace(masks=masks), config.grid, required_channels)
     y = log.stack(dof.state_names)
     w = log.stack(tuple(input_names))
     segment = np.where(np.isfinite(y).all(1) & np.isfinite(w).all(1), number_log_segments(log), -1)
     usable = find_scored_samples(log) & (segment >= 0)
     if not usable.any():
-        reasons_text = (
-            ", ".join(
-                f"{reason.removeprefix(HARD_PREFIX)} {mask.mean():.0%}"
-                for reason, mask in log.masks.items()
-                if mask.any()
-            )
-            or "NaN in a channel that the model needs"
-        )
-        raise DataError(
-            f"log {log.name}: no sample is usable ({reasons_text}); check the masks and the"
-            f" channels {', '.join((*dof.state_names, *input_names))}"
-        )
+        raise _unusable_log_error(log, channel_names)
     # a segment ends at each masked sample, so that no derivative depends on it; only interpolated
     # spikes are crossed, since a gap of one sample would change derivatives more than they do
     other_masks = {reason: mask for reason, mask in log.masks.items() if reason != SPIKE_REASON}
@@ -250,6 +222,51 @@ def prepare_log(
         log, split, y, smoothed, nu_dot, held_inputs, rate_inputs, segment, usable, trainable, dof
     )
     return prepared.on_disk() if is_on_disk else prepared
+
+
+def _require_plausible_values(log: Log, channel_names: Sequence[str]) -> None:
+    """Refuse values that no vessel reaches.
+
+    Raises:
+        DataError: if there are such values; it names the first one.
+    """
+    for name in channel_names:
+        if name not in log.channels:
+            continue
+        indices = np.flatnonzero(is_implausible(log[name], log.units[name]))
+        if indices.size:
+            raise DataError(
+                f"log {log.name}: {name} is {log[name][indices[0]]:g} {log.units[name]} at t ="
+                f" {log.t[indices[0]]:.2f} s, which no vessel reaches ({indices.size} such"
+                " samples); correct them, or set them to NaN"
+            )
+
+
+def _apply_masks_of_model(
+    log: Log, input_names: Sequence[str], rules: Sequence[MaskRule], dof: DegreesOfFreedom
+) -> Mapping[str, np.ndarray]:
+    """Return the masks of recorded samples by reason, from the channels that a model uses."""
+    # inactive states are constant zero and must not be marked as a frozen sensor
+    checked_channels = {*(dof.state_names if dof.is_complete else dof.active_states), *input_names}
+    checked_channels |= {name for rule in rules for name in rule.model_dump().get("channels", ())}
+    checked_values = {
+        name: values for name, values in log.channels.items() if name in checked_channels
+    }
+    return apply_masks(log.replace(channels=checked_values), rules).masks
+
+
+def _unusable_log_error(log: Log, channel_names: Sequence[str]) -> DataError:
+    """Return the error that names the share of each mask in a log without usable samples."""
+    reasons = [
+        f"{reason.removeprefix(HARD_PREFIX)} {mask.mean():.0%}"
+        for reason, mask in log.masks.items()
+        if mask.any()
+    ]
+    reasons_text = ", ".join(reasons) or "NaN in a channel that the model needs"
+    return DataError(
+        f"log {log.name}: no sample is usable ({reasons_text}); check the masks and the channels"
+        f" {', '.join(channel_names)}"
+    )
 
 
 def _step_means(w: np.ndarray, segment: np.ndarray) -> np.ndarray:

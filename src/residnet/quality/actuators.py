@@ -44,11 +44,14 @@ def find_propellers(log: LogStatistics) -> list[str]:
     return [name for name in revolution_inputs if not name.startswith("cmd_")] or revolution_inputs
 
 
-# limits of the yaw angle per revolution at full rudder in rad; vessels have .003 to .03
 _MIN_TURN_RATIO = 8e-4
+"""Smallest plausible yaw angle per propeller revolution at full rudder in rad; vessels have .003 to
+.03.
+"""
 _MAX_TURN_RATIO = 0.3
-# largest plausible propeller revolutions in 1/s
+"""Largest plausible yaw angle per propeller revolution at full rudder in rad."""
 _MAX_REVOLUTIONS = 250.0
+"""Largest plausible propeller revolutions in 1/s."""
 _FULL_RUDDER = 0.35
 """Full rudder angle in rad."""
 _MIN_STEERING_SHARE = 0.2
@@ -303,10 +306,12 @@ def check_rudder_bias(log: LogStatistics, make_finding: Check) -> Iterator[Findi
 _WIDER_RANGE_FIX = "log with a wider range, or exclude these parts"
 
 
-# smallest share of time at the limit, ratio of the yaw moments, and t statistic of the difference
 _MIN_SHARE_AT_LIMIT = 0.03
+"""Smallest share of the time at the limit of a record for a finding."""
 _MIN_EFFECT_RATIO = 1.3
+"""Smallest ratio of the actual yaw moment at the limit to that of the recorded angle."""
 _MIN_T_STATISTIC_AT_LIMIT = 4.5
+"""Smallest t statistic of their difference."""
 
 
 @check(
@@ -391,10 +396,10 @@ def _excess_turning_at_limit(log: LogStatistics, is_at_limit: np.ndarray) -> flo
     return excess if excess > _MIN_T_STATISTIC_AT_LIMIT else 0.0
 
 
-# smallest ratios of residual sums of squares: unshifted over shifted inputs, and without over with
-# steering
 _MIN_SHIFT_IMPROVEMENT = 1.3
+"""Smallest ratio of the residual sums of squares with unshifted and with shifted inputs."""
 _MIN_STEERING_IMPROVEMENT = 1.2
+"""Smallest ratio of the residual sums of squares without and with the steering inputs."""
 
 
 @check("inputs", "rudder_sign", required_channels=("r",), is_record_fault=True, on_subsample=True)
@@ -644,6 +649,44 @@ def _find_local_minima(sum_of_squares_by_shift: Mapping[int, float]) -> list[int
     return [shifts[i] for i in minimum_indices[np.argsort(sums_of_squares[minimum_indices])]]
 
 
+def _choose_shift(
+    sum_of_squares_by_shift: Mapping[int, float], min_sum_of_squares: float, step: float
+) -> int:
+    """Return the smallest causal shift among the minima that are as low as the lowest one.
+
+    A periodic input, as in a zigzag, fits equally well half a period away.
+    """
+    equivalent_shifts = [
+        shift
+        for shift in _find_local_minima(sum_of_squares_by_shift)
+        if sum_of_squares_by_shift[shift] <= _MAX_EQUIVALENT_RATIO * min_sum_of_squares
+    ]
+    return min(equivalent_shifts, key=lambda shift: (-shift * step > MIN_LEAD_TIME, abs(shift)))
+
+
+def _estimate_shift_error(
+    squared_residuals_by_shift: Mapping[int, np.ndarray], is_finite: np.ndarray, step: float
+) -> float:
+    """Return the standard error of a delay in s, from the best shifts of sections of the log.
+
+    Args:
+        squared_residuals_by_shift: squared residuals [K] of the fit with each shift.
+        is_finite: blocks [K] that are used.
+        step: sampling interval in s.
+    """
+    delays = np.array([*squared_residuals_by_shift]) * step
+    squared_residuals = np.array([*squared_residuals_by_shift.values()])
+    sections = np.array_split(np.flatnonzero(is_finite), N_SECTIONS // 2)
+    best_delays = [
+        delays[np.argmin(np.nan_to_num(squared_residuals[:, section].sum(axis=1), nan=np.inf))]
+        for section in sections
+    ]
+    scatter = SIGMA_OF_MAD * float(
+        np.median(np.abs(np.array(best_delays) - np.median(best_delays)))
+    )
+    return float(max(1.5 * scatter / np.sqrt(len(sections)), 0.25 * step))
+
+
 def _fit_residuals(x: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the residuals of S least-squares fits.
 
@@ -755,17 +798,8 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], velocity: str) -> R
         for min_shift in _find_local_minima(sum_of_squares_by_shift)[:_N_MINIMA]
         for k in range(-6, 7)
     )
-    # among equivalent minima the smallest causal shift counts: a periodic input, as in a zigzag,
-    # fits equally well half a period away
     min_sum_of_squares = max(min(sum_of_squares_by_shift.values()), 1e-300)
-    equivalent_shifts = [
-        shift
-        for shift in _find_local_minima(sum_of_squares_by_shift)
-        if sum_of_squares_by_shift[shift] <= _MAX_EQUIVALENT_RATIO * min_sum_of_squares
-    ]
-    best_shift = min(
-        equivalent_shifts, key=lambda shift: (-shift * step > MIN_LEAD_TIME, abs(shift))
-    )
+    best_shift = _choose_shift(sum_of_squares_by_shift, min_sum_of_squares, step)
     is_finite = np.isfinite(squared_residuals_by_shift[best_shift]) & np.isfinite(
         squared_residuals_by_shift[0]
     )
@@ -773,20 +807,7 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], velocity: str) -> R
         fixed_terms.shape[2] + len(make_shifted_terms(names, [0]))
     ):
         return None
-    # standard error: scatter of the best shift over sections of the log
-    tried_delays = np.array([*squared_residuals_by_shift]) * step
-    squared_residuals = np.array([*squared_residuals_by_shift.values()])
-    section_indices = np.array_split(np.flatnonzero(is_finite), N_SECTIONS // 2)
-    best_delay_by_section = [
-        tried_delays[
-            np.argmin(np.nan_to_num(squared_residuals[:, section].sum(axis=1), nan=np.inf))
-        ]
-        for section in section_indices
-    ]
-    scatter = SIGMA_OF_MAD * float(
-        np.median(np.abs(np.array(best_delay_by_section) - np.median(best_delay_by_section)))
-    )
-    standard_error = max(1.5 * scatter / np.sqrt(len(section_indices)), 0.25 * step)
+    standard_error = _estimate_shift_error(squared_residuals_by_shift, is_finite, step)
     best_sum_of_squares = max(
         float(squared_residuals_by_shift[best_shift][is_finite].sum()), 1e-300
     )

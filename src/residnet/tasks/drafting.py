@@ -10,7 +10,7 @@ import os
 import re
 import shlex
 import unicodedata
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -265,10 +265,7 @@ def draft_fit_config(
     from residnet.preprocessing.prepare import PrepareConfig
     from residnet.tasks.fit.config import FitConfig
 
-    mask_settings: dict[str, Any] = {}
-    if "frozen" in finding_codes:
-        mask_channels = {"channels": list(dof.active_states)} if dof.fixed_states else {}
-        mask_settings = {"masks": [{"kind": "frozen", **mask_channels}]}
+    mask_settings = _choose_mask_settings(finding_codes, dof)
     masks = validate_config({"grid": {"step": 1.0}, **mask_settings}, PrepareConfig, "draft").masks
     preparation_recipe = PreparationPlan.from_logs(
         list(draft_logs.complete_logs.values()), inputs, dof, masks
@@ -302,18 +299,7 @@ def draft_fit_config(
     evaluation_settings = make_evaluation_settings(
         splits, durations, preparation_recipe.correlation_time, masks, dof
     )
-    draft_notes.add_note(("prepare", "grid"), preparation_recipe.reason)
-    draft_notes.add_note(
-        ("evaluation", "protocols"),
-        f"free runs of a length that most logs contain; {evaluation_settings['selection']} is used"
-        " for model selection on validation logs",
-    )
-    draft_notes.add_note(
-        ("evaluation", "scales"), "winsorized standard deviations over the training logs"
-    )
-    draft_notes.add_note(
-        ("recipe",), "a portfolio of models, whose terms and sizes follow from the logs"
-    )
+    _note_choices(draft_notes, preparation_recipe.reason, evaluation_settings["selection"])
     config = {
         "task": "fit",
         "name": name,
@@ -343,6 +329,37 @@ def draft_fit_config(
     exclusion_lines = [f"left out: {line}" for line in exclusions]
     text = dump_commented_yaml(config, draft_notes.comments_at, draft_logs.header_lines())
     return ConfigDraft(config, guesses, text, (*exclusion_lines, *unused), missing_text)
+
+
+def _choose_mask_settings(finding_codes: Collection[str], dof: DegreesOfFreedom) -> dict[str, Any]:
+    """Return the masks of a drafted config: frozen channels if a data check found some."""
+    if "frozen" not in finding_codes:
+        return {}
+    # fixed states are constant and must not be marked as frozen
+    mask_channels = {"channels": list(dof.active_states)} if dof.fixed_states else {}
+    return {"masks": [{"kind": "frozen", **mask_channels}]}
+
+
+def _note_choices(draft_notes: DraftNotes, grid_reason: str, selection: str) -> None:
+    """Add comments on grid, evaluation and recipe to a drafted config.
+
+    Args:
+        draft_notes: comments of the config.
+        grid_reason: reason for step and derivative.
+        selection: protocol of the model selection.
+    """
+    draft_notes.add_note(("prepare", "grid"), grid_reason)
+    draft_notes.add_note(
+        ("evaluation", "protocols"),
+        f"free runs of a length that most logs contain; {selection} is used for model selection on"
+        " validation logs",
+    )
+    draft_notes.add_note(
+        ("evaluation", "scales"), "winsorized standard deviations over the training logs"
+    )
+    draft_notes.add_note(
+        ("recipe",), "a portfolio of models, whose terms and sizes follow from the logs"
+    )
 
 
 def _has_current(settings: FitConfig, logs: Sequence[Log], draft_notes: DraftNotes) -> bool:
