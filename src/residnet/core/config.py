@@ -32,8 +32,9 @@ from residnet.core.units import si_unit, to_si, unit_names
 RENAMED_KEYS: dict[str, str] = {}
 """Keys that this release renames -> what to write instead; emptied with the next release.
 
-A key is the end of a dotted key path, `*` stands for any one key, and a renamed value follows the
-path of its key with `=`: `"free_run.lead": "warmup"`, `"baseline.kind=fossen": "hull"`.
+An entry is the last part of a dotted key path, in which `*` matches any key:
+`"free_run.lead": "warmup"`. A renamed value is written after its key path and `=`:
+`"baseline.kind=fossen": "hull"`.
 """
 
 
@@ -169,10 +170,9 @@ def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
     """
     path = Path(path)
     data, root = _read_mapping(path)
-    applied = tuple(apply_override(data, text) for text in overrides)
-    return _validate_data(
-        data, model, _ConfigOrigin(str(path), root, applied), path.parent.absolute()
-    )
+    applied_overrides = tuple(apply_override(data, text) for text in overrides)
+    origin = _ConfigOrigin(str(path), root, applied_overrides)
+    return _validate_data(data, model, origin, path.parent.absolute())
 
 
 @overload
@@ -203,8 +203,7 @@ def validate_config(data: Any, model: Any, where: str, folder: Path | None = Non
 def _validate_data(data: Any, model: Any, origin: _ConfigOrigin, folder: Path | None) -> Any:
     # values that residnet computed itself (no YAML root) may be arbitrarily close to zero
     _require_plausible_numbers(data, origin, 0.0 if origin.root is None else 1.0 / _MAX_NUMBER)
-    # only the JSON mode of pydantic is strict and still accepts lists for tuples and text for enums
-    # and paths
+    # in JSON the strict mode of pydantic accepts lists for tuples, and text for enums and paths
     try:
         return type_adapter(model).validate_json(
             to_json(data), strict=True, context={"folder": folder}
@@ -415,7 +414,7 @@ class PolynomialOf:
     It is used in an annotation: `Annotated[tuple[float, float, float], PolynomialOf("N", "1/s")]`.
 
     Attributes:
-        value: SI unit of the polynomial.
+        value: SI unit of the value of the polynomial.
         variable: SI unit of its variable.
     """
 
@@ -452,6 +451,8 @@ NewtonMetres = Annotated[float, Quantity("N m")]
 
 @dataclass(frozen=True)
 class _PathRule:
+    """Marker of a path field: how a relative path is resolved, and whether it must exist."""
+
     must_exist: bool
     allows_shipped: bool = False
 
@@ -616,9 +617,9 @@ def _parse_fault(details: ErrorDetails, model: Any) -> ConfigFault:
         case "extra_forbidden":
             valid_names = [
                 key
-                for error_type in parents
-                if _is_model_class(error_type)
-                for key in _annotations_by_key(error_type)
+                for parent in parents
+                if _is_model_class(parent)
+                for key in _annotations_by_key(parent)
             ]
             hint = format_renaming_hint(path) or suggest_name(str(path[-1]), valid_names)
             fault_text = f"unknown key{hint}{_kind_suffix(parents)}"
@@ -641,16 +642,14 @@ def _parse_fault(details: ErrorDetails, model: Any) -> ConfigFault:
                 fault_text = f"expected {error_context['expected']} {format_given(value)}"
         case "value_error" | "assertion_error":
             fault_text = str(error_context["error"])
-            # the validator of a section names the key itself, so the section's value is omitted
+            # the message of a section's validator names the key: the section is not printed
             is_scalar = isinstance(value, (str, int, float)) and "(given " not in fault_text
             fault_text = f"{fault_text} {format_given(value)}" if is_scalar else fault_text
         case _ if error_type in _EXPECTED_TYPES:
             fault_text = f"expected {_EXPECTED_TYPES[error_type]} {format_given(value)}"
         case _:
-            # a violated bound: its unit is in the metadata of the field, at any depth of the type
-            model_fields = [
-                error_type.model_fields for error_type in parents if _is_model_class(error_type)
-            ]
+            # a violated bound; its unit is in the metadata of the field, or of a type inside it
+            model_fields = [parent.model_fields for parent in parents if _is_model_class(parent)]
             field_types = {
                 model_field.alias or field_name: (model_field.annotation, model_field.metadata)
                 for fields_of_model in model_fields
@@ -744,21 +743,21 @@ def _union_members(union: Any) -> list[Any]:
     return [member for member in get_args(union) if member is not type(None)]
 
 
-def _select_union_members(kinds: tuple[Any, ...], label: str) -> tuple[Any, ...]:
+def _select_union_members(union_types: tuple[Any, ...], label: str) -> tuple[Any, ...]:
     """Return the members of unions that a label of pydantic denotes; all if none matches.
 
     A label is the value of a discriminator or the name of a type.
     """
     named_kinds = [
         union_type.find_kind(label)
-        for union_type in kinds
+        for union_type in union_types
         if isinstance(union_type, PluginUnion) and label in union_type.kind_names()
     ]
     if named_kinds:
         return tuple(kind_class for kind_class in named_kinds if isinstance(kind_class, type))
     options = [
         _unwrap_type(member)
-        for union_type in kinds
+        for union_type in union_types
         if _is_union(union_type)
         for member in _union_members(union_type)
     ]
@@ -828,11 +827,11 @@ def _literal_fields(model: Any) -> dict[str, tuple[Any, ...]]:
     }
 
 
-def _kind_suffix(kinds: tuple[Any, ...]) -> str:
+def _kind_suffix(section_types: tuple[Any, ...]) -> str:
     # the valid keys of a section depend on its kind, which an override may have changed
     single_literals = [
         (key, values[0])
-        for section_type in kinds
+        for section_type in section_types
         for key, values in _literal_fields(section_type).items()
         if len(values) == 1
     ]
@@ -841,16 +840,16 @@ def _kind_suffix(kinds: tuple[Any, ...]) -> str:
     )
 
 
-def _discriminator_values(kinds: tuple[Any, ...], key: str | int) -> list[str]:
+def _discriminator_values(union_types: tuple[Any, ...], key: str | int) -> list[str]:
     names = [
         name
-        for union_type in kinds
+        for union_type in union_types
         if isinstance(union_type, PluginUnion)
         for name in union_type.kind_names()
     ]
     options = [
         _unwrap_type(member)
-        for union_type in kinds
+        for union_type in union_types
         if _is_union(union_type)
         for member in _union_members(union_type)
     ]

@@ -17,8 +17,8 @@ from residnet.physics.plant import Plant
 class RecordedPlantDynamics(Dynamics):
     """A `PlantDynamics` whose step is traced to a CasADi function at the first call.
 
-    For simulation only: it runs without gradients, in float64, for any batch size, with the same
-    numbers. A plant whose step cannot be traced runs in torch.
+    It is for simulation only: it runs without gradients in float64, and the result of a row does
+    not depend on the batch size. A plant whose step cannot be traced runs in torch.
     """
 
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:

@@ -69,7 +69,7 @@ _C_HEADERS: Final = frozenset(
 """Headers without `.h` that an exported header must not hide from `#include <...>`."""
 
 
-def file_prefix(file: Path) -> str:
+def make_symbol_prefix(file: Path) -> str:
     """Return the prefix of all names in a C file: the stem of the file as a C identifier.
 
     Two exports with different file names can then be linked into one program.
@@ -160,6 +160,7 @@ def render_c_files(
         extra_functions: comment, prototype and body of further functions that call `functions`.
         constants: value and comment of each constant, by name without prefix.
         header_comment: comment at the top of the header that explains its use.
+        header: name of the header, which the source includes.
         is_double_only: whether only double precision is supported.
         build: build identity, which ends in hexadecimal digits; empty for none.
     """
@@ -223,7 +224,7 @@ def compile_shared_library(
         ExportError: if the compiler gives an error or a warning; the message contains the first
             one.
     """
-    # all code for Windows is independent of its position, and the flag a warning there
+    # code for Windows is always position-independent; compilers warn about the flag there
     position_flags = () if library_path.suffix == ".dll" else ("-fPIC",)
     command = [
         compiler_path or find_compiler(),
@@ -254,8 +255,7 @@ def measure_footprint(source: Path) -> dict[str, Any]:
     """Return stack and code size of a C file compiled for size on this machine.
 
     The stack is measured with `-fstack-usage` and the code with `size`. Without these tools both
-    are
-    estimated from the source: local arrays, and four bytes per operation and constant.
+    are estimated from the source: local arrays, and four bytes per operation and constant.
 
     Returns:
         `machine`; `stack_bytes` of each function without its callees; `largest_stack_bytes` of the
@@ -263,37 +263,37 @@ def measure_footprint(source: Path) -> dict[str, Any]:
         constants; `stack_from` and `code_from`, the tool or "estimate".
     """
     text = source.read_text()
-    bodies = function_bodies(text)
-    stack = {name: estimated_stack(body) for name, body in bodies.items()}
-    code = estimated_code(text)
+    bodies = parse_function_bodies(text)
+    stack = {name: estimate_stack(body) for name, body in bodies.items()}
+    code = estimate_code_size(text)
     stack_from = code_from = "estimate"
     with tempfile.TemporaryDirectory() as folder:
-        object_file = Path(folder) / "made.o"
+        object_file = Path(folder) / "footprint.o"
         try:
-            size_tool = find_compiler()
+            compiler = find_compiler()
         except ExportError:
-            size_tool = ""
-        command = [size_tool, "-std=c99", "-Os", "-c", str(source), "-o", str(object_file)]
-        # a compiler that does not know the flag may still tell the size
-        for flags in (["-fstack-usage"], []) if size_tool else ():
+            compiler = ""
+        command = [compiler, "-std=c99", "-Os", "-c", str(source), "-o", str(object_file)]
+        # a compiler without this flag can still compile the file, whose size is then measured
+        for flags in (["-fstack-usage"], []) if compiler else ():
             if subprocess.run([*command, *flags], capture_output=True).returncode == 0:
                 break
         stack_file = object_file.with_suffix(".su")
         if stack_file.is_file():
             usage_rows = (line.split("\t") for line in stack_file.read_text().splitlines())
             stack = {name.rsplit(":", 1)[-1]: int(size) for name, size, *_ in usage_rows}
-            stack_from = f"{Path(size_tool).name} -Os -fstack-usage"
-        if object_file.is_file() and (program := shutil.which("size")) is not None:
+            stack_from = f"{Path(compiler).name} -Os -fstack-usage"
+        if object_file.is_file() and (size_program := shutil.which("size")) is not None:
             lines = subprocess.run(
-                [program, str(object_file)], capture_output=True, text=True
+                [size_program, str(object_file)], capture_output=True, text=True
             ).stdout
             # the first column of Berkeley's format holds code and constants
             code = int(lines.splitlines()[1].split()[0])
-            code_from = f"{Path(size_tool).name} -Os, size"
+            code_from = f"{Path(compiler).name} -Os, size"
     return {
         "machine": f"{platform.machine()}, -Os",
         "stack_bytes": stack,
-        "largest_stack_bytes": deepest_stack(stack, bodies),
+        "largest_stack_bytes": measure_deepest_stack(stack, bodies),
         "stack_from": stack_from,
         "code_bytes": code,
         "code_from": code_from,
@@ -306,13 +306,13 @@ assumed to be in registers.
 """
 
 
-def function_bodies(text: str) -> dict[str, str]:
+def parse_function_bodies(text: str) -> dict[str, str]:
     """Return the body of each function of a written C file by its name."""
-    found = re.finditer(r"^(?!#)[\w ]+ \*?(\w+)\([^;{]*\) \{\n(.*?)^\}$", text, re.M | re.S)
-    return {match[1]: match[2] for match in found}
+    matches = re.finditer(r"^(?!#)[\w ]+ \*?(\w+)\([^;{]*\) \{\n(.*?)^\}$", text, re.M | re.S)
+    return {match[1]: match[2] for match in matches}
 
 
-def estimated_stack(body: str) -> int:
+def estimate_stack(body: str) -> int:
     """Estimate the stack in bytes that the body of a function needs."""
     declarations = re.findall(r"^\s*(?:const )?(?:REAL|int|size_t|\w+_real) ([^=;(]+)", body, re.M)
     names = [name for declaration in declarations for name in declaration.split(",")]
@@ -324,12 +324,12 @@ def estimated_stack(body: str) -> int:
     return 64 + 8 * (sum(sizes) + n_scalars)
 
 
-def estimated_code(text: str) -> int:
+def estimate_code_size(text: str) -> int:
     """Estimate the size in bytes of the code and the constants of a C file."""
     return 4 * len(re.findall(r"[-+*/=<>(]|\b\d[\w.]*", text))
 
 
-def deepest_stack(stack: Mapping[str, int], bodies: Mapping[str, str]) -> int:
+def measure_deepest_stack(stack: Mapping[str, int], bodies: Mapping[str, str]) -> int:
     """Return the stack in bytes of the deepest call chain within the file."""
 
     def depth(name: str) -> int:
@@ -360,16 +360,17 @@ def measure_memory(exported: Exportable) -> int:
 
 
 _FLOAT_BYTES = 4
+"""Size of a single-precision number in bytes."""
 
 
-def report_footprint(what: str, size: Mapping[str, Any]) -> list[str]:
+def report_footprint(file_name: str, size: Mapping[str, Any]) -> list[str]:
     """Report stack and size to the user before a file is written; return the warnings."""
     stack = size["largest_stack_bytes"]
     code = size["code_bytes"]
     log_message(
-        f"  {what}: {stack:,} bytes of stack ({size['stack_from']}), {code:,} bytes of code and"
-        f" constants ({size['code_from']}), {size['memory_bytes']:,} bytes of memory between steps"
-        f" on {size['machine']}"
+        f"  {file_name}: {stack:,} bytes of stack ({size['stack_from']}), {code:,} bytes of code"
+        f" and constants ({size['code_from']}), {size['memory_bytes']:,} bytes of memory between"
+        f" steps on {size['machine']}"
     )
     warnings = []
     if stack > STACK_LIMIT:
@@ -419,12 +420,13 @@ def generate_c_source(
     *,
     is_double_only: bool = False,
 ) -> CSource:
-    """Return source and header.
+    """Generate the C source and the header of a model, policy or force model.
 
     Args:
+        exported: the exported object.
         card: model card, written as a comment into the header.
         header: name of the header.
-        prefix: prefix of all names, see `file_prefix`.
+        prefix: prefix of all names, see `make_symbol_prefix`.
         is_double_only: whether single precision is not offered.
 
     Raises:
@@ -437,7 +439,7 @@ def generate_c_source(
         f"SIZE_{name.upper()}": (n_entries, f"entries of {name}")
         for name, n_entries in exported.arguments
     }
-    # what is found in double precision is written for both
+    # the code is traced in double precision, and the macro of the file selects its precision
     step_function = lower(
         exported.build_step_module(torch.float64), exported.arguments, exported.results, label
     )
@@ -477,14 +479,14 @@ def generate_c_source(
     )
     if exported.dt is not None:
         constants["DT"] = (repr(float(exported.dt)), "step in s")
-    function_comment = f"{exported.name}: {introduction}\n\n{json.dumps(card, indent=1)}"
+    header_comment = f"{exported.name}: {introduction}\n\n{json.dumps(card, indent=1)}"
     build = card["build"]["identity"]
     file_texts = render_c_files(
         prefix,
         functions,
         extra_functions,
         constants,
-        function_comment,
+        header_comment,
         header,
         is_double_only=is_double_only,
         build=build,
@@ -577,8 +579,9 @@ class CompiledModel(LoadedExport):
             if name not in flags[:1]
         }
         arrays = [np.ascontiguousarray(array, dtype=self.real_dtype) for array in step_arguments]
-        returned = self._call_function("step", *arrays, *outputs.values())
-        results = outputs | {name: np.array([returned]) for name in flags[:1]}
+        # the C function returns the first flag
+        return_value = self._call_function("step", *arrays, *outputs.values())
+        results = outputs | {name: np.array([return_value]) for name in flags[:1]}
         return tuple(
             bool(results[name][0]) if name in flags else results[name]
             for name in self.exported.results
@@ -610,9 +613,9 @@ class CExporter(Exporter):
         If rounding in single precision changes the track, the file has double precision only.
         """
         exported.require_finite_numbers()
-        # a header that is asked for names the pair
+        # a request for x.h also writes x.c
         file = file.with_suffix(self.suffix) if file.suffix == ".h" else file
-        prefix = file_prefix(file)
+        prefix = make_symbol_prefix(file)
         card = exported.build_card() | {
             "format": "c",
             "dtype": "float32; float64 with the macro _DOUBLE",

@@ -232,7 +232,7 @@ def _score_covariance(
     n_groups = int(unique_groups.numel())
     if group_index is None or n_groups < 2:
         residual_sum_of_squares = _sum_over_chunks(
-            x, lambda rows, part: (y[rows] - part / scale @ coefficients).square().sum(0)
+            x, lambda rows, chunk: (y[rows] - chunk / scale @ coefficients).square().sum(0)
         )
         return gram * (residual_sum_of_squares / (n_samples - n_columns) * n_samples)[:, None, None]
     group_scores = torch.zeros(n_outputs, n_groups, n_columns, dtype=y.dtype)

@@ -102,9 +102,10 @@ from residnet.preprocessing.motion import MotionConfig, complete_motion
 _MIN_CONSISTENCY = 0.7
 # median step in s above which a pose with a higher rate is searched
 _MAX_POSE_INTERVAL = 0.6
-# fewest rows of a topic with motion, and of a topic with inputs
 _MIN_MOTION_ROWS = 50
+"""Smallest number of rows of a topic with motion."""
 _MIN_INPUT_ROWS = 20
+"""Smallest number of rows of a topic with inputs."""
 _MAX_POSE_CANDIDATES = 12
 """Largest number of positions and of headings whose combinations are tested."""
 _AXIS_PAIRS = (("x", "y"), ("north", "east"), ("east", "north"))
@@ -220,7 +221,7 @@ def _choose_motion_sources(
 
     Args:
         recordings: recordings with aligned clocks.
-        log: the first recording as its standard messages give it; None if they give no log.
+        log: log of the first recording from its standard messages; None if they are not sufficient.
         standard_sources: fields of the standard messages.
         draft_notes: receives guesses and notes.
         is_frame_fixed: whether the format defines the frame of its poses.
@@ -240,7 +241,7 @@ def _choose_motion_sources(
     if standard_sources.step > _MAX_POSE_INTERVAL and not is_frame_fixed:
         candidate_notes = DraftNotes()
         other_sources = _find_best_pose(recordings[0], candidate_notes, _MIN_CONSISTENCY)
-        # with the same pose the velocities of its messages would be lost
+        # the new sources have no measured velocities, so that they must have a higher rate
         if other_sources is not None and other_sources.step < 0.9 * standard_sources.step:
             draft_notes.extend(candidate_notes)
             return other_sources
@@ -303,7 +304,7 @@ def _find_named_table(
         for recording in recordings
         if base_topic in recording.series
     ]
-    # fields with values in all recordings, without clocks
+    # fields with finite values in all recordings; increasing times are no channels
     fields = [
         name
         for name in sources
@@ -602,10 +603,10 @@ def _find_best_pose(
                 _median_series_step(recording[source.topic]) for source in (position, heading)
             ]
             # a tenth of the rate costs .3 of the score
-            rated_score = score - 0.3 * float(np.log10(max(max(source_steps), 0.05) / 0.05))
-            if rated_score > best_candidate[0]:
+            score_with_rate = score - 0.3 * float(np.log10(max(max(source_steps), 0.05) / 0.05))
+            if score_with_rate > best_candidate[0]:
                 best_candidate = (
-                    rated_score,
+                    score_with_rate,
                     (position, heading, score, velocity, min(source_steps)),
                 )
     if best_candidate[1] is None or best_candidate[1][2] < min_score:
@@ -946,8 +947,9 @@ def _rank_publishers(
     shares = ", ".join(f"{topic} {explained[topic, field]:.2f}" for topic, field in fields)
     draft_notes.add_guess(
         (*CHANNELS_KEY, channel),
-        f"{fields[0][1]} is written by {' and '.join(topic for topic, _ in fields)}; {followed[0]}"
-        f" is taken, which the yaw rate follows (share of its changes that is explained: {shares})",
+        f"{fields[0][1]} is written by {' and '.join(topic for topic, _ in fields)};"
+        f" {followed[0]} is used, because it explains the yaw rate best (explained share of its"
+        f" changes: {shares})",
     )
     return lambda source: -explained[source]
 
@@ -995,8 +997,8 @@ def describe_other_files(folder: Path) -> str:
     counts_text = ", ".join(
         f"{n} file{'s' * (n > 1)} {suffix or 'without ending'}" for suffix, n in endings.items()
     )
-    commonest = max(endings, key=lambda ending: endings[ending], default="")
-    return f", but {counts_text[:120]}; {suggest_conversion(commonest)}" if counts_text else ""
+    most_frequent = max(endings, key=lambda ending: endings[ending], default="")
+    return f", but {counts_text[:120]}; {suggest_conversion(most_frequent)}" if counts_text else ""
 
 
 @dataclass
@@ -1115,7 +1117,7 @@ def _draft_trip_parts(
         part_notes.move_key(READER_KEY, (*READER_KEY, "parts", part_name))
         draft_notes.extend(part_notes)
     part_order = sorted(
-        part_settings, key=lambda word: -len(_motion_channels(part_settings[word]["channels"]))
+        part_settings, key=lambda name: -len(_motion_channels(part_settings[name]["channels"]))
     )
     text = (
         f"files whose names differ only in {' and '.join(part_order)} are joined as one trip;"

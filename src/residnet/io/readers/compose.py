@@ -42,10 +42,10 @@ from residnet.io.readers.quantities import (
     UniformClock,
     VelocityConfig,
     complete_quaternion,
+    list_source_channels,
     normalize_quaternion,
     project_fixes,
     quaternion_yaw,
-    source_channels,
 )
 from residnet.io.readers.recording import (
     ALL_FIELDS,
@@ -63,8 +63,9 @@ from residnet.preprocessing.motion import Antenna
 _STATE_CHANNELS = ("x", "y", "psi", "u", "v", "r", "p", "phi")
 _MOTION_CHANNELS = {*_STATE_CHANNELS, "north_rate", "east_rate"}
 _MAX_GAP_SECONDS = 1.0
+"""Longest step in s that is interpolated."""
 _MAX_GAP_STEPS = 3.0
-"""Longest step that is interpolated: in s, and in median steps of a topic (two lost rows)."""
+"""Longest step that is interpolated, in median steps of a topic (two lost rows)."""
 
 
 class RecordingConfig(ConfiguredReader, ABC):
@@ -112,7 +113,7 @@ class RecordingConfig(ConfiguredReader, ABC):
                 "velocity: kind 'derived' needs a uniform clock; set clock: {kind: uniform, step:"
                 " 0.1 s}"
             )
-        declared_channels = source_channels(self.position, self.heading, self.velocity)
+        declared_channels = list_source_channels(self.position, self.heading, self.velocity)
         if duplicates := ", ".join(name for name in declared_channels if name in self.channels):
             raise ValueError(
                 f"channels: {duplicates} given here and by position, heading or velocity; remove"

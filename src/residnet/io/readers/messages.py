@@ -26,7 +26,7 @@ from residnet.io.readers.quantities import (
     GeodeticPosition,
     LocalPosition,
     QuaternionHeading,
-    source_channels,
+    list_source_channels,
 )
 from residnet.io.readers.recording import Recording, Series, normalize_field_path
 
@@ -35,6 +35,7 @@ _NED_CONVERSION = "already in NED and forward-starboard-down"
 _BY_NAME_CONVERSION = "by channel names, assumed in SI, NED and body axes"
 _WORLD_FRAMES = ("map", "odom", "earth", "world", "enu", "ned")
 _INTEGERS = tuple(f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64))
+"""Message types of ROS (package std_msgs) with one whole number."""
 _NUMBER_TYPES = ("Float64", "Float32", *_INTEGERS, "Float64Stamped", "Float32Stamped")
 _FIX_FIELDS = ("latitude", "longitude")
 
@@ -561,7 +562,7 @@ def extend_with_standard_messages(recording: Recording, declared: ChannelPlan) -
             message_plan = message.plan(series)
             planned_channels = {
                 *plan.channels,
-                *source_channels(plan.position, plan.heading, plan.velocity),
+                *list_source_channels(plan.position, plan.heading, plan.velocity),
             }
             planned_channels |= {"r"} if isinstance(plan.velocity, DerivedVelocity) else set()
             # a field that the config maps under one name is not mapped under another
@@ -588,7 +589,7 @@ def extend_with_standard_messages(recording: Recording, declared: ChannelPlan) -
                 heading=plan.heading or heading,
                 velocity=plan.velocity or velocity,
             )
-            added_channels = [*source_channels(position, heading, velocity), *new_channels]
+            added_channels = [*list_source_channels(position, heading, velocity), *new_channels]
             if added_channels:
                 source_text = f"{', '.join(added_channels)}: {message.name} of {series.name}"
                 conversions.append(f"{source_text}, {message.conversion}")

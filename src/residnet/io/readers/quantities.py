@@ -23,9 +23,13 @@ from residnet.preprocessing.motion import Antenna
 
 Frame = Literal["as_measured", "ned", "enu", "body_fsd", "body_fpu"]
 
+# factor and offset of the conversion of a channel to NED and forward-starboard-down
 _IDENTITY = (1.0, 0.0)
+"""No conversion."""
 _NEGATE = (-1.0, 0.0)
+"""Conversion of an axis to the opposite direction, such as port to starboard."""
 _EAST_TO_NORTH = (-1.0, math.pi / 2.0)
+"""Conversion of an angle anticlockwise from east to one clockwise from north, in rad."""
 _EARTH_CHANNELS = ("x", "y", "z", "psi", "wind_dir", "current_north", "current_east")
 EARTH_VELOCITIES = ("u", "v")
 """Channels of a table that are the velocities to the north and to the east in the frame `ned`."""
@@ -172,7 +176,7 @@ def mask_interpolated_headings(psi: np.ndarray) -> np.ndarray:
             continue
         # the first and the last step may be shorter
         largest_step = np.abs(sweep_steps).max()
-        is_even = np.abs(sweep_steps[1:-1]) >= (1.0 - _STEP_TOLERANCE) * largest_step
+        has_equal_steps = np.abs(sweep_steps[1:-1]) >= (1.0 - _STEP_TOLERANCE) * largest_step
         neighbour_step = np.append(
             typical_step[max(start - 2, 0) : start], typical_step[stop : stop + 2]
         ).max(initial=0.0)
@@ -180,7 +184,7 @@ def mask_interpolated_headings(psi: np.ndarray) -> np.ndarray:
         # the step of the short way around the circle must suit the neighbouring steps better
         short_way_step = (2.0 * np.pi - abs(sweep_steps.sum())) / sweep_steps.size
         is_sudden = largest_step - neighbour_step > abs(short_way_step - neighbour_step)
-        if is_even.all() and spans_circle and is_sudden:
+        if has_equal_steps.all() and spans_circle and is_sudden:
             is_interpolated[start + 1 : stop] = True
     if not is_interpolated.any():
         return unwrapped
@@ -204,7 +208,7 @@ class ChannelMap(Conversion):
         letter_o: meaning of the letter O in longitudes, `east` (Ost, Oost) or `west` (Oeste, Ouest,
             Ovest); null rejects it.
         hold: whether a value is valid until the next one (zero-order hold), as for commands that
-            are recorded when they change; rows with such channels only are left out.
+            are recorded when they change. Rows that have values of such channels only are left out.
     """
 
     column: str
@@ -237,9 +241,9 @@ class ChannelMap(Conversion):
 
 
 def conversion_factor(unit: str, expected: str | None) -> float:
-    """Return the factor of a unit to SI, with errors for validators.
+    """Return the factor of a unit to SI; an error is a `ValueError`.
 
-    pydantic adds the path of the key to a `ValueError` only.
+    Validators of pydantic must raise this class, to which pydantic adds the path of the key.
 
     Raises:
         ValueError: if the unit is unknown or has another dimension than `expected`.
@@ -496,7 +500,7 @@ VelocityConfig = Annotated[
 """Source of u, v (and r); velocities in body axes are mapped as channels instead."""
 
 
-def source_channels(
+def list_source_channels(
     position: PositionConfig | None, heading: HeadingConfig | None, velocity: VelocityConfig | None
 ) -> list[str]:
     """Return the names of the channels that configured sources provide."""
@@ -616,15 +620,16 @@ def project_fixes(
         return latitude, longitude, None, int(is_null_fix.sum())
     first_index = int(np.argmax(is_valid))
     plane_origin = origin or (float(latitude[first_index]), float(longitude[first_index]))
-    phi, lam = (np.where(is_valid, angle, np.nan) for angle in (latitude, longitude))
-    north, east = project_to_tangent_plane(phi, lam, *plane_origin)
+    north, east = project_to_tangent_plane(
+        np.where(is_valid, latitude, np.nan), np.where(is_valid, longitude, np.nan), *plane_origin
+    )
     return north, east, plane_origin, int(is_null_fix.sum())
 
 
 def complete_quaternion(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
     """Return the parts x, y, z, w [T] of quaternions of which x and y may be missing (zero)."""
-    missing = (np.zeros_like(parts[-1]),) * (len(QUATERNION) - len(parts))
-    return (*missing, *parts)
+    zero_parts = (np.zeros_like(parts[-1]),) * (len(QUATERNION) - len(parts))
+    return (*zero_parts, *parts)
 
 
 def normalize_quaternion(

@@ -24,9 +24,11 @@ _HEADING_WINDOW_SECONDS = 1.0
 _EXCLUDED_SECONDS = 1.0
 """Distance in s from the optimum within which an offset is no alternative."""
 _MAX_ITERATIONS = 30
+"""Largest number of iterations of offset, drift and weights."""
 _KNOT_SECONDS = 10.0
+"""Distance in s of the knots of the random walk between the heading and the integral of r."""
 _MAX_KNOTS = 60
-"""Distance and largest number of the knots of the random walk between heading and integral."""
+"""Largest number of these knots."""
 _MAX_GAPS = 10
 """Largest number of gaps of the yaw rate across which its integral may jump."""
 _STUDENT_DOF = 5.0
@@ -46,8 +48,8 @@ class ClockEstimate(NamedTuple):
         drift: share by which the clock of the yaw rate runs slow; 0 if it was not estimated.
         middle: time in the middle of the overlap in s, on the clock of the heading.
         correlation: correlation of the yaw rate with the derivative of the heading.
-        margin: logarithm of the likelihood ratio to the best offset farther than one second away,
-            per 2 s of the overlap: neighbouring samples of a yaw rate are not independent.
+        margin: logarithm of the likelihood ratio to the best offset farther than one second away.
+            Each 2 s of the overlap count as one independent sample of the yaw rate.
     """
 
     seconds: float
@@ -114,19 +116,22 @@ def _correlate_rates(
         spectrum = np.fft.rfft(first, size) * np.conj(np.fft.rfft(second, size))
         return np.asarray(np.fft.irfft(spectrum, size))
 
-    in_reference = np.ones(reference.size)
-    in_signal = np.ones(signal.size)
-    counts = np.maximum(correlate(in_reference, in_signal), 1.0)
-    reference_sum = correlate(reference, in_signal)
-    signal_sum = correlate(in_reference, signal)
-    reference_energy = correlate(reference**2, in_signal) - reference_sum**2 / counts
-    signal_energy = correlate(in_reference, signal**2) - signal_sum**2 / counts
+    # correlations with ones give the sums over the overlap at each lag
+    reference_ones = np.ones(reference.size)
+    signal_ones = np.ones(signal.size)
+    counts = np.maximum(correlate(reference_ones, signal_ones), 1.0)
+    reference_sum = correlate(reference, signal_ones)
+    signal_sum = correlate(reference_ones, signal)
+    reference_energy = correlate(reference**2, signal_ones) - reference_sum**2 / counts
+    signal_energy = correlate(reference_ones, signal**2) - signal_sum**2 / counts
     product = correlate(reference, signal) - reference_sum * signal_sum / counts
     # an overlap without turns has no signal and no information on the offset
-    floor = 1e-6 * float(reference @ reference) * float(signal @ signal)
-    if floor <= 0.0:
+    min_energy_product = 1e-6 * float(reference @ reference) * float(signal @ signal)
+    if min_energy_product <= 0.0:
         return None
-    correlation = product / np.sqrt(np.maximum(reference_energy * signal_energy, floor))
+    correlation = product / np.sqrt(
+        np.maximum(reference_energy * signal_energy, min_energy_product)
+    )
     correlation = np.clip(correlation, -0.9999, 0.9999)
     has_overlap = counts >= _MIN_OVERLAP * min(reference.size, signal.size)
     # log-likelihood ratio of a regression with this correlation, which grows with the overlap
@@ -200,8 +205,8 @@ def _refine_offset(
         )[0]
         residual = response - columns / scales @ solution
         solution = solution / scales
-        spread = max(float(np.median(np.abs(residual))) / 0.6745, 1e-9)
-        weights = (_STUDENT_DOF + 1.0) / (_STUDENT_DOF + (residual / spread) ** 2)
+        residual_std = max(float(np.median(np.abs(residual))) / 0.6745, 1e-9)
+        weights = (_STUDENT_DOF + 1.0) / (_STUDENT_DOF + (residual / residual_std) ** 2)
         seconds += float(np.clip(solution[0], -0.3, 0.3))
         drift += float(np.clip(solution[1], -1e-4, 1e-4)) if has_drift else 0.0
         if abs(solution[0]) < 1e-4:
@@ -233,7 +238,8 @@ def _compute_standard_error(
     section_scores = np.stack([scores[sections == k].sum(axis=0) for k in range(_N_SECTIONS)])
     covariance = bread @ section_scores.T @ section_scores @ bread
     covariance *= _N_SECTIONS / (_N_SECTIONS - 1.0)
-    # few sections underestimate it: it is no smaller than with first-order autoregressive residuals
+    # with few sections the sandwich underestimates the error; lower bound: the standard error for
+    # first-order autoregressive residuals
     centred = residual - residual.mean()
     energy = max(float(centred @ centred), 1e-300)
     autocorrelation = min(max(float(centred[1:] @ centred[:-1]) / energy, 0.0), 0.98)
