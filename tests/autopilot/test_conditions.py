@@ -18,16 +18,15 @@ from residnet.autopilot.heading.conditions import (
     HeadingStepBatch,
     LimitCycleTest,
     SteadinessLimits,
-    TuningConfig,
     count_excess_overshoots,
     noise_free,
     sample_gauss_markov,
     sample_wave_motion,
-    tune_parameters,
     with_nominal_rows,
 )
 from residnet.autopilot.heading.controllers import ControlTask, PdConfig, PidConfig, PtosConfig
 from residnet.autopilot.heading.steering_variation import HEADING
+from residnet.autopilot.heading.tuning import TuningConfig, tune_parameters
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.heading.vessels import SteeredPlant
 from residnet.physics.vessel import load_vessel

@@ -29,7 +29,8 @@ from residnet.autopilot.heading.policies import OBSERVER_MEMORY
 from residnet.core.errors import UsageError
 from residnet.export import get_exporter
 from residnet.export.c import compile_shared_library
-from residnet.testing.checks import assert_finite, assert_true, replace_entries
+from residnet.testing.checks import assert_finite, assert_true
+from residnet.testing.export_checks import replace_entries
 
 FAR = 12_000.0
 """Metres from the origin of the chart, where single precision resolves a millimetre."""

@@ -24,7 +24,7 @@ from residnet.io.readers.formats.topic_folder import TopicFolderConfig
 from residnet.io.readers.recording import ALL_FIELDS
 from residnet.io.readers.text_tables import detect_encoding
 from residnet.io.split import extract_segment
-from residnet.tasks.drafting import choose_inputs
+from residnet.tasks.input_selection import choose_inputs
 
 T = np.arange(0.0, 60.0, 0.2)
 PSI = 0.4 * np.sin(0.2 * T)

@@ -43,7 +43,8 @@ from residnet.preprocessing.prepare import PrepareConfig, PreparedLog
 from residnet.preprocessing.prepare import prepare_log as prepare_log
 from residnet.quality import inspect_log as examine
 from residnet.quality import inspect_log_set
-from residnet.tasks.drafting import ConfigDraft, choose_inputs, draft_fit_config
+from residnet.tasks.drafting import ConfigDraft, draft_fit_config
+from residnet.tasks.input_selection import choose_inputs
 from residnet.tasks.naval_draft import NavalParticulars
 
 if TYPE_CHECKING:

@@ -23,17 +23,19 @@ from residnet.baselines.base import ParametricBaseline
 from residnet.core.errors import UsageError
 from residnet.core.layout import DYNAMIC_STATES
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.identification.change_scores import (
+    PRIOR_STD,
+    GroupScores,
+    compute_robust_score_sums,
+    marginalise,
+)
 from residnet.identification.changes import PerturbedDynamics, SystemChange
 from residnet.identification.fitter import FittedModel
 from residnet.identification.monitoring import (
-    PRIOR_STD,
     ChangeDetector,
-    GroupScores,
     MeasuredWindow,
     MonitorVerdict,
     compute_innovations,
-    compute_robust_score_sums,
-    marginalise,
     split_window,
 )
 from residnet.training.refit import require_parametric_baseline

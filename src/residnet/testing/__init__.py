@@ -12,9 +12,7 @@ Each function checks a part and raises an `AssertionError` of one line if it vio
 from __future__ import annotations
 
 from residnet.testing.checks import (
-    check_bad_inputs,
     check_baseline,
-    check_exporter,
     check_head,
     check_manoeuvre,
     check_reader,
@@ -22,6 +20,7 @@ from residnet.testing.checks import (
     make_example_models,
     make_example_samples,
 )
+from residnet.testing.export_checks import check_bad_inputs, check_exporter
 
 __all__ = [
     "check_bad_inputs",

@@ -13,18 +13,20 @@ from residnet.core.errors import DataError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.engine.rollout import Rollout
-from residnet.identification.changes import PerturbedDynamics, SystemChange
-from residnet.identification.monitoring import (
-    ChangeDetector,
+from residnet.identification.change_scores import (
     GroupScores,
-    MeasuredWindow,
-    MonitorConfig,
-    MonitorVerdict,
-    OnlineChangeDetector,
     ScoreDistribution,
     compute_robust_score_sums,
     estimate_score_inflation,
     fit_score_distribution,
+)
+from residnet.identification.changes import PerturbedDynamics, SystemChange
+from residnet.identification.monitoring import (
+    ChangeDetector,
+    MeasuredWindow,
+    MonitorConfig,
+    MonitorVerdict,
+    OnlineChangeDetector,
 )
 from residnet.identification.recursive_refit import refit_recursively
 from residnet.testing.checks import EXAMPLE_TIME_STEP, make_example_model, make_example_spec

@@ -21,14 +21,11 @@ from numpy.typing import NDArray
 from residnet.autopilot.courses.course_check import BuoyConfig, PassingRule, find_first_violation
 from residnet.autopilot.courses.fitting import RouteProblem, RouteSolution
 from residnet.autopilot.courses.outline import RINGS, Circle, RouteSearch, TurnRoom
+from residnet.autopilot.courses.route import N_LEG_POINTS, Route, RouteOutline, TurnSpec
 from residnet.autopilot.courses.turns import (
-    N_LEG_POINTS,
     N_TURN_POINTS,
     Array,
-    Route,
-    RouteOutline,
     TurnMaker,
-    TurnSpec,
     TurnTables,
     simulate_following_turns,
     state_after_turn,

@@ -18,13 +18,8 @@ from scipy.optimize import linprog
 
 from residnet.autopilot.courses.course_check import first_checked_sample
 from residnet.autopilot.courses.outline import Circle
-from residnet.autopilot.courses.turns import (
-    N_LEG_POINTS,
-    N_TURN_POINTS,
-    Array,
-    Route,
-    RouteGeometry,
-)
+from residnet.autopilot.courses.route import N_LEG_POINTS, Route, RouteGeometry
+from residnet.autopilot.courses.turns import N_TURN_POINTS, Array
 
 _MAX_ITERATIONS = 45
 """Largest number of iterations of a fit; converged fits need far fewer."""

@@ -17,7 +17,8 @@ from typing import NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
-from residnet.autopilot.courses.turns import Array, RouteOutline, TurnSpec
+from residnet.autopilot.courses.route import RouteOutline, TurnSpec
+from residnet.autopilot.courses.turns import Array
 
 _ANGLES = 36
 """Number of positions on a circle at which a course may touch it, ten degrees apart."""

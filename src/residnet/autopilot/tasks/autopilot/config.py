@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, final
 import torch
 from pydantic import Field, model_validator
 
-from residnet.autopilot.heading.conditions import ConditionsConfig, TuningConfig
+from residnet.autopilot.heading.conditions import ConditionsConfig
 from residnet.autopilot.heading.controllers import (
     BangBangConfig,
     ClassicalController,
@@ -24,6 +24,7 @@ from residnet.autopilot.heading.controllers import (
 )
 from residnet.autopilot.heading.predictive import DocumentConfig, PredictiveConfig
 from residnet.autopilot.heading.steering_variation import DEPTH, HEADING, Axis
+from residnet.autopilot.heading.tuning import TuningConfig
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.heading.vessels import SteeredModel, SteeredPlant
 from residnet.autopilot.records import ControllerKind

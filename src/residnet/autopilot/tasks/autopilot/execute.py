@@ -37,7 +37,6 @@ from residnet.autopilot.heading.conditions import (
     noise_free,
     settled_time,
     simulate_heading_steps,
-    tune_parameters,
 )
 from residnet.autopilot.heading.controllers import (
     ControlTask,
@@ -49,6 +48,7 @@ from residnet.autopilot.heading.controllers import (
     load_recurrent,
 )
 from residnet.autopilot.heading.policies import LOS_CONSTANTS, DepthPolicy, ObserverPolicy
+from residnet.autopilot.heading.tuning import tune_parameters
 from residnet.autopilot.heading.vessels import SteeredPlant
 from residnet.autopilot.records import (
     AutopilotMetricsFile,
