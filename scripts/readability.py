@@ -1,4 +1,4 @@
-"""Prints the mean length of sentences and the share of those over 35 words, page by page.
+"""Print the mean length of sentences and the share of those over 35 words, page by page.
 
 python scripts/readability.py
 """
@@ -9,36 +9,36 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LONG = 35
-"""Words of a sentence that is too long to be read once."""
+MAX_WORDS = 35
+"""Number of words above which a sentence is too long."""
 
 
-def sentences(markdown: str) -> list[int]:
-    """Return the words of each sentence of a page's prose: no code, tables, titles, comments."""
+def count_words(markdown: str) -> list[int]:
+    """Return the number of words of each sentence of the prose, without code, tables and titles."""
     text = re.sub(r"```.*?```|<!--.*?-->", "", markdown, flags=re.DOTALL)
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
-    out = []
+    word_counts = []
     for block in re.split(r"\n\s*\n|\n(?=\s*(?:[-*]|\d+\.) )", text):
         lines = [line for line in block.splitlines() if not re.match(r"\s*(?:\||#|!!!|:::)", line)]
-        # a full stop within code or a number ends nothing
+        # a full stop within code or a number does not end a sentence
         for sentence in re.split(r"(?<=[.!?])\s+(?=[A-Z`\"(])|:\s*$", " ".join(lines)):
             count = len(re.findall(r"`[^`]*`|[\w'’-]+(?:[.,]\d+)?", sentence))
-            out += [count] if count > 2 else []
-    return out
+            word_counts += [count] if count > 2 else []
+    return word_counts
 
 
 def main() -> None:
     """Print a line for each page, and one for all."""
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-    counts = {page.relative_to(ROOT).as_posix(): sentences(page.read_text()) for page in pages}
+    counts = {page.relative_to(ROOT).as_posix(): count_words(page.read_text()) for page in pages}
     counts["all pages"] = [count for page in counts.values() for count in page]
-    for name, found in counts.items():
-        if found:
-            long = 100 * sum(count > LONG for count in found) / len(found)
-            mean = sum(found) / len(found)
+    for name, word_counts in counts.items():
+        if word_counts:
+            long_share = 100 * sum(count > MAX_WORDS for count in word_counts) / len(word_counts)
+            mean = sum(word_counts) / len(word_counts)
             print(
-                f"{name:40s} {len(found):5d} sentences, mean {mean:5.1f} words,"
-                f" {long:4.1f} % over {LONG}"
+                f"{name:40s} {len(word_counts):5d} sentences, mean {mean:5.1f} words,"
+                f" {long_share:4.1f} % over {MAX_WORDS}"
             )
 
 

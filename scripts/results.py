@@ -1,22 +1,21 @@
-"""Rewrites the figures of README and documentation from runs, and says what it did not run.
+"""Rewrite the figures of README and documentation from runs, and list sources that did not run.
 
     python scripts/results.py [--only NAME,...] [--runs runs/results] [--minutes 60]
 
-A figure in a page stands between two comments, of which the first says where it comes from:
+A figure in a page is between two comments. The first one has its source:
 
     <!--= quickstart metrics.json rows[model=plsr,split=test].nrmse.mean -->0.123<!--/-->
 
-are the name of a source (see `SOURCES`), a file in its run folder (or `stdout`), and a path through
-that JSON file, with `[key=value,...]` for the first entry of a list that has these values. For
-`stdout` the path is a regular expression in which a space is `\\s`. A fourth word scales it:
-`x100` by a factor, `deg` from rad; a fifth is the number of digits, 3 otherwise. Lists stand with
-slashes between their entries.
+These are the name of a source (see `SOURCES`), a file in its run folder (or `stdout`), and a path
+in that JSON file, with `[key=value,...]` for the first entry of a list that has these values. For
+`stdout` the path is a regular expression in which a space is `\\s`. The optional fourth field is a
+scale: `x100` for a factor, `deg` to convert from rad. The fifth is the number of digits; default 3.
+Entries of lists are separated by slashes.
 
-A source that is finished under --runs, with the package and the configs as they are now, is not run
-again, so that all figures of a call are of one state; it must be committed. The pages are rewritten
-after each source, and a call that is interrupted goes on from there. What fails, such as for want
-of data or of a package, or takes longer than --minutes, leaves its figures as they are, and the
-last lines name it.
+All figures of a call are of one state, which must be committed: a source is not run again if it is
+finished under --runs with the present package and configs. The pages are rewritten after each
+source, so that an interrupted call can be repeated. If a source fails, for example without data or
+a package, or takes longer than --minutes, its figures are not changed and the last lines name it.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-MARK = re.compile(r"<!--= (?P<where>.+?) -->(?P<shown>.*?)<!--/-->", re.DOTALL)
+MARK = re.compile(r"<!--= (?P<origin>.+?) -->(?P<text>.*?)<!--/-->", re.DOTALL)
 DEG = 180.0 / math.pi
 
 
@@ -73,41 +72,46 @@ SOURCES: dict[str, tuple[str, ...]] = {
 """Commands that make figures: a config with overrides behind it, or a script with arguments."""
 
 
-def pages() -> list[Path]:
+def list_pages() -> list[Path]:
     """Return README and all pages of the documentation."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-def marks(page: Path) -> list[tuple[str, str]]:
-    """Return where each figure of a page comes from, and what stands there."""
-    return [(m["where"], m["shown"]) for m in MARK.finditer(page.read_text(encoding="utf-8"))]
+def find_figures(page: Path) -> list[tuple[str, str]]:
+    """Return origin and text of each figure of a page."""
+    return [
+        (match["origin"], match["text"])
+        for match in MARK.finditer(page.read_text(encoding="utf-8"))
+    ]
 
 
-def git(*words: str) -> str:
-    """Return what git says."""
-    said = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True)
-    return said.stdout.strip()
+def run_git(*arguments: str) -> str:
+    """Return the output of git."""
+    completed = subprocess.run(
+        ["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return completed.stdout.strip()
 
 
-def state() -> str:
-    """Return what the figures depend on: package, configs and scripts as they are committed.
+def hash_inputs() -> str:
+    """Return the git hashes of package, configs and scripts, on which the figures depend.
 
     Raises:
-        SystemExit: where something of them is not committed.
+        SystemExit: if some of these files are not committed.
     """
     parts = ("src", "configs", "scripts/bench", "tests/support")
-    if changed := git("status", "--porcelain", "--", *parts):
+    if changed := run_git("status", "--porcelain", "--", *parts):
         raise SystemExit(f"commit first, so that figures belong to a commit:\n{changed}")
-    return git("rev-parse", *(f"HEAD:{part}" for part in parts))
+    return run_git("rev-parse", *(f"HEAD:{part}" for part in parts))
 
 
-def make(name: str, runs: Path, now: str, minutes: float) -> str:
-    """Run a source unless it is finished; return why its figures are not there, or nothing."""
+def run_source(name: str, runs: Path, input_hashes: str, minutes: float) -> str:
+    """Run a source unless it is finished; return the reason if it failed, else an empty text."""
     folder = runs / name
     command = list(SOURCES[name])
     stamp = folder / "state"
-    now = f"{now}\n{' '.join(command)}"
-    if stamp.is_file() and stamp.read_text(encoding="utf-8") == now:
+    state = f"{input_hashes}\n{' '.join(command)}"
+    if stamp.is_file() and stamp.read_text(encoding="utf-8") == state:
         return ""
     print(f"running {name}: {' '.join(command)}", flush=True)
     if command[0].endswith(".yaml"):
@@ -116,92 +120,100 @@ def make(name: str, runs: Path, now: str, minutes: float) -> str:
         command += ["--out", str(folder), "--overwrite", "--quiet"]
     call = [sys.executable, *command]
     try:
-        ran = subprocess.run(
+        completed = subprocess.run(
             call, cwd=ROOT, capture_output=True, text=True, timeout=60 * minutes, check=False
         )
     except subprocess.TimeoutExpired:
         return f"takes longer than {minutes:g} minutes; give --minutes"
-    if ran.returncode:
-        return f"failed: {(ran.stderr.strip() or 'without a word').splitlines()[-1]}"
+    if completed.returncode:
+        return f"failed: {(completed.stderr.strip() or 'no message').splitlines()[-1]}"
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "stdout").write_text(ran.stdout, encoding="utf-8")
-    stamp.write_text(now, encoding="utf-8")
+    (folder / "stdout").write_text(completed.stdout, encoding="utf-8")
+    stamp.write_text(state, encoding="utf-8")
     return ""
 
 
-def figure(where: str, runs: Path) -> str:
-    """Return a figure from a run as it stands in a page; a LookupError where it has none."""
-    name, file, path, *scale = where.split()
+def read_figure(origin: str, runs: Path) -> str:
+    """Return the text of a figure from a run.
+
+    Raises:
+        LookupError: if the run has no such figure.
+    """
+    name, file, path, *scale = origin.split()
     content = (runs / name / file).read_text(encoding="utf-8")
     if file == "stdout":
-        found = re.search(path, content)
-        if found is None:
-            raise LookupError(f"{where}: the output has no such line")
-        return found[1]
-    word = scale[0] if scale else "x1"
+        match = re.search(path, content)
+        if match is None:
+            raise LookupError(f"{origin}: the output has no such line")
+        return match[1]
+    unit = scale[0] if scale else "x1"
     digits = int(scale[1]) if len(scale) > 1 else 3
-    factor = DEG if word == "deg" else float(word.removeprefix("x"))
-    return shown(entry(json.loads(content), path), factor, digits)
+    factor = DEG if unit == "deg" else float(unit.removeprefix("x"))
+    return format_value(find_entry(json.loads(content), path), factor, digits)
 
 
-def lacking(name: str, runs: Path) -> str:
-    """Return the first figure of the pages that the run of a source does not have, or nothing."""
-    for page in pages():
-        for where, _ in marks(page):
-            if where.split()[0] == name:
+def find_missing_figure(name: str, runs: Path) -> str:
+    """Return the first figure of the pages that a run does not have; empty if it has all."""
+    for page in list_pages():
+        for origin, _ in find_figures(page):
+            if origin.split()[0] == name:
                 try:
-                    figure(where, runs)
+                    read_figure(origin, runs)
                 except (LookupError, OSError) as error:
-                    return f"ran, but has no figure {where}: {error}"
+                    return f"ran, but has no figure {origin}: {error}"
     return ""
 
 
-def entry(content: Any, path: str) -> Any:
-    """Return what a path leads to; a LookupError where it leads nowhere."""
-    for key, wanted in re.findall(r"([^.\[\]]+)?(?:\[([^\]]*)\])?(?:\.|$)", path):
+def find_entry(content: Any, path: str) -> Any:
+    """Return the value at a path of a JSON file.
+
+    Raises:
+        LookupError: if there is no such value.
+    """
+    for key, condition in re.findall(r"([^.\[\]]+)?(?:\[([^\]]*)\])?(?:\.|$)", path):
         if key:
             content = content[int(key) if isinstance(content, list) else key]
-        if wanted:
-            pairs = [pair.split("=") for pair in wanted.split(",")]
+        if condition:
+            pairs = [pair.split("=") for pair in condition.split(",")]
             rows = [row for row in content if all(str(row.get(k)) == value for k, value in pairs)]
             if not rows:
-                raise LookupError(f"no entry with {wanted}")
+                raise LookupError(f"no entry with {condition}")
             content = rows[0]
     return content
 
 
-def shown(value: Any, factor: float, digits: int = 3) -> str:
+def format_value(value: Any, factor: float, digits: int = 3) -> str:
     """Return a value, or a list of them, in a number of significant digits."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list):
-        return " / ".join(shown(part, factor, digits) for part in value)
+        return " / ".join(format_value(part, factor, digits) for part in value)
     if not isinstance(value, float):
         return str(value)
     return f"{float(f'{factor * value:.{digits}g}'):.10g}"
 
 
-def rewrite(page: Path, runs: Path, missing: Sequence[str]) -> int:
-    """Put the figures of finished sources into a page; return how many changed."""
+def rewrite_page(page: Path, runs: Path, missing: Sequence[str]) -> int:
+    """Insert the figures of finished sources into a page; return the number of changed ones."""
     text = page.read_text(encoding="utf-8")
-    changed = 0
+    n_changed = 0
 
-    def put(match: re.Match[str]) -> str:
-        nonlocal changed
-        if match["where"].split()[0] in missing:
+    def replace_figure(match: re.Match[str]) -> str:
+        nonlocal n_changed
+        if match["origin"].split()[0] in missing:
             return match[0]
-        new = figure(match["where"], runs)
-        changed += new != match["shown"]
-        return f"<!--= {match['where']} -->{new}<!--/-->"
+        figure = read_figure(match["origin"], runs)
+        n_changed += figure != match["text"]
+        return f"<!--= {match['origin']} -->{figure}<!--/-->"
 
-    after = MARK.sub(put, text)
-    if after != text:
-        page.write_text(after, encoding="utf-8")
-    return changed
+    new_text = MARK.sub(replace_figure, text)
+    if new_text != text:
+        page.write_text(new_text, encoding="utf-8")
+    return n_changed
 
 
 def main() -> None:
-    """Run what the figures need, rewrite the pages, and say what was left out."""
+    """Run the sources of the figures, rewrite the pages, and list the sources that did not run."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -209,23 +221,23 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "results", help="their folder")
     parser.add_argument("--minutes", type=float, default=60, help="that a run may take")
     options = parser.parse_args()
-    used = {where.split()[0] for page in pages() for where, _ in marks(page)}
-    wanted = set(options.only.split(",")) if options.only else used
-    if unknown := wanted - set(SOURCES):
+    used = {origin.split()[0] for page in list_pages() for origin, _ in find_figures(page)}
+    selected = set(options.only.split(",")) if options.only else used
+    if unknown := selected - set(SOURCES):
         parser.error(f"no source '{min(unknown)}'; valid: {', '.join(SOURCES)}")
-    now = state()
-    changed = 0
-    reasons = dict.fromkeys(used - wanted, "not asked for")
-    for name in sorted(used & wanted):
-        reason = make(name, options.runs, now, options.minutes)
-        if reason := reason or lacking(name, options.runs):
+    input_hashes = hash_inputs()
+    n_changed = 0
+    reasons = dict.fromkeys(used - selected, "not selected")
+    for name in sorted(used & selected):
+        reason = run_source(name, options.runs, input_hashes, options.minutes)
+        if reason := reason or find_missing_figure(name, options.runs):
             reasons[name] = reason
             continue
-        # at once, so that a call that is interrupted leaves what it ran
-        others = sorted(used - {name})
-        changed += sum(rewrite(page, options.runs, others) for page in pages())
-    commit = git("rev-parse", "--short", "HEAD")
-    print(f"{changed} figures changed; those that were run are of commit {commit}.")
+        # after each source, so that an interrupted call keeps the figures of finished ones
+        other_sources = sorted(used - {name})
+        n_changed += sum(rewrite_page(page, options.runs, other_sources) for page in list_pages())
+    commit = run_git("rev-parse", "--short", "HEAD")
+    print(f"{n_changed} figures changed; the figures of this call are of commit {commit}.")
     for name, reason in sorted(reasons.items()):
         print(f"not run: {name}: {reason}")
 

@@ -1,12 +1,12 @@
-"""Keep what must not change, and compare a later state of the project with it.
+"""Record results of a state of the project, and compare those of a later state with them.
 
-    python scripts/ci/frozen.py make DIR        at the state to compare with
-    python scripts/ci/frozen.py compare DIR     at a later one: exit 1 where something differs
+    python scripts/ci/frozen.py make DIR        records the results of the present state
+    python scripts/ci/frozen.py compare DIR     compares; exit code 1 if something differs
 
-DIR holds the sample logs themselves, so that both states read the same files; arrays and meta of
-every log; what the doctor says; metrics, summary and the words of the page of shortened runs; and
-how their exports end, each of which checks its parity. `--only logs,doctor,runs,exports` takes a
-part.
+DIR contains the sample logs, so that both states read the same files; arrays and meta of all logs;
+the findings of the data checks; metrics, summary and the text of the page of shortened runs; and
+the exit codes of their exports, each of which checks its parity. `--only logs,doctor,runs,exports`
+selects some of these.
 """
 
 from __future__ import annotations
@@ -49,22 +49,23 @@ VOLATILE = re.compile(
     r"|peak|memory|python|machine|command|run$|id$|file"
 )
 """Keys that differ between two runs of one state."""
-LOGS = 1e-12
-FIGURES = 1e-6
-SHOWN = 8
-"""Relative differences allowed in logs, which are read, and in figures, which go through
-optimisers; and how many of a file are shown."""
+LOG_TOLERANCE = 1e-12
+"""Relative difference that is allowed in logs, which are only read."""
+FIGURE_TOLERANCE = 1e-6
+"""Relative difference that is allowed in figures, which are results of optimisers."""
+MAX_SHOWN_DIFFERENCES = 8
+"""Largest number of differences that are printed for one file."""
 
 
-def residnet(*words: object) -> subprocess.CompletedProcess[str]:
-    """Give the command line some words."""
+def run_residnet(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the command line of residnet."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "200", "NO_COLOR": "1"}
-    call = [sys.executable, "-m", "residnet", *map(str, words)]
+    call = [sys.executable, "-m", "residnet", *map(str, arguments)]
     return subprocess.run(call, cwd=ROOT, env=environment, capture_output=True, text=True)
 
 
-def samples(folder: Path) -> None:
-    """Write a log in every format that the project reads, and those of the demo."""
+def write_samples(folder: Path) -> None:
+    """Write a log in all formats that the project reads, and the logs of the demo."""
     import written_logs
 
     log = written_logs.trial()
@@ -72,11 +73,11 @@ def samples(folder: Path) -> None:
         for name in names:
             (folder / name).mkdir(parents=True)
             getattr(__import__(module), name)(log, folder / name)
-    residnet("demo", folder / "demo")
+    run_residnet("demo", folder / "demo")
 
 
-def recordings(folder: Path) -> Iterator[tuple[str, Path]]:
-    """Yield what to read: each file or folder of a sample, the demo's files, the field's cases."""
+def iterate_samples(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Yield name and path of all sample logs: formats, the demo, and the cases of the field."""
     for sample in sorted(folder.iterdir()):
         if sample.name != "demo":
             yield from ((sample.name, path) for path in sorted(sample.iterdir())[:1])
@@ -85,11 +86,11 @@ def recordings(folder: Path) -> Iterator[tuple[str, Path]]:
     yield from (("field", case) for case in sorted(field.glob("*/")))
 
 
-def logs(kept: Path) -> Iterator[tuple[str, Any]]:
-    """Read every sample from Python; yield arrays and meta, or the words of the refusal."""
+def read_samples(folder: Path) -> Iterator[tuple[str, Any]]:
+    """Read all samples in Python; yield arrays and meta, or the message of the error."""
     from residnet import ResidnetError, read_logs
 
-    for name, path in recordings(kept / "samples"):
+    for name, path in iterate_samples(folder / "samples"):
         content: dict[str, Any] = {}
         try:
             for log in read_logs(str(path)):
@@ -101,129 +102,139 @@ def logs(kept: Path) -> Iterator[tuple[str, Any]]:
         yield f"{name} {path.name}", content
 
 
-def doctor(kept: Path) -> Iterator[tuple[str, Any]]:
-    """Yield what `inspect` prints of every sample."""
-    for name, path in recordings(kept / "samples"):
-        done = residnet("inspect", path)
-        said = "".join(line for line in done.stderr.splitlines(True) if "so far" not in line)
-        text = f"exit {done.returncode}\n{done.stdout}\n{said}".replace(str(path), "PATH")
+def inspect_samples(folder: Path) -> Iterator[tuple[str, Any]]:
+    """Yield the output of `residnet inspect` for all samples."""
+    for name, path in iterate_samples(folder / "samples"):
+        completed = run_residnet("inspect", path)
+        # progress lines depend on the load of the machine
+        errors = "".join(line for line in completed.stderr.splitlines(True) if "so far" not in line)
+        output = f"exit {completed.returncode}\n{completed.stdout}\n{errors}"
+        text = output.replace(str(path), "PATH")
         yield f"{name} {path.name}", text.splitlines()
 
 
-def page_words(page: str) -> list[str]:
-    """Return the pieces of text of a page, numbers and folders masked, in alphabetical order."""
+def extract_page_text(page: str) -> list[str]:
+    """Return the lines of text of a page without numbers and folders, in alphabetical order."""
     text = re.sub(r"(?s)<(script|style)\b.*?</\1>|<[^>]+>", "\n", page)
-    # this state's folder, which a page may break after any slash, then revisions and checksums
+    # the folder of this checkout, which a page may break after a slash; revisions and checksums
     text = re.sub("/ ?".join(map(re.escape, str(ROOT).split("/"))), "", text)
     text = re.sub(r"\b[0-9a-f]{12,64}\b|[-+]?\d[\d.,e+-]*", "#", text)
     return sorted({" ".join(line.split()) for line in text.splitlines() if len(line) > 12})
 
 
-def runs(kept: Path) -> Iterator[tuple[str, Any]]:
-    """Carry out shortened runs; yield metrics, summary and the words of their pages."""
+def run_short_configs(folder: Path) -> Iterator[tuple[str, Any]]:
+    """Run shortened configs; yield metrics, summary and the text of their pages."""
     from short_configs import SHORT
 
     for name in RUNS:
-        folder = kept / "runs" / name.replace("/", "_")
-        overrides = [one.replace("{runs}", str(kept / "runs")) for one in SHORT[name].overrides]
-        words = ["run", ROOT / "configs" / f"{name}.yaml", "--out", folder, "--overwrite"]
-        done = residnet(*words, *(word for one in overrides for word in ("-s", one)))
-        print(f"  {name}: exit {done.returncode}", flush=True)
-        content: dict[str, Any] = {"said": done.stderr[-2000:]} if done.returncode else {}
+        run = folder / "runs" / name.replace("/", "_")
+        overrides = [
+            override.replace("{runs}", str(folder / "runs")) for override in SHORT[name].overrides
+        ]
+        arguments = ["run", ROOT / "configs" / f"{name}.yaml", "--out", run, "--overwrite"]
+        completed = run_residnet(*arguments, *(part for o in overrides for part in ("-s", o)))
+        print(f"  {name}: exit {completed.returncode}", flush=True)
+        content: dict[str, Any] = {"said": completed.stderr[-2000:]} if completed.returncode else {}
         for file in ("metrics.json", "summary.json"):
-            if (folder / file).is_file():
-                content[file.removesuffix(".json")] = json.loads((folder / file).read_text())
-        if (folder / "report.html").is_file():
-            content["page"] = page_words((folder / "report.html").read_text())
+            if (run / file).is_file():
+                content[file.removesuffix(".json")] = json.loads((run / file).read_text())
+        if (run / "report.html").is_file():
+            content["page"] = extract_page_text((run / "report.html").read_text())
         yield name, content
 
 
-def exports(kept: Path) -> Iterator[tuple[str, Any]]:
-    """Export models of the shortened runs in every format, whose parity each export checks."""
-    for kind in FORMATS:
+def export_models(folder: Path) -> Iterator[tuple[str, Any]]:
+    """Export models of the shortened runs in all formats; yield the exit codes."""
+    for file_format in FORMATS:
         for run, model in EXPORTED:
             with tempfile.TemporaryDirectory() as scratch:
-                file = Path(scratch) / ("model.pt" if kind == "torchscript" else "model")
-                words = ("--model", model, "--format", kind, "--out", file)
-                done = residnet("export", kept / "runs" / run, *words)
-            print(f"  {kind} {run} {model}: exit {done.returncode}", flush=True)
-            yield f"{kind} {run} {model}", done.returncode
+                file = Path(scratch) / ("model.pt" if file_format == "torchscript" else "model")
+                options = ("--model", model, "--format", file_format, "--out", file)
+                completed = run_residnet("export", folder / "runs" / run, *options)
+            print(f"  {file_format} {run} {model}: exit {completed.returncode}", flush=True)
+            yield f"{file_format} {run} {model}", completed.returncode
 
 
-def differences(old: Any, new: Any, tolerance: float, where: str = "") -> Iterator[str]:
-    """Yield where two values differ by more than the tolerance, volatile keys apart."""
+def find_differences(old: Any, new: Any, tolerance: float, path: str = "") -> Iterator[str]:
+    """Yield the keys at which two values differ by more than a tolerance, but `VOLATILE` ones."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in sorted({*old, *new}, key=str):
             if VOLATILE.search(str(key)):
                 continue
             if key not in old or key not in new:
-                yield f"{where}.{key}: only in the {'new' if key not in old else 'old'} state"
+                yield f"{path}.{key}: only in the {'new' if key not in old else 'old'} state"
             else:
-                yield from differences(old[key], new[key], tolerance, f"{where}.{key}")
+                yield from find_differences(old[key], new[key], tolerance, f"{path}.{key}")
     elif isinstance(old, list) and isinstance(new, list):
-        yield from list_differences(old, new, tolerance, where)
+        yield from compare_lists(old, new, tolerance, path)
     elif isinstance(old, np.ndarray | int | float) and type(old) is type(new):
-        yield from number_differences(old, new, tolerance, where)
+        yield from compare_numbers(old, new, tolerance, path)
     elif old != new:
-        yield f"{where}: {str(old)[:160]!r}, now {str(new)[:160]!r}"
+        yield f"{path}: {str(old)[:160]!r}, now {str(new)[:160]!r}"
 
 
-def list_differences(old: list[Any], new: list[Any], tolerance: float, where: str) -> Iterator[str]:
+def compare_lists(old: list[Any], new: list[Any], tolerance: float, path: str) -> Iterator[str]:
     """Yield the lines that only one of two texts has, or the differences of other lists."""
     if all(isinstance(line, str) for line in (*old, *new)):
-        yield from (f"{where}: gone: {line[:200]}" for line in old if line not in new)
-        yield from (f"{where}: new:  {line[:200]}" for line in new if line not in old)
+        yield from (f"{path}: gone: {line[:200]}" for line in old if line not in new)
+        yield from (f"{path}: new:  {line[:200]}" for line in new if line not in old)
     elif all(isinstance(number, int | float) for number in (*old, *new)):
-        yield from differences(np.array(old), np.array(new), tolerance, where)
+        yield from find_differences(np.array(old), np.array(new), tolerance, path)
     else:
-        yield from differences(dict(enumerate(old)), dict(enumerate(new)), tolerance, where)
+        yield from find_differences(dict(enumerate(old)), dict(enumerate(new)), tolerance, path)
 
 
-def number_differences(old: Any, new: Any, tolerance: float, where: str) -> Iterator[str]:
+def compare_numbers(old: Any, new: Any, tolerance: float, path: str) -> Iterator[str]:
     """Yield the largest difference of two numbers or arrays if it exceeds the tolerance."""
     a = np.asarray(old, dtype=float)
     b = np.asarray(new, dtype=float)
     if a.shape != b.shape:
-        yield f"{where}: shape {a.shape}, now {b.shape}"
+        yield f"{path}: shape {a.shape}, now {b.shape}"
     elif not np.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True):
         difference = np.nanmax(np.abs(a - b))
-        yield f"{where}: differs by up to {difference:.3g}" + f" ({old!r})" * (a.ndim == 0)
+        yield f"{path}: differs by up to {difference:.3g}" + f" ({old!r})" * (a.ndim == 0)
 
 
-PARTS = {"logs": logs, "doctor": doctor, "runs": runs, "exports": exports}
+PARTS = {
+    "logs": read_samples,
+    "doctor": inspect_samples,
+    "runs": run_short_configs,
+    "exports": export_models,
+}
+"""Functions that compute the recorded results of the folder, by name."""
 
 
 def main() -> int:
-    """Make or compare; returns 1 where something differs."""
+    """Record or compare results; return 1 if something differs."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("verb", choices=("make", "compare"))
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--only", default=",".join(PARTS), help="parts, with commas between")
-    given = parser.parse_args()
-    kept = given.folder.resolve()
-    total = 0
-    if not (kept / "samples").is_dir():
-        samples(kept / "samples")
-    for part in given.only.split(","):
+    parser.add_argument("--only", default=",".join(PARTS), help="results, separated by commas")
+    arguments = parser.parse_args()
+    folder = arguments.folder.resolve()
+    n_differences = 0
+    if not (folder / "samples").is_dir():
+        write_samples(folder / "samples")
+    for part in arguments.only.split(","):
         print(part, flush=True)
-        file = kept / f"{part}.json"
-        text = json.dumps(dict(PARTS[part](kept)), default=np.ndarray.tolist)
-        if given.verb == "make":
+        file = folder / f"{part}.json"
+        text = json.dumps(dict(PARTS[part](folder)), default=np.ndarray.tolist)
+        if arguments.verb == "make":
             file.write_text(text)
             continue
-        before = json.loads(file.read_text())
-        found = json.loads(text)
-        for name in sorted({*before, *found}):
-            tolerance = LOGS if part == "logs" else FIGURES
-            told = list(differences(before.get(name), found.get(name), tolerance))
-            total += len(told)
-            for line in told[:SHOWN]:
+        recorded = json.loads(file.read_text())
+        current = json.loads(text)
+        for name in sorted({*recorded, *current}):
+            tolerance = LOG_TOLERANCE if part == "logs" else FIGURE_TOLERANCE
+            lines = list(find_differences(recorded.get(name), current.get(name), tolerance))
+            n_differences += len(lines)
+            for line in lines[:MAX_SHOWN_DIFFERENCES]:
                 print(f"  {part}, {name}{line}")
-            if len(told) > SHOWN:
-                print(f"  {part}, {name}: and {len(told) - SHOWN} more")
-    if given.verb == "compare":
-        print(f"{total} differences")
-    return int(total > 0)
+            if len(lines) > MAX_SHOWN_DIFFERENCES:
+                print(f"  {part}, {name}: and {len(lines) - MAX_SHOWN_DIFFERENCES} more")
+    if arguments.verb == "compare":
+        print(f"{n_differences} differences")
+    return int(n_differences > 0)
 
 
 if __name__ == "__main__":

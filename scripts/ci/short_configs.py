@@ -1,8 +1,8 @@
 """Run every shipped config in a shortened form, to its report.
 
-What a config's parts say shortens them (`general`): fewer trials, one epoch, a coarser grid. `OWN`
-has what a config needs besides. Every part of a run is kept. Configs whose data are absent are
-skipped visibly; what takes longer than `LIMIT` fails.
+`shorten_parts` shortens the parts of a config: fewer trials, one epoch, a coarser grid.
+`SPECIFIC_OVERRIDES` has further overrides by config. No part of a run is removed. Configs whose
+data are absent are reported as skipped; a run that takes longer than `TIME_LIMIT` fails.
 
     python scripts/ci/short_configs.py [NAME...] [--jobs 2] [--out FOLDER]
 """
@@ -27,18 +27,18 @@ from residnet.core.config import load_mapping
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs"
-LIMIT = 400
+TIME_LIMIT = 400
 """Seconds after which a run has failed."""
 
 
 @dataclass(frozen=True)
-class Short:
-    """How a config is shortened.
+class ShortConfig:
+    """The shortened form of a config.
 
     Attributes:
-        overrides: of its keys; `{runs}` stands for the folder of all short runs.
-        data: folder below RESIDNET_DATA that it needs; empty for none.
-        after: config whose short run it uses.
+        overrides: overrides of keys; `{runs}` is replaced by the folder of all short runs.
+        data: required folder below RESIDNET_DATA; empty for none.
+        after: config whose short run is used; empty for none.
     """
 
     overrides: tuple[str, ...] = ()
@@ -54,7 +54,7 @@ TRIALS = (
     "data.identification={zigzag: 4, acceleration_deceleration: 2, three_two_one_one: 2}",
     "data.validation={zigzag: 1, acceleration_deceleration: 1, three_two_one_one: 1}",
 )
-# and of those under water
+# fewer simulated trials under water
 DIVES = (
     "data.trials=[{kind: depth_step, count: 4, depth: [1], drive: [0.1, 0.2], dive: [0.1, 0.2]},"
     " {kind: random_steps, count: 4, drive: [0.1, 0.2], steer_amplitude: [0.0, 0.04],"
@@ -86,40 +86,41 @@ POLICY = {
 }
 
 
-def keys(place: str, values: Mapping[str, str]) -> list[str]:
-    """Return overrides of several keys of one place."""
-    return [f"{place}.{key}={value}" for key, value in values.items()]
+def override_keys(section: str, values: Mapping[str, str]) -> list[str]:
+    """Return overrides of several keys of a section."""
+    return [f"{section}.{key}={value}" for key, value in values.items()]
 
 
-def general(content: Mapping[str, Any]) -> list[str]:
+def shorten_parts(content: Mapping[str, Any]) -> list[str]:
     """Return the overrides that follow from the parts of a config."""
     data = content.get("data") or {}
-    out = []
-    kinds = {one["kind"] for one in data.get("trials", ())}
-    out += DIVES if "depth_step" in kinds else TRIALS if "three_two_one_one" in kinds else ()
-    out += COARSE if data.get("kind") == "measured" else ()
-    out += ["refit={}"] if "refit" in content else []
-    out += ["bands=null"] if "refit" in content or data.get("kind") == "measured" else []
+    overrides: list[str] = []
+    kinds = {trial["kind"] for trial in data.get("trials", ())}
+    overrides += DIVES if "depth_step" in kinds else TRIALS if "three_two_one_one" in kinds else ()
+    overrides += COARSE if data.get("kind") == "measured" else ()
+    overrides += ["refit={}"] if "refit" in content else []
+    overrides += ["bands=null"] if "refit" in content or data.get("kind") == "measured" else []
     for head in content.get("training", ()):
-        out += keys(f"training.{head}", EPOCH)
+        overrides += override_keys(f"training.{head}", EPOCH)
     if "conditions" in content:
-        out += [*FLIGHTS, *[BEYOND] * ("beyond" in content["conditions"])]
+        overrides += [*FLIGHTS, *[BEYOND] * ("beyond" in content["conditions"])]
     for name, policy in (content.get("policies") or {}).items():
-        quiet = "steady" in policy["training"]  # it is told that no flight tells whether it swings
-        given = {key: one for key, one in POLICY.items() if key != "steady" or not quiet}
-        out += keys(f"policies.{name}.training", given)
+        # a config that sets `steady` itself keeps its value
+        has_steady = "steady" in policy["training"]
+        settings = {k: value for k, value in POLICY.items() if k != "steady" or not has_steady}
+        overrides += override_keys(f"policies.{name}.training", settings)
     for name in content.get("predictive", ()):
-        out.append(f"predictive.{name}.training={{states: 300, epochs: 5, batch: 50}}")
+        overrides.append(f"predictive.{name}.training={{states: 300, epochs: 5, batch: 50}}")
     task = content["task"]
-    out += ["test.plants=2", "test.dt=0.1 s"] if task == "autopilot" else []
-    out += ["test.bias_time=20 s"] if "beyond" in content.get("conditions", ()) else []
-    out += ["course.interval=10 s"] if task == "ferry_study" else []
-    out += ["repeats=1"] if task == "breeding" else []
-    return out
+    overrides += ["test.plants=2", "test.dt=0.1 s"] if task == "autopilot" else []
+    overrides += ["test.bias_time=20 s"] if "beyond" in content.get("conditions", ()) else []
+    overrides += ["course.interval=10 s"] if task == "ferry_study" else []
+    overrides += ["repeats=1"] if task == "breeding" else []
+    return overrides
 
 
-def lasting(seconds: int, *policies: str) -> tuple[str, ...]:
-    """Return overrides for flights of a slow vessel."""
+def set_durations(seconds: int, *policies: str) -> tuple[str, ...]:
+    """Return overrides of the durations of simulations of a slow vessel."""
     return (
         f"conditions.stated.duration={seconds} s",
         *(f"policies.{name}.training.duration={seconds} s" for name in policies),
@@ -136,12 +137,12 @@ GENETIC = "heads.genetic.evolution={population: 30, generations: 2}"
 ALL_SPLITS = "evaluation.splits=[train, validation, test]"
 PHYSICS = "baselines.physics={kind: regressors, terms: [u, v, r, n]}"
 HEAD = "heads={mlp: {kind: mlp, hidden: [8]}}"
-STEPS = ("~training.lstm", *keys("training.mlp", EPOCH))
+STEPS = ("~training.lstm", *override_keys("training.mlp", EPOCH))
 SWEPT = [*TRIALS, HEAD, *STEPS, "bands=null", "export.models=[]"]
 FEW = "{drives: [0.35, 0.55, 0.7, 1.0], steers: [0.3], zigzag: 40 s, hold: 10 s, courses: [0.0]}"
 HORIZON = "training: {states: 300, epochs: 5}"
 ONE_CELL = ("rows.values=[0.2]", "columns.values=[0.2]", "~published")
-OWN: dict[str, tuple[str, ...]] = {
+SPECIFIC_OVERRIDES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("wam_v_s2", "wam_v_s3", "wam_v_equations"), ("bands=null",)),
     "simulate_wam_v": ("~programme.families",),
     "sweep_quickstart": (
@@ -168,10 +169,13 @@ OWN: dict[str, tuple[str, ...]] = {
         "effort=0.01",
     ),
     **dict.fromkeys(("autopilot_remus", "autopilot_remus_depth"), TORPEDO),
-    "autopilot_conditions_patrol": (*lasting(12, "learned", "constants"), "test.sea_time=10 s"),
-    "autopilot_patrol": (*lasting(12, "policy"), "test.sea_time=10 s"),
+    "autopilot_conditions_patrol": (
+        *set_durations(12, "learned", "constants"),
+        "test.sea_time=10 s",
+    ),
+    "autopilot_patrol": (*set_durations(12, "policy"), "test.sea_time=10 s"),
     "autopilot_patrol_learned": (
-        *lasting(12, "on_vessel", "on_model"),
+        *set_durations(12, "on_vessel", "on_model"),
         "policies.on_model.learned.run={runs}/patrol_identified",
     ),
     "studies/esso_osaka/ablation": (
@@ -227,120 +231,129 @@ AFTER = {
 }
 
 
-def shipped() -> list[str]:
+def list_shipped_configs() -> list[str]:
     """Return the names of all configs of runs: their paths below configs/, without suffix."""
     files = (path for path in CONFIGS.rglob("*.yaml") if path.parent.name != "vessels")
     return sorted(path.relative_to(CONFIGS).with_suffix("").as_posix() for path in files)
 
 
-def short(name: str) -> Short:
-    """Return how a config is shortened."""
+def shorten_config(name: str) -> ShortConfig:
+    """Return the shortened form of a config."""
     file = CONFIGS / f"{name}.yaml"
     content = load_mapping(file)
     base = file.parent / content["base"] if "base" in content else file
-    needs = re.search(r"\$\{RESIDNET_DATA\}/(\w+)", base.read_text(encoding="utf-8"))
-    overrides = (*general(content), *OWN.get(name, ()))
-    return Short(overrides, needs[1] if needs else "", AFTER.get(name, ""))
+    data_match = re.search(r"\$\{RESIDNET_DATA\}/(\w+)", base.read_text(encoding="utf-8"))
+    overrides = (*shorten_parts(content), *SPECIFIC_OVERRIDES.get(name, ()))
+    return ShortConfig(overrides, data_match[1] if data_match else "", AFTER.get(name, ""))
 
 
-SHORT = {name: short(name) for name in shipped()}
+SHORT = {name: shorten_config(name) for name in list_shipped_configs()}
+"""Shortened form of each shipped config by name."""
 
 
 class Result(NamedTuple):
-    """How the short run of a config ended: `ok`, `skipped` or `FAILED`, and why."""
+    """Result of the short run of a config.
+
+    Attributes:
+        state: `ok`, `skipped` or `FAILED`.
+        reason: reason for a skipped or failed run.
+    """
 
     state: str
-    words: str = ""
+    reason: str = ""
 
 
-def carry_out(name: str, runs: Path) -> Result:
-    """Run one config in its short form, and look for its report and finished mark.
+def run_config(name: str, runs: Path) -> Result:
+    """Run a config in its short form; check its report and that it is finished.
 
-    The run is a fork of this process, which has the libraries loaded: ten seconds less each.
+    The run is a fork of this process, which has loaded the libraries: it saves ten seconds.
     """
-    one = SHORT[name]
-    started = time.monotonic()
+    short_config = SHORT[name]
+    start_time = time.monotonic()
     folder = runs / name.replace("/", "_")
-    if one.data and not (Path(os.environ.get("RESIDNET_DATA", "")) / one.data).is_dir():
-        result = Result("skipped", f"no RESIDNET_DATA/{one.data}")
+    data_folder = Path(os.environ.get("RESIDNET_DATA", "")) / short_config.data
+    if short_config.data and not data_folder.is_dir():
+        result = Result("skipped", f"no RESIDNET_DATA/{short_config.data}")
     else:
         runs.mkdir(parents=True, exist_ok=True)
         command = ["residnet", "run", str(CONFIGS / f"{name}.yaml"), "--out", str(folder)]
-        for override in one.overrides:
+        for override in short_config.overrides:
             command += ["-s", override.replace("{runs}", str(runs))]
-        result = forked(command, folder)
-    seconds = time.monotonic() - started
-    print(f"{result.state:8s} {seconds:6.1f} s  {name}  {result.words}".rstrip(), flush=True)
+        result = run_forked(command, folder)
+    seconds = time.monotonic() - start_time
+    print(f"{result.state:8s} {seconds:6.1f} s  {name}  {result.reason}".rstrip(), flush=True)
     return result
 
 
-def forked(command: list[str], folder: Path) -> Result:
-    """Carry out a command line in a fork; return how it ended, and why."""
-    said = folder.with_suffix(".txt")
-    process = multiprocessing.get_context("fork").Process(target=spoken, args=(command, said))
+def run_forked(command: list[str], folder: Path) -> Result:
+    """Run a command in a fork of this process and check the run folder."""
+    output_file = folder.with_suffix(".txt")
+    process = multiprocessing.get_context("fork").Process(
+        target=run_command, args=(command, output_file)
+    )
     process.start()
-    process.join(LIMIT)
+    process.join(TIME_LIMIT)
     if process.is_alive():
         process.kill()
-        return Result("FAILED", f"not done after {LIMIT} s")
+        return Result("FAILED", f"not done after {TIME_LIMIT} s")
     if process.exitcode:
-        last = (said.read_text().strip().splitlines() or [""])[-1]
-        return Result("FAILED", f"exit {process.exitcode}: {last}")
+        last_line = (output_file.read_text().strip().splitlines() or [""])[-1]
+        return Result("FAILED", f"exit {process.exitcode}: {last_line}")
     summary = json.loads((folder / "summary.json").read_text())
     if not summary["finished"] or not summary["verdict"]:
         return Result("FAILED", "summary.json does not say finished, or has no verdict")
-    page = (folder / "report.html").is_file()
-    return Result("ok") if page else Result("FAILED", "no report.html")
+    has_report = (folder / "report.html").is_file()
+    return Result("ok") if has_report else Result("FAILED", "no report.html")
 
 
-def spoken(command: list[str], said: Path) -> None:
-    """Carry out a command line in this process, its output in a file."""
+def run_command(command: list[str], output_file: Path) -> None:
+    """Run a command in this process, write its output to a file, and end the process."""
     from residnet.__main__ import main
 
-    with said.open("w") as stream:
+    with output_file.open("w") as stream:
         for output in (sys.stdout, sys.stderr):
             os.dup2(stream.fileno(), output.fileno())
         sys.argv = command
-        code: object = 0
+        exit_code: object = 0
         try:
             main()
         except SystemExit as end:
-            code = end.code
+            exit_code = end.code
         sys.stdout.flush()
         sys.stderr.flush()
-    # the threads of the parent, which a fork of one cannot join, are not waited for
-    os._exit(code if isinstance(code, int) else 0)
+    # a normal exit would wait for threads of the parent, which do not run in the fork
+    os._exit(exit_code if isinstance(exit_code, int) else 0)
 
 
 def main() -> int:
-    """Run the named configs, or all; return 1 where one failed."""
+    """Run the named configs, or all; return 1 if one failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", help="configs below configs/, without suffix")
-    parser.add_argument("--jobs", type=int, default=2, help="runs side by side")
+    parser.add_argument("--jobs", type=int, default=2, help="number of parallel runs")
     parser.add_argument("--out", type=Path, help="folder for the runs; a temporary one otherwise")
-    given = parser.parse_args()
-    if stale := sorted({*OWN, *AFTER} - set(SHORT)):
-        raise SystemExit(f"{Path(__file__).name} names what is no config: {', '.join(stale)}")
+    arguments = parser.parse_args()
+    if unknown_names := sorted({*SPECIFIC_OVERRIDES, *AFTER} - set(SHORT)):
+        raise SystemExit(f"{Path(__file__).name} has unknown configs: {', '.join(unknown_names)}")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     import lightning  # noqa: F401  (every run that trains loads it; forks have it already)
 
     import residnet.tasks.registry  # noqa: F401
 
-    started = time.monotonic()
-    wanted = set(given.names or SHORT)
-    wanted |= {SHORT[name].after for name in wanted if SHORT[name].after}
+    start_time = time.monotonic()
+    selected_names = set(arguments.names or SHORT)
+    selected_names |= {SHORT[name].after for name in selected_names if SHORT[name].after}
     results: list[Result] = []
-    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(given.jobs) as pool:
-        runs = given.out or Path(temporary)
-        # those whose runs others use come first
-        for later in (False, True):
-            names = sorted(name for name in wanted if bool(SHORT[name].after) == later)
-            results += pool.map(lambda name: carry_out(name, runs), names)
+    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(arguments.jobs) as pool:
+        runs = arguments.out or Path(temporary)
+        # configs whose runs are used by others come first
+        for uses_other_run in (False, True):
+            names = sorted(n for n in selected_names if bool(SHORT[n].after) == uses_other_run)
+            results += pool.map(lambda name: run_config(name, runs), names)
     failed = sum(result.state == "FAILED" for result in results)
     skipped = sum(result.state == "skipped" for result in results)
     print(
-        f"{len(results)} configs: {failed} failed, {skipped} skipped for want of data,"
-        f" {time.monotonic() - started:.0f} s"
+        f"{len(results)} configs: {failed} failed, {skipped} skipped without data,"
+        f" {time.monotonic() - start_time:.0f} s"
     )
     return min(failed, 1)
 

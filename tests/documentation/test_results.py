@@ -14,14 +14,14 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_every_figure_names_a_source_that_exists() -> None:
-    found = [where for page in results.pages() for where, _ in results.marks(page)]
-    assert len(found) > 40
-    for where in found:
-        name, file, *rest = where.split()
-        assert name in results.SOURCES, where
-        assert file == "stdout" or file.endswith(".json"), where
-        assert len(rest) in (1, 2, 3), where
-        assert not rest[1:] or re.fullmatch(r"deg|x[0-9.e-]+", rest[1]), where
+    origins = [origin for page in results.list_pages() for origin, _ in results.find_figures(page)]
+    assert len(origins) > 40
+    for origin in origins:
+        name, file, *rest = origin.split()
+        assert name in results.SOURCES, origin
+        assert file == "stdout" or file.endswith(".json"), origin
+        assert len(rest) in (1, 2, 3), origin
+        assert not rest[1:] or re.fullmatch(r"deg|x[0-9.e-]+", rest[1]), origin
     for command in results.SOURCES.values():
         assert (ROOT / command[0]).is_file(), command
 
@@ -35,11 +35,11 @@ def test_figures_are_read_from_runs_and_put_into_pages(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     marks = ("metrics.json rows[model=b].value x100", r"stdout in\s(\d+\sof\s60)")
     page.write_text("".join(f"<!--= quickstart {mark} -->old<!--/-->; " for mark in marks))
-    assert results.rewrite(page, tmp_path, ["quickstart"]) == 0
-    assert results.rewrite(page, tmp_path, []) == 2
-    assert [text for _, text in results.marks(page)] == ["12.3 / 200", "58 of 60"]
+    assert results.rewrite_page(page, tmp_path, ["quickstart"]) == 0
+    assert results.rewrite_page(page, tmp_path, []) == 2
+    assert [text for _, text in results.find_figures(page)] == ["12.3 / 200", "58 of 60"]
     with pytest.raises(LookupError, match="no entry with model=c"):
-        results.figure("quickstart metrics.json rows[model=c].value", tmp_path)
+        results.read_figure("quickstart metrics.json rows[model=c].value", tmp_path)
 
 
 def test_what_ran_stands_in_the_pages_and_what_did_not_is_named(
@@ -53,10 +53,10 @@ def test_what_ran_stands_in_the_pages_and_what_did_not_is_named(
     good.write_text("import sys; print('took', sys.argv[1])")
     (tmp_path / "bad.py").write_text("raise SystemExit('no such luck')")
     (tmp_path / "long.py").write_text("import time; time.sleep(60)")
-    monkeypatch.setattr(results, "pages", lambda: [page])
+    monkeypatch.setattr(results, "list_pages", lambda: [page])
     monkeypatch.setattr(results, "SOURCES", made)
-    monkeypatch.setattr(results, "state", lambda: "now")
-    monkeypatch.setattr(results, "git", lambda *words: "abc")
+    monkeypatch.setattr(results, "hash_inputs", lambda: "now")
+    monkeypatch.setattr(results, "run_git", lambda *arguments: "abc")
     call = ["results.py", "--runs", str(tmp_path / "runs"), "--only", "good,bad,long"]
     monkeypatch.setattr(sys, "argv", [*call, "--minutes", "0.03"])
 
@@ -65,12 +65,12 @@ def test_what_ran_stands_in_the_pages_and_what_did_not_is_named(
         return capsys.readouterr().out
 
     told = said()
-    assert [text for _, text in results.marks(page)] == ["7", "old", "old", "old"]
+    assert [text for _, text in results.find_figures(page)] == ["7", "old", "old", "old"]
     for words in (
-        "1 figures changed; those that were run are of commit abc.",
+        "1 figures changed; the figures of this call are of commit abc.",
         "not run: bad: failed: no such luck",
         "not run: long: takes longer than 0.03 minutes",
-        "not run: other: not asked for",
+        "not run: other: not selected",
     ):
         assert words in told
     # what is finished is not run again, unless its command or its source is another one
@@ -78,7 +78,7 @@ def test_what_ran_stands_in_the_pages_and_what_did_not_is_named(
     assert "running good" not in said()
     made["good"] = (str(good), "8")
     said()
-    assert next(text for _, text in results.marks(page)) == "8"
+    assert next(text for _, text in results.find_figures(page)) == "8"
     good.write_text("print('took long')")
-    monkeypatch.setattr(results, "state", lambda: "later")
+    monkeypatch.setattr(results, "hash_inputs", lambda: "later")
     assert "has no figure good stdout" in said()

@@ -37,10 +37,10 @@ def test_what_cannot_run_is_skipped_and_what_fails_has_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
-    result = short_configs.carry_out("kvlcc2", tmp_path)
+    result = short_configs.run_config("kvlcc2", tmp_path)
     assert (result.state, result.words) == ("skipped", "no RESIDNET_DATA/kvlcc2")
-    wrong = short_configs.Short(("trials=3",))
+    wrong = short_configs.ShortConfig(("trials=3",))
     monkeypatch.setitem(short_configs.SHORT, "wam_v_trials", wrong)
-    result = short_configs.carry_out("wam_v_trials", tmp_path)
+    result = short_configs.run_config("wam_v_trials", tmp_path)
     assert result.state == "FAILED"
     assert "unknown key" in result.words
