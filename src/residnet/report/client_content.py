@@ -19,6 +19,7 @@ from residnet.evaluation.derivatives import DerivativeRow, DerivativesFile
 from residnet.evaluation.records import BookletFile, BookletIndex, BookletRow
 from residnet.physics.similarity import is_rudder
 from residnet.report.run_reader import RunFiles
+from residnet.report.run_settings import ModelSettings
 from residnet.report.sections.manoeuvres import index_title
 
 _SPLIT_TITLES = {
@@ -492,17 +493,16 @@ def _manoeuvre_title(page: BookletRow) -> str:
 
 
 def _describe_extrapolation(
-    booklet: BookletFile | None, model_settings: Mapping[str, Any]
+    booklet: BookletFile | None, model_settings: ModelSettings
 ) -> list[str]:
     """Return a sentence on standard manoeuvres whose rudder angle the tests do not contain."""
-    signals = model_settings.get("signals", {})
-    inputs = list(signals.get("inputs", ()))
-    rudder = next((name for name in inputs if is_rudder(name)), None)
+    signals = model_settings.signals
+    rudder = next((name for name in signals.inputs if is_rudder(name)), None)
     if booklet is None or rudder is None:
         return []
-    index = len(signals.get("velocities", ())) + inputs.index(rudder)
-    low = model_settings["low"][index]
-    high = model_settings["high"][index]
+    index = len(signals.velocities) + signals.inputs.index(rudder)
+    low = model_settings.low[index]
+    high = model_settings.high[index]
     # measured angles differ from the ordered ones by noise and offsets
     margin = 0.05 * (high - low)
     beyond = [
@@ -529,14 +529,11 @@ def _limits_section(
     """Return the range of the tests, and what the predictions do not contain."""
     section = ReportSection("Limits of validity")
     model = booklet.model if booklet is not None else run.selected
-    settings = run.read_json(f"models/{model}/model.json")
-    signals = settings.get("signals", {}) if isinstance(settings, dict) else {}
-    names = [*signals.get("velocities", ()), *signals.get("inputs", ())]
+    settings = run.model_settings(model)
+    names = [*settings.signals.velocities, *settings.signals.inputs]
     scale = booklet.scale if booklet is not None else 1.0
     rows = []
-    for name, low, high in zip(
-        names, settings.get("low", ()), settings.get("high", ()), strict=False
-    ):
+    for name, low, high in zip(names, settings.low, settings.high, strict=False):
         si = run.si_unit(name)
         unit, factor = display_unit(si)
         ship = scale ** {"1/s": -0.5, **_SHIP_EXPONENTS}.get(si, 0.0)

@@ -86,11 +86,13 @@ class SignalSettings(ShownSettings):
     """The inputs of the models.
 
     Attributes:
+        velocities: velocities of the models; empty if they are not recorded.
         inputs: commands or actuator states.
         exogenous: further inputs, such as wind.
         forces: vessel whose thrusters give the forces, or their settings; None for none.
     """
 
+    velocities: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
     exogenous: tuple[str, ...] = ()
     forces: object = None

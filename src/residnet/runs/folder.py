@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from residnet.core.records import StoredFile
-    from residnet.evaluation.records import MetricsFile
+    from residnet.evaluation.records import ExcitationFile, MetricsFile
 
 
 SUMMARY_SCHEMA: Final = "residnet.summary/1"
@@ -287,9 +287,11 @@ class RunFolder:
 
         return MetricsFile.read(self.metrics)
 
-    def read_excitation(self) -> dict[str, Any]:
-        """Return the contents of excitation.json; empty for runs of earlier versions."""
-        return read_json(self.excitation) if self.excitation.is_file() else {}
+    def read_excitation(self) -> ExcitationFile | None:
+        """Return the contents of excitation.json; None for runs of earlier versions."""
+        from residnet.evaluation.records import ExcitationFile
+
+        return ExcitationFile.read_optional(self.path, self.excitation.name)
 
     def read_fit_notes(self, model: str) -> dict[str, Any]:
         """Return the content of models/<model>/fit.json; empty if the file does not exist."""

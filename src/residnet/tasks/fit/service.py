@@ -23,6 +23,7 @@ from residnet.core.names import suggest_name
 from residnet.core.ownership import record_folder
 from residnet.core.progress import log_message
 from residnet.evaluation.metrics import find_row
+from residnet.evaluation.records import ExcitationFile
 from residnet.identification.identified import evaluate_splits, make_candidates
 from residnet.identification.monitoring import (
     ChangeDetector,
@@ -667,30 +668,31 @@ def plan_next_trials(
 
 
 def advise_excitation(
-    excitation: Mapping[str, Any], steering_inputs: Sequence[str]
+    excitation: ExcitationFile | None, steering_inputs: Sequence[str]
 ) -> tuple[str, ...]:
     """Return a sentence for each input or pair of inputs that the training logs do not excite.
 
     Args:
-        excitation: contents of excitation.json; may be empty.
+        excitation: contents of excitation.json; None if the run has no such file.
         steering_inputs: names of the inputs that steer.
     """
+    if excitation is None:
+        return ()
     sentences = []
-    for row in excitation.get("inputs") or []:
-        name = row["name"]
-        if row["state"] == "excited":
+    for row in excitation.inputs:
+        if row.state == "excited":
             continue
         manoeuvre = (
             "a zigzag, a 3-2-1-1 or random steps in open loop"
-            if name in steering_inputs
+            if row.name in steering_inputs
             else "steps between at least three levels"
         )
-        sentences.append(f"Not excited: {row['text']}; run {manoeuvre} of {name}.")
-    for row in excitation.get("directions") or []:
-        if not row["is_excited"]:
-            first, second = row["inputs"]
+        sentences.append(f"Not excited: {row.text}; run {manoeuvre} of {row.name}.")
+    for direction in excitation.directions:
+        if not direction.is_excited:
+            first, second = direction.inputs
             sentences.append(
-                f"Not excited: {row['name']}; run steps of {first} and {second} independent of"
+                f"Not excited: {direction.name}; run steps of {first} and {second} independent of"
                 " each other."
             )
     return tuple(sentences)
