@@ -21,8 +21,18 @@ from residnet.autopilot.courses.course_plan import Course
 from residnet.autopilot.guidance import CourseGuidance, TrackKeeping
 from residnet.autopilot.heading.policies import MAX_DEPTH, SteeringPolicy
 from residnet.autopilot.heading.steering_variation import DEPTH, HEADING
+from residnet.autopilot.records import (
+    AnyCourseRow,
+    CardSchema,
+    CommandLimits,
+    ControllerCard,
+    CourseStart,
+    HeadingRow,
+    MeasuredQuantity,
+    ReferenceQuantity,
+    SteeringParameters,
+)
 from residnet.core.errors import ExportError
-from residnet.core.records import Record
 from residnet.core.version import __version__
 from residnet.export.base import Exportable, LoadedExport, RoundingError
 from residnet.export.torchscript import get_size, require_shape, trace_function
@@ -409,7 +419,7 @@ class ExportedController(Exportable):
         metrics: rows of metrics.json of this policy for the model card.
     """
 
-    schema: str
+    schema: CardSchema
     kind: str
     methods = ("initial_state", "step")
 
@@ -420,7 +430,7 @@ class ExportedController(Exportable):
         *,
         fallback: FallbackCommand,
         description: Mapping[str, Any],
-        metrics: Sequence[Record],
+        metrics: Sequence[HeadingRow | AnyCourseRow],
     ) -> None:
         self.name = name
         self.policy = policy
@@ -475,38 +485,35 @@ class ExportedController(Exportable):
         measured_ranges = zip(module.low.tolist(), module.high.tolist(), strict=True)
         fallback_text = "held" if self.fallback == "hold" else "amidships"
         reference_text = ", reference" if self._reference_arguments() else ""
-        return {
-            "schema": self.schema,
-            "policy": self.name,
-            "measured": [
-                {"name": name, "unit": unit, "range": list(limits)}
+        command = CommandLimits(
+            name=self.steering_axis.command,
+            unit="rad",
+            limit=policy.limit,
+            rate=None if math.isinf(policy.rate) else policy.rate,
+        )
+        card = ControllerCard(
+            schema=self.schema,
+            policy=self.name,
+            measured=tuple(
+                MeasuredQuantity(name=name, unit=unit, range=limits)
                 for (name, unit), limits in zip(
                     self.measured_units.items(), measured_ranges, strict=True
                 )
-            ],
-            **self.describe_for_card(module),
-            "fault": (
-                f"measurement{reference_text} or memory no number or out of range: command"
-                f" {fallback_text}, flag"
-                " set"
             ),
-            "command": [
-                {
-                    "name": self.steering_axis.command,
-                    "unit": "rad",
-                    "limit": policy.limit,
-                    "rate": None if math.isinf(policy.rate) else policy.rate,
-                }
-            ],
-            "dt": policy.dt,
+            **self.describe_for_card(module),
+            fault=f"measurement{reference_text} or memory no number or out of range: command"
+            f" {fallback_text}, flag set",
+            command=(command,),
+            dt=policy.dt,
             **policy.describe(),
-            "turning": {"K": policy.gain, "T": policy.time_constant, "speed": policy.speed},
-            "frame": _FRAME_OF_AXIS[self.steering_axis],
-            "versions": {"residnet": __version__, "torch": torch.__version__},
-            "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            turning=SteeringParameters(K=policy.gain, T=policy.time_constant, speed=policy.speed),
+            frame=_FRAME_OF_AXIS[self.steering_axis],
+            versions={"residnet": __version__, "torch": torch.__version__},
+            exported=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             **self.description,
-            "metrics": [row.model_dump(mode="json", exclude_unset=True) for row in self.metrics],
-        }
+            metrics=tuple(self.metrics),
+        )
+        return card.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
     def check_parity(
         self, loaded: LoadedExport, subject: str, dtype: torch.dtype, tolerance: float | None = None
@@ -561,7 +568,7 @@ class ExportedController(Exportable):
 class ExportedHeading(ExportedController):
     """Export of a heading or depth policy; some laws with a rudder rate need double precision."""
 
-    schema = "residnet.policy_card/1"
+    schema: CardSchema = "residnet.policy_card/1"
     kind = "policy"
     results = ("command", "s_after", "fault")
     flags = ("fault",)
@@ -589,12 +596,12 @@ class ExportedHeading(ExportedController):
 
     def describe_for_card(self, module: Any) -> dict[str, Any]:
         return {
-            "reference": [
-                {
-                    "name": self.steering_axis.name,
-                    "unit": self.measured_units[self.steering_axis.value],
-                }
-            ],
+            "reference": (
+                ReferenceQuantity(
+                    name=self.steering_axis.name,
+                    unit=self.measured_units[self.steering_axis.value],
+                ),
+            ),
             "memory": [*module.policy.memory_ranges(1.0, 1.0), "last_command"],
         }
 
@@ -603,7 +610,7 @@ class ExportedHeading(ExportedController):
 class ExportedCoursePolicy(ExportedController):
     """Export of a heading policy with the guidance of a planned course."""
 
-    schema = "residnet.course_card/1"
+    schema: CardSchema = "residnet.course_card/1"
     kind = "course of"
     results = ("command", "s_after", "fault", "arrived")
     flags = ("fault", "arrived")
@@ -618,7 +625,7 @@ class ExportedCoursePolicy(ExportedController):
         *,
         fallback: FallbackCommand,
         description: Mapping[str, Any],
-        metrics: Sequence[Record],
+        metrics: Sequence[HeadingRow | AnyCourseRow],
     ) -> None:
         self.guidance = guidance
         self.course = course
@@ -657,7 +664,7 @@ class ExportedCoursePolicy(ExportedController):
         (north, east) = course.track[0].tolist()
         heading = float(course.heading[0])
         return {
-            "start": {"north": north, "east": east, "heading": heading},
+            "start": CourseStart(north=north, east=east, heading=heading),
             "length": course.length,
             "lookahead": module.guidance.lookahead,
             "memory": [

@@ -23,6 +23,8 @@ ControllerKind = Literal[
     "floor",
 ]
 """Roles of controllers in a comparison."""
+CardSchema = Literal["residnet.policy_card/1", "residnet.course_card/1"]
+"""Formats of the model card of a controller."""
 
 # metrics.json of the task `autopilot`
 
@@ -329,3 +331,119 @@ class CourseMetricsFile(FileRecord):
     smallest: SmallestTurn
     feasibility: tuple[BuoyFeasibility, ...]
     rows: tuple[AnyCourseRow, ...] = Field(min_length=1)
+
+
+# model card of an exported controller
+
+
+class MeasuredQuantity(Record):
+    """A measurement of a controller.
+
+    Attributes:
+        name: name of the channel.
+        unit: unit of the channel.
+        range: smallest and largest accepted value.
+    """
+
+    name: str
+    unit: str
+    range: tuple[float, float]
+
+
+class ReferenceQuantity(Record):
+    """The reference of a controller.
+
+    Attributes:
+        name: `heading` or `depth`.
+        unit: unit of the reference.
+    """
+
+    name: str
+    unit: str
+
+
+class CommandLimits(Record):
+    """The command of a controller.
+
+    Attributes:
+        name: name of the command.
+        unit: unit of the command.
+        limit: largest absolute value.
+        rate: largest rate per second; None for no limit.
+    """
+
+    name: str
+    unit: str
+    limit: float
+    rate: float | None
+
+
+class CourseStart(Record):
+    """Start of a planned course.
+
+    Attributes:
+        north: north coordinate in m.
+        east: east coordinate in m.
+        heading: heading in rad.
+    """
+
+    north: float
+    east: float
+    heading: float
+
+
+class SteeringParameters(Record):
+    """Nomoto's model of the vessel for which a controller was designed.
+
+    Attributes:
+        K: gain in 1/s.
+        T: time constant in s.
+        speed: speed in m/s at which they hold.
+    """
+
+    K: float
+    T: float
+    speed: float
+
+
+class ControllerCard(Record):
+    """Entries of the model card of a policy or of a policy with a course.
+
+    Further entries describe the structure of the policy, its vessel and its training.
+
+    Attributes:
+        policy: name of the policy.
+        measured: measurements in the order of the input y.
+        reference: reference of a policy; absent for a course.
+        start: start of the course; absent for a policy.
+        length: length of the course in m; absent for a policy.
+        lookahead: look-ahead distance of the guidance in m; absent for a policy.
+        memory: names of the entries of the memory s.
+        fault: meaning of the flag.
+        command: the command and its limits.
+        dt: time step in s.
+        turning: Nomoto's model of the vessel.
+        frame: axes and signs.
+        versions: versions of the packages.
+        exported: time of the export in UTC.
+        metrics: rows of metrics.json of this policy.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    schema_name: CardSchema = Field(alias="schema")
+    policy: str
+    measured: tuple[MeasuredQuantity, ...]
+    reference: tuple[ReferenceQuantity, ...] | None = None
+    start: CourseStart | None = None
+    length: float | None = None
+    lookahead: float | None = None
+    memory: tuple[str, ...]
+    fault: str
+    command: tuple[CommandLimits, ...]
+    dt: float
+    turning: SteeringParameters
+    frame: str
+    versions: dict[str, str]
+    exported: str
+    metrics: tuple[HeadingRow | CourseRow | CourseEnsembleRow, ...]
