@@ -38,9 +38,9 @@ def test_what_cannot_run_is_skipped_and_what_fails_has_failed(
 ) -> None:
     monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
     result = short_configs.run_config("kvlcc2", tmp_path)
-    assert (result.state, result.words) == ("skipped", "no RESIDNET_DATA/kvlcc2")
+    assert (result.state, result.reason) == ("skipped", "no RESIDNET_DATA/kvlcc2")
     wrong = short_configs.ShortConfig(("trials=3",))
     monkeypatch.setitem(short_configs.SHORT, "wam_v_trials", wrong)
     result = short_configs.run_config("wam_v_trials", tmp_path)
     assert result.state == "FAILED"
-    assert "unknown key" in result.words
+    assert "unknown key" in result.reason
