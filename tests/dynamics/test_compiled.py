@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from residnet.core.errors import ExportError
 from residnet.core.processes import worker_limit
 from residnet.dynamics.base import Dynamics
-from residnet.engine import c_code, compiled
+from residnet.engine import c_code, rollout_source
 from residnet.engine.compiled import CompiledRollout, _clip_row_gradients
 from residnet.engine.rollout import Rollout, Source
 
@@ -112,8 +112,8 @@ def test_what_is_no_number_stays_so_and_subnormal_numbers_stay_numbers() -> None
 def test_functions_of_many_numbers_are_right_to_the_last_digits(
     dtype: torch.dtype, most: float, close: float, tiny: float
 ) -> None:
-    functions = compiled._VECTOR_FUNCTIONS[dtype]
-    source = compiled._write_prelude(dtype) + "".join(
+    functions = rollout_source._VECTOR_FUNCTIONS[dtype]
+    source = rollout_source._write_prelude(dtype) + "".join(
         f"void each_{name}(const REAL *a, REAL *o, long n)"
         f" {{ for (long i = 0; i < n; i += LANES) *(U *)(o + i) = v_{name}(*(U *)(a + i)); }}\n"
         for name in functions
