@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import shutil
 import sys
 from collections.abc import Iterator
@@ -14,6 +15,9 @@ from tiny import TINY, Command, Said, call, write_yaml
 
 from residnet.core.registry import clear_caches
 from residnet.export import vessel
+
+# the interval between searches for reference cycles that the command line uses
+gc.set_threshold(100_000)
 
 DEAR = (
     "contracts/test_every_part.py",
@@ -37,6 +41,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Order the files; `--dist loadfile` gives each to one process, which makes its fixtures."""
     order = {f"tests/{name}": number for number, name in enumerate(DEAR)}
     items.sort(key=lambda item: order.get(item.nodeid.partition("::")[0], len(DEAR)))
+
+
+def pytest_collection_finish() -> None:
+    """Exclude modules and collected tests, which live until the end, from the search for cycles."""
+    gc.freeze()
 
 
 @pytest.fixture

@@ -13,8 +13,7 @@ from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-import yaml
-from tiny import TINY
+from tiny import TINY, write_yaml
 
 import residnet
 from residnet.core.registry import import_object
@@ -55,6 +54,8 @@ RUN_COMMANDS = """
 import json, sys
 import residnet
 from residnet.__main__ import main
+from residnet.export import vessel
+vessel.PARITY_STEPS = 60
 commands, wings = json.loads(sys.argv[1])
 for command in commands:
     sys.argv = ["residnet", *command]
@@ -145,7 +146,17 @@ def test_core_commands_load_no_wing(tmp_path: Path) -> None:
     """Lists, a fit with an export, and another export import no module of a wing."""
     config = {**TINY, "heads": {"ridge": TINY["heads"]["ridge"]}, "export": {"models": ["ridge"]}}
     del config["training"], config["ensembles"]
-    (tmp_path / "fit.yaml").write_text(yaml.safe_dump(config))
+    # short trials, and no bands, whose free runs take most of the time
+    data = {"duration": 15, "trials": [{"kind": "zigzag", "count": 4, "heading": ["20 deg"]}]}
+    data |= {"identification": {"zigzag": 2}, "validation": {"zigzag": 1}}
+    terms = ["u", "v", "r", "tau_x", "tau_n"]
+    config |= {"data": {**TINY["data"], **data}, "bands": None}
+    config["baseline"] = {"kind": "regressors", "terms": terms}
+    config["evaluation"] = {
+        **TINY["evaluation"],
+        "protocols": {"manoeuvre": {"kind": "manoeuvre"}},
+    }
+    write_yaml(tmp_path / "fit.yaml", config)
     catalogues = ("tasks", "heads", "baselines", "manoeuvres", "readers", "vessels", "formats")
     commands = [
         *(["list", catalogue] for catalogue in catalogues),

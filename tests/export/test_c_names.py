@@ -24,6 +24,7 @@ from residnet.engine import c_code
 from residnet.engine.c_code import find_compiler
 from residnet.evaluation.assessment import Assessment, CardFinding, name_splits
 from residnet.export import c, get_exporter
+from residnet.export import vessel as exported_vessel
 from residnet.export.c import (
     STRICT_FLAGS,
     measure_c_export,
@@ -70,10 +71,41 @@ LINKS = {
 }  # fmt: skip
 
 
+MODELS = {"steer.c": 1.0, "my-boat 2.c": 0.5}
+"""Scale of the coefficients of the model in each file."""
+
+
+@pytest.fixture(scope="module")
+def two_exports(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the C files of `MODELS`."""
+    folder = tmp_path_factory.mktemp("two_exports")
+    for name, scale in MODELS.items():
+        export_quickly(vessel(scale), folder / name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def lstm_export(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The C file of a model with a memory."""
+    file = tmp_path_factory.mktemp("lstm") / "boat.c"
+    export_quickly(ExportedVessel(*built("lstm")), file)
+    return file
+
+
+def export_quickly(made: ExportedVessel, file: Path) -> None:
+    """Write a C file; few steps are compared with the model, as in `short_parity`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(exported_vessel, "PARITY_STEPS", 60)
+        get_exporter("c").export(made, file)
+
+
 @pytest.mark.parametrize("way", LINKS)
-def test_two_exports_of_one_model_name_serve_one_program(way: str, tmp_path: Path) -> None:
-    models = {"steer.c": vessel(), "my-boat 2.c": vessel(0.5)}
-    cards = {name: get_exporter("c").export(made, tmp_path / name) for name, made in models.items()}
+def test_two_exports_of_one_model_name_serve_one_program(
+    way: str, two_exports: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(two_exports, tmp_path, dirs_exist_ok=True)
+    models = [vessel(scale) for scale in MODELS.values()]
+    cards = [json.loads((tmp_path / name).with_suffix(".card.json").read_text()) for name in MODELS]
     (tmp_path / "main.c").write_text(MAIN)
     parts = ("steer.c", "my-boat 2.c", "main.c")
     (tmp_path / "all.c").write_text("".join(f'#include "{part}"\n' for part in parts))
@@ -83,12 +115,12 @@ def test_two_exports_of_one_model_name_serve_one_program(way: str, tmp_path: Pat
         subprocess.run([*call, *flags], cwd=tmp_path, check=True)
     printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True).stdout.split()
     x, w = torch.tensor([[0.0, 0, 0, 1, 0, 0]]), torch.tensor([[9.0, 9, 3, 1]])
-    for found, made in zip(printed[:2], models.values(), strict=True):
+    for found, made in zip(printed[:2], models, strict=True):
         with torch.no_grad():
             after, _ = made.to_precision(torch.float32).step(x, w, x[:, :0])
         assert float(found) == pytest.approx(float(after[0, 3]), rel=1e-6)
     assert printed[0] != printed[1]
-    assert printed[2:] == [card["build"]["identity"] for card in cards.values()]
+    assert printed[2:] == [card["build"]["identity"] for card in cards]
     assert printed[2] != printed[3]
 
 
@@ -169,10 +201,8 @@ def test_stack_and_size_are_reported_before_the_file_is_written(
     assert [f"  warning: {warning}" for warning in warnings] == [text for text, _ in heard[1:]]
 
 
-def test_the_stack_of_a_call_holds_that_of_the_functions_that_it_calls(tmp_path: Path) -> None:
-    spec, model = built("lstm")
-    get_exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
-    size = measure_footprint(tmp_path / "boat.c")
+def test_the_stack_of_a_call_holds_that_of_the_functions_that_it_calls(lstm_export: Path) -> None:
+    size = measure_footprint(lstm_export)
     own = size["stack_bytes"]
     called = max(own["boat_step"], own["boat_measured"])
     assert size["largest_stack_bytes"] == own["boat_warmup"] + called
@@ -223,17 +253,15 @@ def test_the_single_model_is_proposed_with_its_size(
 
 @pytest.mark.parametrize("known", [["cc", "size"], ["cc"], []])
 def test_what_the_tools_do_not_measure_is_estimated_and_said_so(
-    known: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    known: list[str], lstm_export: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spec, model = built("lstm")
-    get_exporter("c").export(ExportedVessel(spec, model), tmp_path / "boat.c")
-    measured = measure_footprint(tmp_path / "boat.c")
+    measured = measure_footprint(lstm_export)
     path = tools(tmp_path / "bin", known)
     found = {name: f"{path}/{name}" for name in known}
     monkeypatch.delenv("CC", raising=False)
     for module in (c, c_code):
         monkeypatch.setattr(module.shutil, "which", found.get)
-    size = measure_footprint(tmp_path / "boat.c")
+    size = measure_footprint(lstm_export)
     assert size["stack_from"] == "estimate"
     assert (size["code_from"] == "estimate") == ("size" not in known)
     assert size["stack_bytes"].keys() == measured["stack_bytes"].keys()

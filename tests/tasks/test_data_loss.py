@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from pictures import omit_drawings
 from tiny import Command, call, write_yaml
 
 from residnet.export import vessel
@@ -27,6 +28,11 @@ COLLISIONS = (
     "boat_vessel.yaml", "logs/turn.parquet", "rollouts/external/turn.parquet",
 )  # fmt: skip
 """Names of files that some command writes."""
+
+
+@pytest.fixture(autouse=True)
+def _no_drawings(monkeypatch: pytest.MonkeyPatch) -> None:
+    omit_drawings(monkeypatch)
 
 
 @pytest.fixture(scope="module")

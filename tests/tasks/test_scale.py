@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import TINY, Command, read_json, write_yaml
+from tiny import Command, read_json
 
 import residnet
+from residnet.export import vessel
 
 
 def test_the_full_scale_run_has_the_errors_of_the_model_in_units_of_the_ship(
-    tmp_path: Path, command: Command
+    tiny_run: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = tmp_path / "run"
+    monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
+    run = shutil.copytree(tiny_run, tmp_path / "run")
     ship = tmp_path / "ship"
-    assert command("run", write_yaml(tmp_path / "tiny.yaml", TINY), "--out", run).code == 0
     said = command("scale", run, "--scale", "16", "--out", ship)
     assert said.code == 0, said.err
     assert "not of full-scale trials" in said.out
@@ -44,10 +46,8 @@ def test_the_full_scale_run_has_the_errors_of_the_model_in_units_of_the_ship(
     assert "needs its source" in unknown.err
 
 
-def test_a_scaled_model_simulates_like_the_original(tmp_path: Path, command: Command) -> None:
-    run = tmp_path / "run"
-    assert command("run", write_yaml(tmp_path / "tiny.yaml", TINY), "--out", run).code == 0
-    model = residnet.load(run, "baseline")
+def test_a_scaled_model_simulates_like_the_original(tiny_run: Path) -> None:
+    model = residnet.load(tiny_run, "baseline")
     ship = model.scale(16.0)
     low = np.array(model.spec.low)
     high = np.array(model.spec.high)

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from forged_run import forge_sums
+from pictures import omit_drawings
 from tiny import TINY, Command, read_json, write_yaml
 
 from residnet import load
@@ -21,7 +22,18 @@ def _config(head: dict[str, Any]) -> dict[str, Any]:
     config = copy.deepcopy(TINY)
     config |= {"name": "boosted", "heads": {"boosting": head}, "bands": None}
     config |= {"ensembles": {}, "training": {}, "export": {"models": []}}
-    config["data"]["duration"] = 25
+    # a step of these heads takes a millisecond: few, short free runs suffice
+    config["data"] |= {
+        "duration": 15,
+        "trials": [
+            {"kind": "zigzag", "count": 5, "heading": ["20 deg"], "start": 1},
+            {"kind": "three_two_one_one", "count": 2, "start": 1},
+        ],
+        "identification": {"zigzag": 4, "three_two_one_one": 1},
+        "validation": {"zigzag": 1, "three_two_one_one": 0},
+    }
+    config["baseline"] = {"kind": "regressors", "terms": ["u", "v", "r", "tau_x", "tau_n"]}
+    del config["evaluation"]["protocols"]["T10"]
     return config
 
 
@@ -38,6 +50,11 @@ MEMORY = {
         "sklearn.linear_model.LinearRegression",
     ],
 }
+
+
+@pytest.fixture(autouse=True)
+def _no_drawings(monkeypatch: pytest.MonkeyPatch) -> None:
+    omit_drawings(monkeypatch)
 
 
 def test_the_plain_head_runs_to_its_end(command: Command, tmp_path: Path) -> None:

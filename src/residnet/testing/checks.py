@@ -188,8 +188,28 @@ def make_example_models() -> list[tuple[ModelSpec, HybridDynamics]]:
 def make_example_model(spec: ModelSpec) -> HybridDynamics:
     """Build the model of a specification of `make_example_spec` and identify its baseline.
 
-    The head is calibrated on the example samples; a closed-form head is fitted to them.
+    The head is calibrated on the example samples; a closed-form head is fitted to them. A second
+    call with an equal specification returns a copy of the first model, and leaves the generator of
+    random numbers as the first call did.
     """
+    key = (type(spec.baseline), type(spec.head), spec.model_dump_json())
+    if key not in _EXAMPLE_MODELS:
+        model = _identify_example_model(spec)
+        _EXAMPLE_MODELS[key] = model, torch.get_rng_state()
+    model, random_state = _EXAMPLE_MODELS[key]
+    torch.set_rng_state(random_state)
+    return copy.deepcopy(model)
+
+
+_EXAMPLE_MODELS: dict[tuple[type, type, str], tuple[HybridDynamics, Tensor]] = {}
+"""Example models by types and content of their specification, with the random state after each.
+
+Heads that search for terms take seconds to fit, and a contract needs the same model several times.
+"""
+
+
+def _identify_example_model(spec: ModelSpec) -> HybridDynamics:
+    """Build the model of a specification and identify it from the example samples."""
     torch.manual_seed(0)
     model = spec.build()
     training_samples = make_example_samples(signals=spec.signals)
