@@ -14,7 +14,6 @@ from sample_package import TASKS, install
 from tiny import TINY, Command, Said, call, write_yaml
 
 from residnet.core.registry import clear_caches
-from residnet.export import vessel
 
 # the interval between searches for reference cycles that the command line uses
 gc.set_threshold(100_000)
@@ -78,10 +77,16 @@ def tiny_config(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_run(tiny_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run, a copy for each process."""
+    """A finished run without drawings, a copy for each process."""
 
     def make(folder: Path) -> None:
+        # not at the top: the process that distributes the tests needs no PyTorch
+        from pictures import omit_drawings
+
+        from residnet.export import vessel
+
         with pytest.MonkeyPatch.context() as patch:
+            omit_drawings(patch)
             patch.setattr(vessel, "PARITY_STEPS", 60)
             assert call(patch, "run", tiny_config, "--out", folder) == 0
 

@@ -9,6 +9,7 @@ import json
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -83,8 +84,7 @@ def imports(path: Path, *, at_load: bool = False, at_work: bool = False) -> set[
     run, too; `from residnet import x` names the module x where there is one.
     """
     found: set[str] = set()
-    tree = ast.parse(path.read_text())
-    nodes = executed(tree, inside=at_work) if at_load or at_work else list(ast.walk(tree))
+    nodes = statements(path, executed=at_load or at_work, inside=at_work or not at_load)
     for node in nodes:
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
@@ -96,16 +96,35 @@ def imports(path: Path, *, at_load: bool = False, at_work: bool = False) -> set[
     return found
 
 
-def executed(tree: ast.AST, *, inside: bool) -> list[ast.AST]:
-    """Nodes outside `if TYPE_CHECKING`, and outside functions or `inside` them, too."""
-    out: list[ast.AST] = []
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and not inside:
-            continue
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            continue
-        out += [node, *executed(node, inside=inside)]
-    return out
+@cache
+def parse(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+def statements(path: Path, *, executed: bool, inside: bool) -> Iterator[ast.AST]:
+    """Yield the statements of a file; expressions contain no imports.
+
+    Args:
+        path: the file.
+        executed: whether to leave out those below `if TYPE_CHECKING`.
+        inside: whether to include those of functions.
+    """
+    pending: list[ast.AST] = [parse(path)]
+    while pending:
+        node = pending.pop()
+        yield node
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.expr):
+                continue
+            if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef) and not inside:
+                continue
+            if (
+                executed
+                and isinstance(child, ast.If)
+                and "TYPE_CHECKING" in ast.unparse(child.test)
+            ):
+                continue
+            pending.append(child)
 
 
 def package(module: str) -> str | None:
@@ -147,8 +166,8 @@ def test_core_commands_load_no_wing(tmp_path: Path) -> None:
     config = {**TINY, "heads": {"ridge": TINY["heads"]["ridge"]}, "export": {"models": ["ridge"]}}
     del config["training"], config["ensembles"]
     # short trials, and no bands, whose free runs take most of the time
-    data = {"duration": 15, "trials": [{"kind": "zigzag", "count": 4, "heading": ["20 deg"]}]}
-    data |= {"identification": {"zigzag": 2}, "validation": {"zigzag": 1}}
+    data = {"duration": 15, "trials": [{"kind": "zigzag", "count": 5, "heading": ["20 deg"]}]}
+    data |= {"identification": {"zigzag": 4}, "validation": {"zigzag": 1}}
     terms = ["u", "v", "r", "tau_x", "tau_n"]
     config |= {"data": {**TINY["data"], **data}, "bands": None}
     config["baseline"] = {"kind": "regressors", "terms": terms}

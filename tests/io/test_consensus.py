@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,21 +21,9 @@ _SEED = 11
 _COUNT = 3
 
 
-@functools.cache
-def draw_fleets(kind: str) -> list[Fleet]:
-    """Draw fleets of 8 to 12 logs, since the time grows with the square of their number."""
-    return drawn(kind, _SEED, _COUNT, most=12)
-
-
-@functools.cache
-def draw_nine_logs(kind: str) -> Fleet:
-    (fleet,) = drawn(kind, 14, 1, fewest=9, most=9)
-    return fleet
-
-
 @pytest.fixture(scope="module", params=["boat", pytest.param("twin", marks=pytest.mark.long)])
 def fleets(request: pytest.FixtureRequest) -> list[Fleet]:
-    return draw_fleets(request.param)
+    return drawn(request.param, _SEED, _COUNT)
 
 
 def find_contradictions(logs: list[Log], fleet: Fleet) -> list[Finding]:
@@ -121,7 +108,7 @@ def test_find_consensus_with_a_shared_fault_flags_all_logs_with_it(
     states: tuple[str, ...],
 ) -> None:
     """A third of the logs share it; where none holds velocities, positions tell them."""
-    fleet = draw_nine_logs(kind)
+    (fleet,) = drawn(kind, 14, 1, fewest=9, most=9)
     logs = [
         log.replace(channels={name: log[name] for name in (*states, *fleet.inputs)})
         for log in fleet.logs
@@ -160,7 +147,7 @@ def test_find_unexplained_idle_returns_the_planted_stretch(fleets: list[Fleet]) 
 
 
 def test_find_consensus_without_majority_says_so() -> None:
-    fleet = draw_fleets("boat")[0]
+    fleet = drawn("boat", _SEED, _COUNT)[0]
     log = fleet.logs[1]
     channels = {**log.channels, fleet.steering: -log[fleet.steering]}
     assert find_contradictions(fleet.logs[:2], fleet) == []
@@ -188,7 +175,7 @@ def test_find_consensus_with_surge_only_flags_a_weak_propeller() -> None:
 
 
 def test_rank_hypotheses_with_linked_rudders_names_both() -> None:
-    fleet = draw_fleets("boat")[0]
+    fleet = drawn("boat", _SEED, _COUNT)[0]
     logs = []
     for number, log in enumerate(fleet.logs):
         rudders = dict.fromkeys(

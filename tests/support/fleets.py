@@ -7,6 +7,7 @@ residnet's own simulator, for logs of another kind than those by which limits we
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -31,8 +32,12 @@ class Fleet:
     steering: str
 
 
+@functools.cache
 def drawn(kind: str, seed: int, count: int, fewest: int = 8, most: int = 20) -> list[Fleet]:
-    """Return fleets of 8 to 20 logs of vessels drawn at random; `kind` is boat or twin."""
+    """Return fleets of 8 to 20 logs of vessels drawn at random; `kind` is boat or twin.
+
+    A simulation takes seconds: an equal call returns the same fleets, not to be changed.
+    """
     random = np.random.default_rng([seed, KINDS.index(kind), 7])
     vessels = draw(random, count, shortest=1.0, longest=300.0)
     other = draw(random, count, shortest=1.0, longest=300.0)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pictures import omit_drawings
 from tiny import Command, read_json
 
 import residnet
@@ -17,6 +18,7 @@ def test_the_full_scale_run_has_the_errors_of_the_model_in_units_of_the_ship(
     tiny_run: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(vessel, "PARITY_STEPS", 60)
+    omit_drawings(monkeypatch)
     run = shutil.copytree(tiny_run, tmp_path / "run")
     ship = tmp_path / "ship"
     said = command("scale", run, "--scale", "16", "--out", ship)

@@ -15,6 +15,7 @@ from tiny import TINY, Command, read_json, write_yaml
 
 from residnet import load
 from residnet.core.errors import UsageError
+from residnet.evaluation import soundness
 
 
 def _config(head: dict[str, Any]) -> dict[str, Any]:
@@ -53,8 +54,10 @@ MEMORY = {
 
 
 @pytest.fixture(autouse=True)
-def _no_drawings(monkeypatch: pytest.MonkeyPatch) -> None:
+def _quick_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Omit drawings, and check the boundedness over 30 s: each step takes four milliseconds."""
     omit_drawings(monkeypatch)
+    monkeypatch.setattr(soundness, "_LONG_RUN_DURATION", 30.0)
 
 
 def test_the_plain_head_runs_to_its_end(command: Command, tmp_path: Path) -> None:
