@@ -14,6 +14,7 @@ from tiny import Command, call, write_yaml
 from residnet.export import vessel
 from residnet.runs import folder as folders
 from residnet.runs.folder import RunFolder
+from residnet.tasks import demo
 from residnet.training import trainer
 
 TURN = {"kind": "constant", "name": "turn", "drive": 0.5, "steer": 0.3}
@@ -218,7 +219,13 @@ def test_json_of_inspect_is_a_flag(flown: Path, tmp_path: Path, command: Command
     assert out.read_text() == "mine"
 
 
-def test_demo_is_replaced_only_if_it_is_unchanged(tmp_path: Path, command: Command) -> None:
+def test_demo_is_replaced_only_if_it_is_unchanged(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # short logs and one workbook, in all layouts
+    monkeypatch.setitem(demo.DEMO_TRIALS, "duration", "35 s")
+    workbooks = dict([next(iter(demo._BASIN_MANOEUVRES.items()))])
+    monkeypatch.setattr(demo, "_BASIN_MANOEUVRES", workbooks)
     folder = tmp_path / "demo"
     assert command("demo", folder, "--quiet").code == 0
     said = command("demo", folder, "--quiet")
