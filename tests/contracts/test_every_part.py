@@ -209,8 +209,8 @@ def test_a_model_stored_in_single_precision_keeps_its_answers(kind: str, tmp_pat
             assert torch.equal(one, other)
 
 
-# in single precision, one head of each code generator for gradients: the others are compiled from
-# the same statements with another type
+# single precision changes only the type of the generated statements: a trained head and one with a
+# closed-form solution are checked here, the others among the long tests
 @pytest.mark.parametrize(
     ("kind", "dtype"),
     [
