@@ -805,7 +805,17 @@ def derivatives(
     order: Annotated[int, typer.Option(help="Highest order of the Taylor series, 1 to 3.")] = 1,
     output_file: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="File to write: .json, .csv or .m (MATLAB)."),
+        typer.Option(
+            "--out", metavar="FILE", help="File to write: .json, .csv, .m, .yaml (vessel) or .sdf."
+        ),
+    ] = None,
+    format_name: Annotated[
+        str | None,
+        typer.Option(
+            "--format",
+            metavar="FORMAT",
+            help="Format of --out: json, csv, matlab, vessel, mss or sdf; else by its suffix.",
+        ),
     ] = None,
     trust: Trust = False,
 ) -> None:
@@ -813,9 +823,13 @@ def derivatives(
 
     Masses from beam, draught and mass turn derivatives of accelerations into those of forces.
     """
+    from residnet.core.errors import UsageError
     from residnet.core.files import write_owned
+    from residnet.export.derivative_files import render_derivatives
     from residnet.tasks.derivatives import derive_run
 
+    if format_name is not None and output_file is None:
+        raise UsageError("--format: needs --out, the file to write")
     particulars = {
         "length": length,
         "speed": speed,
@@ -836,7 +850,7 @@ def derivatives(
     )
     print(table.to_text())
     if output_file is not None:
-        text = table.to_text_of(output_file.suffix)
+        text = render_derivatives(table, output_file, format_name)
         with write_owned(output_file) as temporary_file:
             temporary_file.write_text(text)
         print(f"written: {output_file}")

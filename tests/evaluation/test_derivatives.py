@@ -219,15 +219,6 @@ def test_covariance_of_another_size_is_refused() -> None:
         derive(covariance=[[1.0]])
 
 
-def test_written_files_hold_every_row() -> None:
-    table = derive()
-    assert len(json.loads(table.to_text_of(".json"))["rows"]) == len(table.rows)
-    assert len(table.to_text_of(".csv").splitlines()) == len(table.rows) + 1
-    assert "prime.N_delta" in table.to_text_of(".m")
-    with pytest.raises(UsageError, match=r"\.xls"):
-        table.to_text_of(".xls")
-
-
 def test_command_writes_derivatives_of_a_run(command: Any, tiny_run: Path, tmp_path: Path) -> None:
     file = tmp_path / "derivatives.json"
     words = ("--length", "4.88 m", "--speed", "1.2 m/s", "--out", file)

@@ -17,6 +17,7 @@ import csv
 import io
 import itertools
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -48,6 +49,8 @@ from residnet.physics.similarity import (
 )
 
 _AXES = ("X", "Y", "N")
+_VELOCITY = Dimension(0, 1, -1)
+_YAW_RATE = Dimension(0, 0, -1)
 _FORCE_DIMENSIONS = (Dimension(1, 1, -2), Dimension(1, 1, -2), Dimension(1, 2, -2))
 """Dimensions of X and Y (N) and of N (N m)."""
 _ACCELERATION_DIMENSIONS = (Dimension(0, 1, -2), Dimension(0, 1, -2), Dimension(0, 0, -2))
@@ -57,6 +60,8 @@ _NORMAL_95 = 1.959964
 """Quantile of the standard normal distribution for 95 % intervals."""
 _NEGLIGIBLE = 1e-12
 """Coefficients below this share of the axis's largest are rounding errors of an exact zero."""
+_NEGLIGIBLE_CONSTANT = 1e-9
+"""The same for the force at the expansion point, an equilibrium up to the tolerance of its root."""
 
 MassSource = Literal["identified", "estimated", "unknown"]
 
@@ -65,10 +70,12 @@ class DerivativeRow(Record):
     """A hydrodynamic derivative.
 
     Attributes:
-        name: symbol such as Y_v or N_delta; with the suffix "/m" for an acceleration.
+        name: symbol such as Y_v, N_delta or Y_v|v|, and Y_0 for the force at the expansion point;
+            with the suffix "/m" for an acceleration.
         axis: X, Y or N.
         variables: variables of the monomial that the coefficient multiplies; `u` is the difference
-            to the service speed, and a propeller's revolutions that to their equilibrium.
+            to the service speed, a propeller's revolutions that to their equilibrium, and `|v|` a
+            magnitude.
         value: value in SI units.
         unit: SI unit.
         standard_error: standard error in SI units; None if the covariance of the parameters is
@@ -109,7 +116,8 @@ class DerivativesFile(FileRecord):
         scale: length of the target vessel divided by the length of the vessel in the logs.
         operating_point: values of the inputs at the expansion point.
         surge_imbalance: surge acceleration at the expansion point in m/s^2; zero at an equilibrium.
-        rows: derivatives by order, axis and variables.
+        ranges: training ranges of u, v, r and the inputs in SI, the limits of validity.
+        rows: derivatives by order, axis and variables; last the terms with |v| or |r|.
         correlation: correlation matrix of the first-order derivatives; None if unknown.
         published: Y_v, Y_r, N_v, N_r in the prime I system by Clarke et al. (1983); None if the
             particulars do not suffice.
@@ -126,6 +134,7 @@ class DerivativesFile(FileRecord):
     scale: float
     operating_point: dict[str, float]
     surge_imbalance: float
+    ranges: dict[str, Interval] = Field(default_factory=dict)
     rows: list[DerivativeRow]
     correlation: dict[str, list[float]] | None
     published: dict[str, float] | None
@@ -158,17 +167,6 @@ class DerivativesFile(FileRecord):
             lines.append(f"Clarke et al. (1983), prime I x 1e5: {estimates}")
         return "\n".join([*lines, *self.remarks])
 
-    def to_text_of(self, suffix: str) -> str:
-        """Return the contents of a file with a suffix: .json, .csv or .m.
-
-        Raises:
-            UsageError: if the suffix is another one.
-        """
-        writers = {".json": self.to_json_text, ".csv": self.to_csv, ".m": self.to_matlab}
-        if suffix not in writers:
-            raise UsageError(f"derivatives: no file type '{suffix}'; choose .json, .csv or .m")
-        return writers[suffix]()
-
     def to_csv(self) -> str:
         """Return the rows as comma-separated values."""
         stream = io.StringIO()
@@ -191,7 +189,7 @@ class DerivativesFile(FileRecord):
             f"rho = {particulars['density']!r};",
         ]
         for row in self.rows:
-            field = row.name.replace("/m", "_acc").replace("|", "a")
+            field = re.sub(r"\|(\w)\|", r"abs\1", row.name).replace("/m", "_acc")
             lines.append(f"si.{field} = {row.value!r}; % {row.unit}")
             if row.prime_i is not None:
                 lines.append(f"prime.{field} = {row.prime_i!r};")
@@ -265,16 +263,25 @@ def compute_derivatives(
     point = _find_operating_point(spec, model, baseline, input_names, particulars.speed)
     mass_of, source = _choose_mass_matrix(baseline, particulars)
     variables = _expansion_variables(spec, input_names)
-    monomials = [
+    smooth_monomials: list[tuple[_Variable, ...]] = [
         combination
-        for k in range(1, order + 1)
+        for k in range(order + 1)
         for combination in itertools.combinations_with_replacement(variables, k)
     ]
-
-    force = _build_force_function(model, baseline, point, mass_of, particulars)
+    modulus_columns = _modulus_terms(baseline) if order > 1 else {}
+    monomials = [*smooth_monomials, *modulus_columns.values()]
+    rigid_mass = 0.0 if source == "unknown" else particulars.mass or 0.0
+    force = _build_force_function(
+        model, baseline, point, mass_of, rigid_mass, particulars.centre_of_gravity
+    )
 
     def coefficients(theta: Tensor) -> Tensor:
-        return _taylor_coefficients(lambda q: force(theta, q), variables, monomials, order)
+        taylor = _taylor_coefficients(lambda q: force(theta, q), variables, smooth_monomials, order)
+        if not modulus_columns:
+            return taylor
+        assert isinstance(baseline, RegressorBaseline), "only regressors have terms"
+        modulus = mass_of(theta) @ (theta * baseline.term_mask)[:, list(modulus_columns)]
+        return torch.cat((taylor, modulus.T))
 
     theta = baseline.theta.detach().double()
     values = coefficients(theta)
@@ -283,7 +290,7 @@ def compute_derivatives(
     first_order_covariance = None
     if parameter_covariance is not None:
         errors, first_order_covariance = _propagate_covariance(
-            coefficients, theta, baseline.free_indices(), parameter_covariance, len(variables)
+            coefficients, theta, baseline.free_indices(), parameter_covariance, 1 + len(variables)
         )
     full_scale = particulars.scaled(scale, density_ratio)
     is_force = source != "unknown"
@@ -292,9 +299,10 @@ def compute_derivatives(
     largest = values.abs().amax(dim=0)
     for k, monomial in enumerate(monomials):
         for axis in range(3):
-            if abs(float(values[k, axis])) <= _NEGLIGIBLE * float(largest[axis]):
+            share = _NEGLIGIBLE_CONSTANT if not monomial else _NEGLIGIBLE
+            if abs(float(values[k, axis])) <= share * float(largest[axis]):
                 continue
-            if k < len(variables):
+            if k <= len(variables):
                 row_indices.append(3 * k + axis)
             rows.append(
                 _make_row(
@@ -324,13 +332,14 @@ def compute_derivatives(
         scale=scale,
         operating_point=_scaled_inputs(spec, point, scale, density_ratio),
         surge_imbalance=point.surge_imbalance,
+        ranges=_scaled_ranges(spec, scale, density_ratio),
         rows=rows,
         correlation=_correlation_table(
             rows[:n_first_order], first_order_covariance if has_correlations else None, row_indices
         ),
         published=estimate_linear_derivatives(particulars),
         remarks=[
-            *_build_remarks(spec, particulars, point, source, baseline),
+            *_build_remarks(spec, particulars, point, source, baseline, order),
             *_describe_errors(covariance is not None, has_correlations),
         ],
     )
@@ -415,9 +424,9 @@ def _find_operating_point(
 def _expansion_variables(spec: ModelSpec, input_names: Sequence[str]) -> list[_Variable]:
     units = spec.signals.channel_units()
     variables = [
-        _Variable("u", 0, Dimension(0, 1, -1)),
-        _Variable("v", 1, Dimension(0, 1, -1)),
-        _Variable("r", 2, Dimension(0, 0, -1)),
+        _Variable("u", 0, _VELOCITY),
+        _Variable("v", 1, _VELOCITY),
+        _Variable("r", 2, _YAW_RATE),
     ]
     for i, name in enumerate(input_names):
         if name in spec.signals.exogenous:
@@ -426,6 +435,23 @@ def _expansion_variables(spec: ModelSpec, input_names: Sequence[str]) -> list[_V
         if dimension is not None:
             variables.append(_Variable(name, 3 + i, dimension))
     return variables
+
+
+def _modulus_terms(baseline: ParametricBaseline) -> dict[int, tuple[_Variable, ...]]:
+    """Return the monomials of terms such as v|r|, which have no Taylor series, by their column.
+
+    These are the products of two velocities v or r with one magnitude (second-order modulus terms).
+    """
+    if not isinstance(baseline, RegressorBaseline):
+        return {}
+    plain = {"v": _Variable("v", 1, _VELOCITY), "r": _Variable("r", 2, _YAW_RATE)}
+    magnitudes = {"v": _Variable("|v|", 1, _VELOCITY), "r": _Variable("|r|", 2, _YAW_RATE)}
+    columns: dict[int, tuple[_Variable, ...]] = {}
+    for column, term in enumerate(baseline.library.terms):
+        match = re.fullmatch(r"(?P<plain>[vr]) ?\|(?P<magnitude>[vr])\|", term)
+        if match:
+            columns[column] = (plain[match["plain"]], magnitudes[match["magnitude"]])
+    return columns
 
 
 MassFunction = Callable[[Tensor], Tensor]
@@ -472,14 +498,21 @@ def _build_force_function(
     baseline: ParametricBaseline,
     point: _OperatingPoint,
     mass_of: MassFunction,
-    particulars: Particulars,
+    mass: float,
+    centre: float,
 ) -> Callable[[Tensor, Tensor], Tensor]:
     """Return the force [3] as a function of theta and (u - U, v, r, inputs - equilibrium).
 
     It is the hydrodynamic force if the mass of the rigid body is known, else M nu_dot.
+
+    Args:
+        model: the model, which computes the channels of its baseline.
+        baseline: the baseline.
+        point: expansion point.
+        mass_of: mass matrix as a function of theta.
+        mass: mass of the rigid body in kg; 0 if it is unknown.
+        centre: centre of gravity ahead of the origin in m.
     """
-    mass = particulars.mass or 0.0
-    centre = particulars.centre_of_gravity
     pose = torch.zeros(3, dtype=torch.float64)
 
     def force(theta: Tensor, q: Tensor) -> Tensor:
@@ -505,12 +538,13 @@ def _taylor_coefficients(
 ) -> Tensor:
     """Return the coefficients [K, 3] of monomials in the Taylor series about zero.
 
-    A monomial with powers k_i has the derivative divided by the product of k_i!.
+    A monomial with powers k_i has the derivative divided by the product of k_i!; the monomial
+    without variables has the value at zero.
     """
     n_variables = max(variable.column for variable in variables) + 1
     origin = torch.zeros(n_variables, dtype=torch.float64)
     derivative = function
-    derivatives = []
+    derivatives = [function(origin)]
     for _ in range(order):
         derivative = torch.func.jacfwd(derivative)
         derivatives.append(derivative(origin))
@@ -518,7 +552,7 @@ def _taylor_coefficients(
     for monomial in monomials:
         indices = tuple(variable.column for variable in monomial)
         factorial = math.prod(math.factorial(indices.count(index)) for index in set(indices))
-        rows.append(derivatives[len(indices) - 1][(slice(None), *indices)] / factorial)
+        rows.append(derivatives[len(indices)][(..., *indices)] / factorial)
     return torch.stack(rows)
 
 
@@ -536,7 +570,7 @@ def _propagate_covariance(
         theta: parameters of the baseline.
         free_indices: indices of the free parameters in the flattened theta [P].
         covariance: covariance of the free parameters [P, P].
-        n_first_order: number of monomials of first order, which come first.
+        n_first_order: number of monomials of order 0 and 1, which come first.
 
     Returns:
         Standard errors [K, 3], and the covariance of the first-order coefficients, monomial by
@@ -600,7 +634,8 @@ def _make_row(
             units[system] = scales.factor(dimension)
     names = [variable.name for variable in monomial]
     # single letters are written together as usual, Y_vvr; longer names need a separator
-    subscript = "".join(names) if all(len(name) == 1 for name in names) else "_".join(names)
+    is_short = all(len(name.strip("|")) == 1 for name in names)
+    subscript = ("".join(names) if is_short else "_".join(names)) or "0"
     interval = None if error is None else (value - _NORMAL_95 * error, value + _NORMAL_95 * error)
     prime_i = units.get("prime_i")
     return DerivativeRow(
@@ -637,6 +672,18 @@ def _scaled_inputs(
     return scaled
 
 
+def _scaled_ranges(spec: ModelSpec, scale: float, density_ratio: float) -> dict[str, Interval]:
+    """Return the training ranges of u, v, r and the inputs at the target scale."""
+    units = {"u": "m/s", "v": "m/s", "r": "rad/s", **spec.signals.channel_units()}
+    names = ("u", "v", "r", *spec.signals.input_columns)
+    ranges = {}
+    for name, low, high in zip(names, spec.low, spec.high, strict=False):
+        dimension = dimension_of_unit(units.get(name, "-")) or DIMENSIONLESS
+        factor = froude_factor(dimension, scale, density_ratio)
+        ranges[name] = (float(low) * factor, float(high) * factor)
+    return ranges
+
+
 def _correlation_table(
     rows: Sequence[DerivativeRow], covariance: np.ndarray | None, indices: Sequence[int]
 ) -> dict[str, list[float]] | None:
@@ -655,6 +702,7 @@ def _build_remarks(
     point: _OperatingPoint,
     source: MassSource,
     baseline: ParametricBaseline,
+    order: int,
 ) -> list[str]:
     """Return sentences on the validity of the derivatives."""
     remarks = []
@@ -685,11 +733,17 @@ def _build_remarks(
             " Soeding (1982); their error is not part of the intervals."
         )
     if isinstance(baseline, RegressorBaseline):
-        modulus_terms = [term for term in baseline.library.terms if "|v|" in term or "|r|" in term]
-        if modulus_terms:
+        listed_columns = _modulus_terms(baseline) if order > 1 else {}
+        missing_terms = [
+            term
+            for column, term in enumerate(baseline.library.terms)
+            if ("|v|" in term or "|r|" in term) and column not in listed_columns
+        ]
+        if missing_terms:
+            hint = "see fit.json" if order > 1 else "--order 2 lists them"
             remarks.append(
-                f"Terms with |v| or |r| ({', '.join(modulus_terms)}) have no Taylor series and are"
-                " not part of the table; see fit.json for their coefficients."
+                f"Terms with |v| or |r| ({', '.join(missing_terms)}) have no Taylor series and are"
+                f" not part of the table; {hint}."
             )
     return remarks
 
