@@ -552,7 +552,8 @@ def _taylor_coefficients(
     for monomial in monomials:
         indices = tuple(variable.column for variable in monomial)
         factorial = math.prod(math.factorial(indices.count(index)) for index in set(indices))
-        rows.append(derivatives[len(indices)][(..., *indices)] / factorial)
+        index: Any = (slice(None), *indices)
+        rows.append(derivatives[len(indices)][index] / factorial)
     return torch.stack(rows)
 
 
