@@ -150,6 +150,33 @@ def test_the_regressions_of_clarke_are_near_the_published_tanker() -> None:
     assert priors["R_0"] == default_priors(hull)["R_0"]
 
 
+@pytest.mark.parametrize("formulas", ["kijima", "inoue"])
+def test_the_regressions_of_the_aspect_ratio_are_near_the_published_tanker(formulas: str) -> None:
+    config = MMGConfig.model_validate({**TANKER, "formulas": formulas})
+    priors = dict(zip(PARAMETER_NAMES, config.priors(), strict=True))
+    for name, tolerance in (("Y_v", 0.15), ("Y_r", 0.06), ("N_v", 0.01), ("N_r", 0.01)):
+        assert priors[name].mean == pytest.approx(PUBLISHED[name], abs=tolerance), name
+
+
+def test_the_formulas_of_the_rudder_change_their_own_means_only() -> None:
+    usual, kijima, brix = (
+        dict(
+            zip(
+                PARAMETER_NAMES,
+                MMGConfig.model_validate({**TANKER, "rudder_formulas": formulas}).priors(),
+                strict=True,
+            )
+        )
+        for formulas in ("usual", "kijima", "brix")
+    )
+    assert {name for name in usual if kijima[name] != usual[name]} == {"a_H", "t_R", "epsilon"}
+    assert {name for name in usual if brix[name] != usual[name]} == {"gamma_p", "gamma_n", "l_R"}
+    for name, tolerance in (("a_H", 0.08), ("t_R", 0.2), ("epsilon", 0.3)):
+        assert kijima[name].mean == pytest.approx(PUBLISHED[name], abs=tolerance), name
+    assert brix["l_R"].mean == pytest.approx(PUBLISHED["l_R"], abs=0.25)
+    assert brix["gamma_p"].sd == usual["gamma_p"].sd
+
+
 def test_a_semi_empirical_model_is_not_fitted() -> None:
     config = SemiEmpiricalConfig.model_validate(
         {**TANKER, "kind": "semi_empirical", "formulas": "clarke"}

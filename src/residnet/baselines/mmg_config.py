@@ -15,8 +15,11 @@ from residnet.baselines.mmg_parameters import (
     MMGPropeller,
     MMGRudder,
     ParameterPrior,
+    brix_rudder_means,
     clarke_priors,
     default_priors,
+    inoue_priors,
+    kijima_rudder_means,
 )
 from residnet.core.names import VELOCITY_NAMES, suggest_name
 from residnet.core.sample_origins import SampleOrigins
@@ -26,6 +29,12 @@ if TYPE_CHECKING:
     from residnet.baselines.mmg import MMGBaseline, MMGForces, SemiEmpiricalBaseline
     from residnet.core.samples import Samples
     from residnet.regression.estimator import Solution
+
+
+_REGRESSIONS = {"kijima": default_priors, "inoue": inoue_priors, "clarke": clarke_priors}
+"""Functions from a hull to the priors, by name of the regressions."""
+_RUDDER_MEANS = {"kijima": kijima_rudder_means, "brix": brix_rudder_means}
+"""Functions from a hull to prior means of the rudder-hull interaction, by name."""
 
 
 class MMGParticularsConfig(IdentifiedConfig, ABC):
@@ -40,8 +49,11 @@ class MMGParticularsConfig(IdentifiedConfig, ABC):
         revolutions: channel of the propeller revolutions, 1/s.
         angle: channel of the rudder angle, rad, positive to starboard.
         formulas: regressions of the prior means of added masses and linear hull derivatives from
-            the main particulars: `kijima` (Kijima et al. 1990) or `clarke` (Clarke, Gedling and
-            Hine 1983).
+            the main particulars: `kijima` (Kijima et al. 1990), `inoue` (Inoue, Hirano and Kijima
+            1981) or `clarke` (Clarke, Gedling and Hine 1983).
+        rudder_formulas: prior means of the interaction of rudder and hull: `usual` values of
+            merchant ships, regressions of `kijima` (Kijima et al. 1990), or the flow straightening
+            of `brix` (Brix 1993).
     """
 
     hull: MMGHull
@@ -50,7 +62,8 @@ class MMGParticularsConfig(IdentifiedConfig, ABC):
     beliefs: dict[str, tuple[float, Annotated[float, Field(ge=0)]]] = Field(default_factory=dict)
     revolutions: str = "n"
     angle: str = "delta"
-    formulas: Literal["kijima", "clarke"] = "kijima"
+    formulas: Literal["kijima", "inoue", "clarke"] = "kijima"
+    rudder_formulas: Literal["usual", "kijima", "brix"] = "usual"
 
     @model_validator(mode="after")
     def _validate_beliefs(self) -> Self:
@@ -77,11 +90,14 @@ class MMGParticularsConfig(IdentifiedConfig, ABC):
 
     def priors(self) -> list[ParameterPrior]:
         """Return the prior of every parameter, in the order of `PARAMETER_NAMES`."""
-        regressions = clarke_priors if self.formulas == "clarke" else default_priors
+        priors = _REGRESSIONS[self.formulas](self.hull)
+        if self.rudder_formulas != "usual":
+            means = _RUDDER_MEANS[self.rudder_formulas](self.hull)
+            priors |= {name: priors[name]._replace(mean=mean) for name, mean in means.items()}
         configured_priors = {
             name: ParameterPrior(*mean_and_std, "") for name, mean_and_std in self.beliefs.items()
         }
-        return list((regressions(self.hull) | configured_priors).values())
+        return list((priors | configured_priors).values())
 
     def build_forces(self, names: Sequence[str]) -> MMGForces:
         """Build the force model for channels `names`.

@@ -160,6 +160,20 @@ def default_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
     }
 
 
+def inoue_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
+    """Return the default priors with linear hull derivatives by Inoue, Hirano and Kijima (1981).
+
+    Source: Hydrodynamic derivatives on ship manoeuvring, International Shipbuilding Progress 28,
+    at even keel. Only the sway force of turning differs from Kijima et al. (1990): the derivative
+    without the added mass in surge is pi/4 k with the aspect ratio k = 2 d / L. The MMG system's
+    Y_r contains this added mass (Yasukawa and Yoshimura 2015, eq. (7)).
+    """
+    priors = default_priors(hull)
+    sway_of_turning = 0.25 * math.pi * 2.0 * hull.draught / hull.length
+    mean = sway_of_turning + priors["m_x"].mean
+    return priors | {"Y_r": priors["Y_r"]._replace(mean=mean)}
+
+
 def clarke_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
     """Return the default priors with linear hull derivatives by Clarke, Gedling and Hine (1983).
 
@@ -195,6 +209,33 @@ def clarke_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
         "N_r": derivatives["N_r"] * ratio,
     }
     return priors | {name: priors[name]._replace(mean=mean) for name, mean in means.items()}
+
+
+def kijima_rudder_means(hull: MMGHull) -> dict[str, float]:
+    """Return prior means of the rudder-hull interaction by Kijima et al. (1990).
+
+    The regressions are on the block coefficient C_b and on C_b B / L: the induced hull force a_H,
+    the steering resistance deduction t_R and the wake ratio epsilon.
+    """
+    block_coefficient = hull.block_coefficient
+    beam_fullness = block_coefficient * hull.beam / hull.length
+    return {
+        "a_H": 0.627 * block_coefficient - 0.153,
+        "t_R": 1.0 - (0.28 * block_coefficient + 0.55),
+        "epsilon": -156.2 * beam_fullness**2 + 41.6 * beam_fullness - 1.76,
+    }
+
+
+def brix_rudder_means(hull: MMGHull) -> dict[str, float]:
+    """Return prior means of the flow straightening by Brix (1993), Manoeuvring Technical Manual.
+
+    The transverse inflow of the rudder is -0.364 v plus a share of the yaw rate that corresponds to
+    the position 2 * 0.907 x_R, with x_R = -L/2; the constants are those of Kose (1982), On a new
+    mathematical model of maneuvering motions of a ship, International Shipbuilding Progress 29,
+    from Series 60 models. They do not depend on the hull.
+    """
+    del hull
+    return {"gamma_p": 0.364, "gamma_n": 0.364, "l_R": -0.907}
 
 
 PARAMETER_NAMES = tuple(default_priors(MMGHull(length=1.0, beam=0.2, draught=0.1, mass=10.0)))
