@@ -63,6 +63,7 @@ from residnet.io.readers.quantities import (
 )
 from residnet.io.readers.tables import (
     TABLE_KINDS,
+    join_excel_sheets,
     list_sheet_names,
     read_excel_sheet,
     read_json_head,
@@ -1263,13 +1264,42 @@ def _parse_unit_cell(cell: str) -> str:
     return unit if is_unit(unit) else ""
 
 
+def are_parts_of_recording(sheets: Sequence[pd.DataFrame]) -> bool:
+    """Return whether sheets are parts of one recording.
+
+    They have the same first column, their times overlap by half, and no other column is in two.
+    """
+    import pandas as pd
+
+    if len(sheets) < 2:
+        return False
+    names = [[str(name) for name in sheet.columns] for sheet in sheets]
+    other_names = [name for columns in names for name in columns[1:] if name]
+    if len({columns[0] for columns in names}) > 1 or len(set(other_names)) < len(other_names):
+        return False
+    ranges = []
+    for sheet in sheets:
+        times = pd.to_numeric(sheet.iloc[:, 0], errors="coerce").dropna()
+        if times.empty or not times.is_monotonic_increasing:
+            return False
+        ranges.append((float(times.iloc[0]), float(times.iloc[-1])))
+    overlap = min(end for _, end in ranges) - max(start for start, _ in ranges)
+    return overlap > 0.5 * max(end - start for start, end in ranges)
+
+
 def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Load the first sheet with two or more columns of numbers, otherwise the first sheet."""
+    """Load the first sheet with two or more columns of numbers, otherwise the first sheet.
+
+    Further sheets of the same recording are joined.
+    """
     names = list_sheet_names(path)
     tables = {name: read_excel_sheet(path, name, rows) for name in names}
     numeric_sheets = [
         n for n, table in tables.items() if len(table.select_dtypes("number").columns) > 1
     ]
+    if are_parts_of_recording([tables[name] for name in numeric_sheets]):
+        joined = join_excel_sheets(path, {name: tables[name] for name in numeric_sheets})
+        return joined, {"kind": "excel", "sheet": numeric_sheets}
     name = next(iter([*numeric_sheets, *names]))
     table = tables[name]
     table.attrs["other_sheets"] = tuple(numeric_sheets[1:])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import codecs
 import json
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -614,18 +615,24 @@ class CsvConfig(TableConfig):
 class ExcelConfig(TableConfig):
     """Reader of sheets in Excel files (.xlsx).
 
-    Rows above the column names, and units below them, are skipped.
+    Rows above the column names, and units below them, are skipped. Numbers in cells of text may
+    have a decimal comma.
 
     Attributes:
-        sheet: name of the sheet; null takes the first one.
+        sheet: name of the sheet; null takes the first one. Several names are the sheets of one
+            recording, whose first columns are the time: their rows are merged in order of time.
     """
 
     kind: Literal["excel"] = "excel"
-    sheet: str | None = None
+    sheet: str | tuple[str, ...] | None = None
     row_format: ClassVar[str] = "row {1}"
 
     def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
-        table = read_excel_sheet(path, self.sheet)
+        table = (
+            join_excel_sheets(path, {name: read_excel_sheet(path, name) for name in self.sheet})
+            if isinstance(self.sheet, tuple)
+            else read_excel_sheet(path, self.sheet)
+        )
         selected = table.iloc[
             :, find_column_positions(path, [str(name) for name in table.columns], columns)
         ]
@@ -808,12 +815,108 @@ def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> 
     # the names in the first rows made all columns object columns
     table = cells.iloc[first_value_row:].infer_objects()
     table.columns = pd.Index(make_names_unique(head_rows[header_row] if head_rows else []))
-    table = table.dropna(how="all")
+    table = _convert_decimal_commas(table.dropna(how="all"))
     table.attrs |= {
         "n_lines_above": first_value_row,
         "unit_rows": head_rows[header_row + 1 : first_value_row],
     }
     return table
+
+
+_DECIMAL_COMMA = re.compile(r"\s*[-+]?\d+(,\d+)?([eE][-+]?\d+)?\s*")
+"""A number in a cell of text, with a decimal comma or none."""
+_CLEAR_COMMA = re.compile(r"\s*[-+]?(0,\d+|\d+,(\d{1,2}|\d{4,})([eE].*)?)\s*")
+"""A number whose comma cannot separate thousands."""
+
+
+def _convert_decimal_commas(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table whose columns of texts such as `1,091` are numbers.
+
+    A number has no decimal sign in a cell of Excel unless it is a text. A comma before three digits
+    may also separate thousands, so that one column has to have a clear decimal comma.
+    """
+    import pandas as pd
+
+    converted: dict[int, pd.Series] = {}
+    has_clear_comma = False
+    for position, (_, column) in enumerate(table.items()):
+        if pd.api.types.is_numeric_dtype(column):
+            continue
+        texts = column[column.map(lambda cell: isinstance(cell, str))]
+        if not texts.map(lambda text: "," in text).any():
+            continue
+        if texts.map(lambda text: _DECIMAL_COMMA.fullmatch(text) is not None).all():
+            has_clear_comma |= bool(
+                texts.map(lambda text: _CLEAR_COMMA.fullmatch(text) is not None).any()
+            )
+            numbers = column.map(
+                lambda cell: float(cell.replace(",", ".")) if isinstance(cell, str) else cell
+            )
+            converted[position] = pd.to_numeric(numbers, errors="coerce")
+    if not has_clear_comma:
+        return table
+    columns = [
+        converted.get(position, column) for position, (_, column) in enumerate(table.items())
+    ]
+    result: pd.DataFrame = pd.concat(columns, axis=1)
+    result.columns = table.columns
+    return result
+
+
+def join_excel_sheets(path: Path, tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Join the sheets of one recording: their rows in order of time, equal times in one row.
+
+    Args:
+        path: Excel file.
+        tables: sheets by name; the first column of each is the time.
+
+    Returns:
+        The joined table; a column is empty in rows of other sheets. `attrs` are those of
+        `read_excel_sheet`.
+
+    Raises:
+        DataError: if the sheets have different names of their first columns, or a common further
+            column.
+    """
+    import pandas as pd
+
+    parts = []
+    column_names: list[str] = []
+    unit_rows: list[list[str]] = []
+    time_name = ""
+    for name, table in tables.items():
+        names = [str(column) for column in table.columns]
+        if not time_name:
+            time_name = names[0]
+            column_names = [time_name]
+        if names[0] != time_name:
+            raise DataError(
+                f"{path}: the first column of sheet '{name}' is '{names[0]}', expected the time"
+                f" '{time_name}' like in sheet '{next(iter(tables))}'; give the sheets the same"
+                " column of time"
+            )
+        common_names = set(names[1:]) & set(column_names)
+        if common_names:
+            raise DataError(
+                f"{path}: column '{min(common_names)}' is in sheet '{name}' and in an earlier one;"
+                " rename it in one of them"
+            )
+        column_names += names[1:]
+        for k, units in enumerate(table.attrs["unit_rows"]):
+            if k == len(unit_rows):
+                unit_rows.append([])
+            missing = len(column_names) - len(names) + 1 - len(unit_rows[k])
+            unit_rows[k] += [""] * missing + list(units if not unit_rows[k] else units[1:])
+        timed = table.copy()
+        timed.attrs = {}
+        timed[time_name] = pd.to_numeric(timed[time_name], errors="coerce")
+        timed = timed.dropna(subset=[time_name])
+        # merging needs unique keys
+        parts.append(timed.drop_duplicates(time_name).set_index(time_name))
+    joined: pd.DataFrame = pd.concat(parts, axis=1).sort_index().reset_index(names=time_name)
+    first_table = next(iter(tables.values()))
+    joined.attrs = {"n_lines_above": first_table.attrs["n_lines_above"], "unit_rows": unit_rows}
+    return joined
 
 
 def list_sheet_names(path: Path) -> list[str]:
