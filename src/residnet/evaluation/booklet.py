@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
+import scipy
 from pydantic import Field, field_validator
 
 from residnet.core.config import Config, Metres, Quantity, Seconds
@@ -38,8 +40,9 @@ class BookletConfig(Config):
     """Settings of a manoeuvring booklet, simulated with one refitted baseline.
 
     Parameters are drawn from their posterior distribution. Every draw performs every manoeuvre,
-    which gives prediction intervals of the indices. The intervals assume a correct model structure;
-    they are too narrow if it is wrong.
+    which gives prediction intervals of the indices. Repeated trials show the error of the model's
+    form, which widens the intervals (`add_model_error`); without two of them the intervals assume a
+    correct form.
 
     Attributes:
         model: name of the baseline.
@@ -140,7 +143,22 @@ def build_booklet(
         remarks: manoeuvres that are left out, with their reasons.
     """
 
-    rows = [_page_row(page, length, scale, level) for page in pages]
+    errors = [_model_errors(page) for page in pages]
+    rows = [
+        _page_row(
+            page,
+            # a repeated trial does not judge its own prediction
+            [
+                other_errors
+                for other, other_errors in zip(pages, errors, strict=True)
+                if other is not page and other.manoeuvre.kind == page.manoeuvre.kind
+            ],
+            length,
+            scale,
+            level,
+        )
+        for page in pages
+    ]
     index_names = sorted({name for row in rows for name in row.indices})
     return BookletFile(
         schema=SCHEMA,
@@ -155,13 +173,102 @@ def build_booklet(
     )
 
 
-def _page_row(page: BookletPage, length: float, scale: float, level: float) -> BookletRow:
+class ModelError(NamedTuple):
+    """Deviation of a repeated trial from the measured one in one index.
+
+    Attributes:
+        relative: logarithm of the predicted over the measured index; None unless both are positive.
+        absolute: predicted minus measured index.
+        relative_variance: variance of the logarithm over the parameter draws.
+        absolute_variance: variance over the parameter draws.
+    """
+
+    relative: float | None
+    absolute: float
+    relative_variance: float
+    absolute_variance: float
+
+
+def _model_errors(page: BookletPage) -> dict[str, ModelError]:
+    """Return the deviations of a repeated trial by index; empty for a standard manoeuvre."""
+    errors = {}
+    for name, measured in page.measured_indices.items():
+        value = page.indices[0].get(name)
+        # the approach speed is an initial condition
+        if name not in INDEX_UNITS or name == "approach_speed" or value is None:
+            continue
+        draws = _index_draws(page, name)
+        is_positive = measured > 0.0 and value > 0.0 and bool((draws > 0.0).all())
+        errors[name] = ModelError(
+            math.log(value / measured) if is_positive else None,
+            float(value - measured),
+            float(np.log(draws).var()) if is_positive and draws.size else 0.0,
+            float(draws.var()) if draws.size else 0.0,
+        )
+    return errors
+
+
+def _index_draws(page: BookletPage, name: str) -> np.ndarray:
+    """Return an index of all parameter draws that have it."""
+    return np.array([float(indices[name]) for indices in page.indices[1:] if name in indices])
+
+
+_MIN_REPEATED = 2
+"""Smallest number of repeated trials from which the model error of an index is estimated."""
+
+
+def add_model_error(draws: np.ndarray, errors: Sequence[ModelError]) -> np.ndarray:
+    """Return draws of an index that contain the model error as well as the parameters'.
+
+    Repeated trials deviate from the measured ones by more than the parameters explain, if the form
+    of the model is wrong. The standard deviation of this excess is a relative one for positive
+    indices, and its uncertainty after n trials makes the error follow Student's t distribution with
+    n degrees of freedom (a normal model with known mean zero and unknown variance).
+
+    Args:
+        draws: index by parameter draw [K].
+        errors: deviations of repeated trials of the same kind of manoeuvre.
+
+    Returns:
+        Draws [K * Q], one for each draw and quantile of the model error; `draws` without errors.
+    """
+    if len(errors) < _MIN_REPEATED or not draws.size:
+        return draws
+    quantiles = scipy.stats.t.ppf((np.arange(_N_QUANTILES) + 0.5) / _N_QUANTILES, len(errors))
+    relative = [error.relative for error in errors if error.relative is not None]
+    if len(relative) == len(errors) and (draws > 0.0).all():
+        variance = np.square(relative).mean() - np.mean([e.relative_variance for e in errors])
+        factors: np.ndarray = np.exp(math.sqrt(max(variance, 0.0)) * quantiles)
+        return (draws[:, None] * factors).ravel()
+    absolute = [error.absolute for error in errors]
+    variance = np.square(absolute).mean() - np.mean([e.absolute_variance for e in errors])
+    shifted: np.ndarray = draws[:, None] + math.sqrt(max(variance, 0.0)) * quantiles
+    return shifted.ravel()
+
+
+_N_QUANTILES = 81
+"""Number of quantiles that represent the model error; odd, so that one of them is zero."""
+
+
+def _page_row(
+    page: BookletPage,
+    other_errors: Sequence[Mapping[str, ModelError]],
+    length: float,
+    scale: float,
+    level: float,
+) -> BookletRow:
     names = [
         name
         for name, value in page.indices[0].items()
         if name in INDEX_UNITS and not isinstance(value, list)
     ]
-    indices = {name: _index_summary(page, name, length, scale, level) for name in names}
+    indices = {
+        name: _index_summary(
+            page, name, [by_name[name] for by_name in other_errors if name in by_name], length,
+            scale, level,
+        )
+        for name in names
+    }  # fmt: skip
     return BookletRow(
         name=page.name,
         manoeuvre=page.manoeuvre.kind,
@@ -175,13 +282,17 @@ def _page_row(page: BookletPage, length: float, scale: float, level: float) -> B
 
 
 def _index_summary(
-    page: BookletPage, name: str, length: float, scale: float, level: float
+    page: BookletPage,
+    name: str,
+    errors: Sequence[ModelError],
+    length: float,
+    scale: float,
+    level: float,
 ) -> BookletIndex:
     """Return one index with its interval over draws and, where they are known, its references."""
     value = float(page.indices[0][name])
-    draws = np.array(
-        [float(run_indices[name]) for run_indices in page.indices[1:] if name in run_indices]
-    )
+    draws = _index_draws(page, name)
+    predictions = add_model_error(draws, errors)
     froude_factor = scale ** _FROUDE_EXPONENTS[INDEX_UNITS[name]]
     summary: dict[str, Any] = {
         "value": value,
@@ -189,7 +300,9 @@ def _index_summary(
         "draws": int(draws.size),
     }
     if draws.size:
-        summary["interval"] = np.quantile(draws, (0.5 - level / 2, 0.5 + level / 2)).tolist()
+        summary["interval"] = np.quantile(predictions, (0.5 - level / 2, 0.5 + level / 2)).tolist()
+        if len(errors) >= _MIN_REPEATED:
+            summary["repeated_trials"] = len(errors)
     if name in LENGTH_INDICES:
         summary["lengths"] = value / length
     if name in page.measured_indices:
@@ -202,7 +315,9 @@ def _index_summary(
         summary |= {
             "limit": limit,
             "kept": froude_factor * value <= limit,
-            "kept_share": float(np.mean(froude_factor * draws <= limit)) if draws.size else None,
+            "kept_share": (
+                float(np.mean(froude_factor * predictions <= limit)) if draws.size else None
+            ),
         }
     return BookletIndex.model_validate(summary)
 

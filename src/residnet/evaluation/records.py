@@ -829,19 +829,21 @@ class BookletIndex(Record):
         value: index for the fitted parameters, in the scale of the logs.
         ship: index for the fitted parameters, in the scale of the ship.
         draws: number of parameter draws for which the index exists.
-        interval: prediction interval over the draws.
+        interval: prediction interval over the draws and the model error of repeated trials.
+        repeated_trials: number of repeated trials in the model error; absent if it is unknown.
         lengths: index in lengths of the hull.
         measured: index of the measured manoeuvre.
         difference: simulated minus measured index.
         limit: limit of IMO in the scale of the ship.
         kept: whether the limit is met.
-        kept_share: fraction of the draws that meet the limit.
+        kept_share: share of the predictive distribution that meets the limit.
     """
 
     value: float
     ship: float
     draws: int
     interval: Interval | None = None
+    repeated_trials: int | None = None
     lengths: float | None = None
     measured: float | None = None
     difference: float | None = None

@@ -179,8 +179,9 @@ def _summary_section(run: RunFiles, booklet: BookletFile | None) -> ReportSectio
                     ("manoeuvre", "criterion", "prediction", "interval", "IMO limit", "met"),
                     rows,
                     f"Full-scale predictions compared with {_IMO_SOURCE}. Intervals:"
-                    f" {100 * booklet.level:.0f} % of {booklet.draws} draws of the parameters."
-                    " Met: share of the draws that meet the limit.",
+                    f" {100 * booklet.level:.0f} %, from {booklet.draws} draws of the parameters"
+                    " and the deviations of repeated tests. Met: probability of meeting the"
+                    " limit.",
                     (1.5, 2.0, 1.1, 1.5, 1.0, 0.9),
                 )
             )
@@ -476,7 +477,8 @@ def _prediction_section(booklet: BookletFile, figures: Mapping[str, str]) -> Rep
             ("manoeuvre", "index", "tests", "ship", "interval (ship)", "lengths"),
             rows,
             f"Predicted indices with {100 * booklet.level:.0f} % intervals from {booklet.draws}"
-            " draws of the parameters from their uncertainty after the tests.",
+            " draws of the parameters from their uncertainty after the tests, and from the"
+            " deviations of repeated tests.",
             (1.7, 2.0, 1.1, 1.1, 1.5, 0.8),
         )
     )

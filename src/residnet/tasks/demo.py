@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -171,7 +171,8 @@ def write_basin_workbooks(folder: Path) -> str:
     except ImportError:
         return f'{folder}: not written, it needs the extra excel (pip install "residnet[excel]")'
     generator = np.random.default_rng(50)
-    for test_number, (name, log) in enumerate(simulate_basin_tests().items(), start=1):
+    logs = measure_basin_tests(simulate_basin_tests(), generator)
+    for test_number, (name, log) in enumerate(logs.items(), start=1):
         workbook = openpyxl.Workbook()
         sheet = workbook.active
         assert sheet is not None
@@ -188,10 +189,9 @@ def write_basin_workbooks(folder: Path) -> str:
             ("s", *(unit for _, unit, *_ in _BASIN_COLUMNS.values())),
         ):
             sheet.append(row)
-        columns = [np.round(log.t - log.t[0], 3)]
-        for channel, (_, _, factor, deviation) in _BASIN_COLUMNS.items():
-            noise = deviation * generator.standard_normal(len(log))
-            columns.append(np.round(factor * log[channel] + noise, 5))
+        columns = [np.round(log.t, 3)]
+        for channel, (_, _, factor, _) in _BASIN_COLUMNS.items():
+            columns.append(np.round(factor * log[channel], 5))
         for values in np.column_stack(columns).tolist():
             sheet.append(values)
         with atomic_write(folder / f"{name}.xlsx") as file:
@@ -203,12 +203,16 @@ def write_basin_workbooks(folder: Path) -> str:
     )
 
 
-def simulate_basin_tests() -> dict[str, Log]:
-    """Return the motion of the model in the tests of the basin, without noise, by name."""
+def simulate_basin_tests(vessel: str = "mariner") -> dict[str, Log]:
+    """Return the motion of the model in the tests of the basin, without noise, by name.
+
+    Args:
+        vessel: name or file of a ship as long and as fast as the vessel `mariner`.
+    """
     scaling = FroudeScaling(BASIN_SCALE)
     config = validate_config(
         {
-            "vessel": "mariner",
+            "vessel": vessel,
             "duration": 900.0,
             "step": _BASIN_STEP * scaling.time_factor,
             # the manoeuvres below replace the random trials of the config
@@ -231,6 +235,28 @@ def simulate_basin_tests() -> dict[str, Log]:
     return {
         name: scale_log(run.true_log, scaling.inverse)
         for name, run in zip(_BASIN_MANOEUVRES, runs, strict=True)
+    }
+
+
+def measure_basin_tests(logs: Mapping[str, Log], generator: np.random.Generator) -> dict[str, Log]:
+    """Return the tests of the basin with the noise of its sensors, by name.
+
+    Args:
+        logs: true motion by name.
+        generator: generator of the noise.
+    """
+    factors = {
+        channel: (factor, noise) for channel, (_, _, factor, noise) in _BASIN_COLUMNS.items()
+    }
+    return {
+        name: log.replace(
+            t=log.t - log.t[0],
+            channels={
+                channel: log[channel] + noise / factor * generator.standard_normal(len(log))
+                for channel, (factor, noise) in factors.items()
+            },
+        )
+        for name, log in logs.items()
     }
 
 

@@ -456,6 +456,24 @@ def _spiral_figure(
     )
 
 
+def _describe_model_error(content: BookletFile) -> str:
+    """Return a sentence on the error of the model's form in the intervals."""
+    counts = {
+        entry.repeated_trials
+        for page in content.pages
+        if not page.split
+        for entry in page.indices.values()
+        if entry.repeated_trials is not None
+    }
+    if not counts:
+        return "They assume that the model's form is right: fewer than two trials are repeated."
+    count_text = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
+    return (
+        "They also contain the error of the model's form: the deviation of repeated trials from"
+        f" the measured ones ({count_text} trials, by index)."
+    )
+
+
 def booklet_section(run: RunFiles) -> Section | None:
     """Return a table for each standard manoeuvre and one that compares measured zigzags.
 
@@ -471,7 +489,7 @@ def booklet_section(run: RunFiles) -> Section | None:
     introduction = (
         f"Model {content.model} ran these manoeuvres for {hull_text}.{scale_text} The intervals"
         f" ({100 * content.level:.0f} %) come from {content.draws} draws of the parameters"
-        " from their uncertainty after the trials. They assume that the model's form is right."
+        f" from their uncertainty after the trials. {_describe_model_error(content)}"
     )
     blocks: list[Block] = [Text(introduction)]
     for page in content.pages:

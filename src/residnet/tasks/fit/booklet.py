@@ -39,6 +39,68 @@ from residnet.runs.folder import RunFolder
 _PARAMETER_PATH = "model.baseline.theta"
 
 
+def compute_booklet_pages(
+    config: BookletConfig,
+    fitted_model: FittedModel,
+    logs: Mapping[str, Sequence[PreparedLog]],
+    limit: np.ndarray,
+) -> tuple[list[BookletPage], list[str]]:
+    """Simulate the manoeuvring booklet.
+
+    Args:
+        config: settings of the manoeuvring booklet.
+        fitted_model: the refitted baseline.
+        logs: prepared logs by split.
+        limit: velocities [n] beyond which a simulated run has diverged.
+
+    Returns:
+        The pages, standard manoeuvres first and then repeated trials; and the reasons of those that
+        are left out.
+
+    Raises:
+        ResidnetError: if the model cannot perform the manoeuvres, or no interval is available.
+    """
+    craft = build_booklet_vessel(config, fitted_model, config.inputs)
+    rudder = config.steering_input()
+    pages: list[BookletPage] = []
+    remarks: list[str] = []
+
+    def add_page(
+        vessel: SimulatedVessel, flights: Sequence[ManoeuvreRun], log: Log | None, split: str
+    ) -> None:
+        try:
+            pages.append(_make_page(vessel, config, flights, limit, log, split))
+        except DataError as error:
+            if not config.skip_failed:
+                raise
+            remarks.append(str(error))
+
+    for flights in _simulate_draws(craft, config, fitted_model, config.manoeuvres):
+        add_page(craft, flights, None, "")
+    measured_trials = _identify_measured_trials(config, logs, rudder, remarks)
+    if measured_trials:
+        shares = _input_shares_from_trials(config, measured_trials)
+        craft = build_booklet_vessel(config, fitted_model, shares)
+        craft = replace(
+            craft,
+            initial_state=torch.cat(
+                [_initial_state_of_log(craft, trial.log) for trial in measured_trials]
+            ),
+        )
+        replicas = [_replicate_trial(trial, shares, craft.dynamics.dt) for trial in measured_trials]
+        flights_by_trial = _simulate_draws(
+            craft, config, fitted_model, [simulated for _, simulated in replicas]
+        )
+        for trial, (nominal, _), flights in zip(
+            measured_trials, replicas, flights_by_trial, strict=True
+        ):
+            renamed_flights = [replace(flight, manoeuvre=nominal) for flight in flights]
+            add_page(craft, renamed_flights, trial.log, trial.split)
+    if not pages:
+        raise DataError(f"booklet: no manoeuvre can be predicted: {remarks[0]}")
+    return pages, remarks
+
+
 def write_booklet(
     folder: RunFolder,
     config: BookletConfig,
@@ -60,44 +122,8 @@ def write_booklet(
     """
     import pandas as pd
 
-    craft = _build_craft(config, fitted_model, config.inputs)
     rudder = config.steering_input()
-    pages: list[BookletPage] = []
-    remarks: list[str] = []
-
-    def add_page(
-        vessel: SimulatedVessel, flights: Sequence[ManoeuvreRun], log: Log | None, split: str
-    ) -> None:
-        try:
-            pages.append(_make_page(vessel, config, flights, limit, log, split))
-        except DataError as error:
-            if not config.skip_failed:
-                raise
-            remarks.append(str(error))
-
-    for flights in _simulate_draws(craft, config, fitted_model, config.manoeuvres):
-        add_page(craft, flights, None, "")
-    measured_trials = _identify_measured_trials(config, logs, rudder, remarks)
-    if measured_trials:
-        shares = _input_shares_from_trials(config, measured_trials)
-        craft = _build_craft(config, fitted_model, shares)
-        craft = replace(
-            craft,
-            initial_state=torch.cat(
-                [_initial_state_of_log(craft, trial.log) for trial in measured_trials]
-            ),
-        )
-        replicas = [_replicate_trial(trial, shares, craft.dynamics.dt) for trial in measured_trials]
-        flights_by_trial = _simulate_draws(
-            craft, config, fitted_model, [simulated for _, simulated in replicas]
-        )
-        for trial, (nominal, _), flights in zip(
-            measured_trials, replicas, flights_by_trial, strict=True
-        ):
-            renamed_flights = [replace(flight, manoeuvre=nominal) for flight in flights]
-            add_page(craft, renamed_flights, trial.log, trial.split)
-    if not pages:
-        raise DataError(f"booklet: no manoeuvre can be predicted: {remarks[0]}")
+    pages, remarks = compute_booklet_pages(config, fitted_model, logs, limit)
     folder.write_record(
         folder.booklet,
         build_booklet(
@@ -141,7 +167,7 @@ def require_flyable(config: BookletConfig, logs: PreparedSplits, settings: FitSe
     """
     fitter = Fitter(logs, settings, FitStore(), resolve_recipe=False)
     spec = fitter.build_spec(config.model, "baseline", settings.all_baselines[config.model])
-    craft = _build_craft(config, FittedModel(spec, spec.build(), {}), config.inputs)
+    craft = build_booklet_vessel(config, FittedModel(spec, spec.build(), {}), config.inputs)
     make_manoeuvre_source(
         config.manoeuvres, craft.helm, torch.arange(2, dtype=torch.float64) * spec.dt
     )
@@ -149,7 +175,7 @@ def require_flyable(config: BookletConfig, logs: PreparedSplits, settings: FitSe
         manoeuvre.initial_state(craft.initial_state[0], craft.helm.state)
 
 
-def _build_craft(
+def build_booklet_vessel(
     config: BookletConfig, fitted_model: FittedModel, inputs: Mapping[str, InputShare]
 ) -> SimulatedVessel:
     """Return the model with its actuators as a simulated vessel; batch rows are draws."""
