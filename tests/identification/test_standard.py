@@ -218,6 +218,20 @@ def short(names: tuple[str, ...]) -> dict[str, Any]:
     return make_portfolio(replace(TrainingDataSummary.from_channel_names(names), n_samples=5_400))
 
 
+def test_the_hull_of_model_tests_has_a_saturating_rudder_and_free_asymmetry() -> None:
+    summary = TrainingDataSummary.from_channel_names(("u", "v", "r", "delta"))
+    portfolio = make_portfolio(summary, has_model_tests=True)
+    terms = portfolio["baselines"]["hull"]["terms"]
+    assert {"1", "u|u| delta", "u|u| delta^3", "v|v|"} <= set(terms["r"])
+    assert {"v^2", "r^2", "u|u| delta^2"} <= set(terms["u"])
+    # mirror symmetry: surge is even, sway and yaw are odd
+    assert "u|u| delta^3" not in terms["u"]
+    assert not {"v^2", "r^2", "u|u| delta^2"} & set(terms["r"])
+    assert portfolio["refit"]["hull"]["asymmetric"] == 0.0
+    settings = validate_config({**content(), "recipe": "model_tests"}, FitSettings, "here")
+    assert settings.refit["hull"].asymmetric == 0.0
+
+
 def test_a_yaw_rate_of_noise_alone_tells_no_memory() -> None:
     random = np.random.default_rng(1)
     t = np.arange(0.0, 200.0, 0.1)

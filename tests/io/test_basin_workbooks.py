@@ -31,7 +31,7 @@ def make_test(kind: str, angle_deg: float) -> Log:
     pose = np.zeros((len(t), 3))
     delta = 0.0
     delta_log = np.zeros_like(t)
-    side = 1.0
+    side = float(np.sign(angle_deg))
     for k in range(len(t) - 1):
         if t[k] < 5.0:
             command[k] = 0.0
@@ -40,7 +40,7 @@ def make_test(kind: str, angle_deg: float) -> Log:
         else:
             if side * pose[k, 2] >= abs(angle_deg) / DEGREES:
                 side = -side
-            command[k] = side * angle_deg / DEGREES
+            command[k] = side * abs(angle_deg) / DEGREES
         delta_log[k] = delta
         delta = float(simulate_gear(command[k : k + 1].repeat(2), delta, dt, 0.6, 0.3, 0.0)[1])
         r[k + 1] = r[k] + dt * (0.16 * delta - r[k]) / 2.0

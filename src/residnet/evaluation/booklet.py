@@ -238,12 +238,12 @@ def add_model_error(draws: np.ndarray, errors: Sequence[ModelError]) -> np.ndarr
     relative = [error.relative for error in errors if error.relative is not None]
     if len(relative) == len(errors) and (draws > 0.0).all():
         variance = np.square(relative).mean() - np.mean([e.relative_variance for e in errors])
-        factors: np.ndarray = np.exp(math.sqrt(max(variance, 0.0)) * quantiles)
-        return (draws[:, None] * factors).ravel()
+        widened: np.ndarray = draws[:, None] * np.exp(math.sqrt(max(variance, 0.0)) * quantiles)
+        return widened.ravel()
     absolute = [error.absolute for error in errors]
     variance = np.square(absolute).mean() - np.mean([e.absolute_variance for e in errors])
-    shifted: np.ndarray = draws[:, None] + math.sqrt(max(variance, 0.0)) * quantiles
-    return shifted.ravel()
+    widened = draws[:, None] + math.sqrt(max(variance, 0.0)) * quantiles
+    return widened.ravel()
 
 
 _N_QUANTILES = 81

@@ -73,7 +73,9 @@ class FitSettings(ModelPartsConfig):
         recipe: `standard` sets the parts: a linear baseline, a hull, networks on the hull, for long
             logs also black-box networks, and `ensemble`, the mean of the trajectories of hull and
             networks, which is reported first and exported by default. Terms, sizes and trainings
-            follow from the logs. Null for explicit parts.
+            follow from the logs. `model_tests` is the same with a hull for tests of a model basin:
+            rudder forces saturate, and the asymmetry of a single propeller is not shrunk. Null for
+            explicit parts.
         effort: factor of the duration of trainings that follow from the logs: 1 for the usual one,
             less for a quick look.
     """
@@ -85,7 +87,7 @@ class FitSettings(ModelPartsConfig):
     current: CurrentConfig | None = None
     evaluation: EvaluationConfig
     bands: BandsConfig | None = BandsConfig()
-    recipe: Literal["standard"] | None = None
+    recipe: Literal["standard", "model_tests"] | None = None
     effort: float = Field(default=1.0, gt=0, le=10)
 
     @model_validator(mode="after")
@@ -98,14 +100,15 @@ class FitSettings(ModelPartsConfig):
             return self
         if specified_parts:
             raise ValueError(
-                f"recipe: standard sets {', '.join(PART_KEYS)}; remove"
+                f"recipe: {self.recipe} sets {', '.join(PART_KEYS)}; remove"
                 f" '{specified_parts[0]}' or the recipe"
             )
         return self.with_parts(TrainingDataSummary.from_channel_names(self.signals.channel_names()))
 
     def with_parts(self, data_summary: TrainingDataSummary) -> Self:
         """Return the settings with the parts of the recipe for the given logs."""
-        parts = validate_config(make_portfolio(data_summary), ModelPartsConfig, "recipe")
+        portfolio = make_portfolio(data_summary, has_model_tests=self.recipe == "model_tests")
+        parts = validate_config(portfolio, ModelPartsConfig, "recipe")
         return self.model_copy(update={key: getattr(parts, key) for key in PART_KEYS})
 
     @model_serializer(mode="wrap")

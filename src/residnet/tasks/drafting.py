@@ -284,7 +284,7 @@ def draft_fit_config(
         "prepare": preparation,
         "signals": signals,
         "integrator": choose_integrator(dof),
-        "recipe": "standard",
+        "recipe": "standard" if naval is None else "model_tests",
         "export": {"models": []},
         "evaluation": evaluation_settings,
     }

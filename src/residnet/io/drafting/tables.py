@@ -207,7 +207,10 @@ def draft_tables(
         settings = column_settings.get(entry["column"], {})
         entry |= {"column": main_preview.original_name(entry["column"]), **settings}
     reader_settings = {
-        key: value for key, value in main_preview.reader_settings.items() if key != "kind"
+        # sheets are a list in YAML
+        key: list(value) if isinstance(value, tuple) else value
+        for key, value in main_preview.reader_settings.items()
+        if key != "kind"
     }
     time = dict(clock.settings)
     if "column" in time:
@@ -1299,7 +1302,7 @@ def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]
     ]
     if are_parts_of_recording([tables[name] for name in numeric_sheets]):
         joined = join_excel_sheets(path, {name: tables[name] for name in numeric_sheets})
-        return joined, {"kind": "excel", "sheet": numeric_sheets}
+        return joined, {"kind": "excel", "sheet": tuple(numeric_sheets)}
     name = next(iter([*numeric_sheets, *names]))
     table = tables[name]
     table.attrs["other_sheets"] = tuple(numeric_sheets[1:])
