@@ -228,8 +228,7 @@ def test_the_hull_of_model_tests_has_a_saturating_rudder_and_free_asymmetry() ->
     assert "u|u| delta^3" not in terms["u"]
     assert not {"v^2", "r^2", "u|u| delta^2"} & set(terms["r"])
     assert portfolio["refit"]["hull"]["asymmetric"] == 0.0
-    settings = validate_config({**content(), "recipe": "model_tests"}, FitSettings, "here")
-    assert settings.refit["hull"].asymmetric == 0.0
+    assert settings(recipe="model_tests").refit["hull"].asymmetric == 0.0
 
 
 def test_a_yaw_rate_of_noise_alone_tells_no_memory() -> None:
