@@ -15,8 +15,11 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines.base import ParametricBaseline, select_manoeuvres
+from residnet.core.errors import ConfigError
+from residnet.core.names import VELOCITY_NAMES
 from residnet.core.samples import Samples, directional_derivatives
 from residnet.physics.signals import SoftVelocityLimit
+from residnet.physics.similarity import Particulars, estimate_lateral_dynamics, is_rudder
 from residnet.physics.symmetry import (
     ChannelNames,
     acts_along_own_velocity,
@@ -363,6 +366,8 @@ def fit_regressors(
             else:
                 break
         axis_fits[axis] = axis_solutions
+    if config.particulars is not None:
+        _apply_semi_empirical_prior(config.particulars, baseline, selected, axis_fits)
     axis_solutions = [
         baseline.combine_axis_fits(
             dict(zip(learned_axes, axis_candidates, strict=True)),
@@ -376,6 +381,111 @@ def fit_regressors(
     restoring.calibrate(selected)
     state = {f"bound.{name}": value for name, value in restoring.state_dict().items()}
     return [replace(solution, state={**solution.state, **state}) for solution in axis_solutions]
+
+
+_REGRESSION_ERROR = 0.3
+"""Relative standard deviation of a semi-empirical derivative, before the evidence widens it."""
+_PRIOR_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+"""Factors on this standard deviation, of which the evidence chooses one."""
+
+
+def _apply_semi_empirical_prior(
+    particulars: Particulars,
+    baseline: RegressorBaseline,
+    samples: Samples,
+    axis_fits: dict[int, list[Solution]],
+) -> None:
+    """Combine the least-squares solutions of sway and yaw with semi-empirical derivatives.
+
+    The prior is on the derivatives of the accelerations by v and r at the service speed, to which
+    several terms such as v and u v contribute. The estimates are normal with the covariance of
+    least squares, so that the posterior and the marginal likelihood have closed forms (MacKay 1992,
+    Bayesian Interpolation, Neural Computation 4(3)). One factor widens the prior of all of them.
+
+    Args:
+        particulars: main particulars and service speed.
+        baseline: the baseline.
+        samples: training samples.
+        axis_fits: solutions of each axis, one for each penalty; those of sway and yaw are replaced.
+
+    Raises:
+        ConfigError: if the model has other velocities than u, v and r.
+    """
+    dynamics = estimate_lateral_dynamics(particulars)
+    assert dynamics is not None, "the config was validated"
+    names = list(samples.names)
+    if get_dof(samples.names).dynamic_states != VELOCITY_NAMES:
+        raise ConfigError("baseline 'regressors': particulars are for models of u, v and r")
+    # straight-ahead motion at service speed; propellers at their mean, rudders amidships
+    z = samples.z.double().mean(0, keepdim=True)
+    for column, name in enumerate(names):
+        if name in VELOCITY_NAMES or is_rudder(name):
+            z[:, column] = particulars.speed if name == "u" else 0.0
+    directions = z.new_zeros(2, 1, len(names))
+    directions[0, 0, names.index("v")] = 1.0
+    directions[1, 0, names.index("r")] = 1.0
+    # derivatives of the terms by v and r [2, J]
+    slopes = directional_derivatives(baseline.library, z, directions)[:, 0]
+    targets = torch.tensor(dynamics, dtype=torch.float64)
+    for index in range(len(axis_fits[1])):
+        fits = {axis: axis_fits[axis][index] for axis in (1, 2)}
+        posteriors = [
+            _combine_with_prior(fits, baseline, slopes, targets, factor)
+            for factor in _PRIOR_FACTORS
+        ]
+        best = max(range(len(posteriors)), key=lambda k: posteriors[k][0])
+        for axis, solution in posteriors[best][1].items():
+            axis_fits[axis][index] = solution
+
+
+def _combine_with_prior(
+    fits: Mapping[int, Solution],
+    baseline: RegressorBaseline,
+    slopes: Tensor,
+    targets: Tensor,
+    factor: float,
+) -> tuple[float, dict[int, Solution]]:
+    """Return the log evidence and the posterior solutions of sway and yaw for a width of the prior.
+
+    Args:
+        fits: least-squares solution of sway and of yaw.
+        baseline: the baseline.
+        slopes: derivatives of the terms by v and r [2, J].
+        targets: semi-empirical derivatives of the accelerations of sway and yaw [2, 2].
+        factor: factor on the standard deviation of the regressions.
+    """
+    log_evidence = 0.0
+    posteriors = {}
+    for axis, solution in fits.items():
+        columns = [baseline.library.terms.index(entry.term) for entry in solution.table]
+        design = slopes[:, columns]
+        target = targets[axis - 1]
+        assert solution.covariance is not None, "least squares has a covariance"
+        covariance = solution.covariance[0]
+        estimate = torch.tensor([entry.value for entry in solution.table], dtype=torch.float64)
+        # a velocity without terms in this axis has no derivative that a prior could change
+        is_used = design.abs().amax(1) > 0.0
+        design = design[is_used]
+        target = target[is_used]
+        noise = torch.diag((factor * _REGRESSION_ERROR * target).square())
+        innovation = target - design @ estimate
+        innovation_covariance = design @ covariance @ design.T + noise
+        log_evidence -= 0.5 * float(
+            innovation @ torch.linalg.solve(innovation_covariance, innovation)
+            + torch.linalg.slogdet(innovation_covariance).logabsdet
+        )
+        gain = torch.linalg.solve(innovation_covariance, design @ covariance).T
+        posterior = estimate + gain @ innovation
+        posterior_covariance = covariance - gain @ design @ covariance
+        errors = posterior_covariance.diagonal().clamp(min=0.0).sqrt()
+        table = tuple(
+            replace(entry, value=value, standard_error=error)
+            for entry, value, error in zip(
+                solution.table, posterior.tolist(), errors.tolist(), strict=True
+            )
+        )
+        posteriors[axis] = replace(solution, table=table, covariance=posterior_covariance[None])
+    return log_evidence, posteriors
 
 
 def _destabilising_in_all(

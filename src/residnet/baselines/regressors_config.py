@@ -18,6 +18,7 @@ from residnet.baselines.sets import (
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY_NAMES
 from residnet.core.sample_origins import SampleOrigins
+from residnet.physics.similarity import Particulars
 from residnet.physics.symmetry import (
     active_channels,
     get_dof,
@@ -60,6 +61,10 @@ class RegressorsConfig(IdentifiedConfig):
         bounded: whether velocities and inputs are clamped if they exceed the training range by more
             than half its width, with a restoring acceleration on such velocities, so that the model
             cannot diverge.
+        particulars: main particulars and service speed of the hull. Its semi-empirical derivatives
+            (Clarke, Gedling and Hine 1983) are the prior of the linear sway and yaw dynamics; null
+            for no prior. The width of the prior is the one with the largest marginal likelihood, so
+            that few logs stay near the regressions and many logs leave them.
     """
 
     kind: Literal["regressors"] = "regressors"
@@ -71,6 +76,20 @@ class RegressorsConfig(IdentifiedConfig):
     manoeuvres: tuple[str, ...] = ()
     dissipative: bool = False
     bounded: bool = False
+    particulars: Particulars | None = None
+
+    @model_validator(mode="after")
+    def _validate_particulars(self) -> RegressorsConfig:
+        if self.particulars is not None and None in (
+            self.particulars.beam,
+            self.particulars.draught,
+            self.particulars.mass,
+        ):
+            raise ValueError(
+                "particulars: semi-empirical derivatives need beam, draught and mass; add them, or"
+                " remove particulars"
+            )
+        return self
 
     @model_validator(mode="after")
     def _validate_terms(self) -> RegressorsConfig:

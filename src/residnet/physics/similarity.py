@@ -492,3 +492,43 @@ def estimate_linear_derivatives(particulars: Particulars) -> dict[str, float] | 
         "N_v": -slenderness * (0.5 + 2.4 * draught_to_length),
         "N_r": -slenderness * (0.25 + 0.039 * beam_to_draught - 0.56 * beam_to_length),
     }
+
+
+def estimate_lateral_dynamics(particulars: Particulars) -> list[list[float]] | None:
+    """Estimate the derivatives of sway and yaw accelerations by v and r at the service speed.
+
+    The hull derivatives are those of `estimate_linear_derivatives`, the masses those of
+    `estimate_added_mass` with the rigid body of the particulars (Fossen 2011, section 6.5).
+
+    Returns:
+        Rows [[v_dot by v, v_dot by r], [r_dot by v, r_dot by r]] in SI; None if particulars are
+        missing.
+    """
+    added_mass = estimate_added_mass(particulars)
+    derivatives = estimate_linear_derivatives(particulars)
+    if added_mass is None or derivatives is None or particulars.mass is None:
+        return None
+    mass = particulars.mass
+    length = particulars.length
+    speed = particulars.speed
+    static_moment = mass * particulars.centre_of_gravity
+    inertia = mass * ((particulars.gyradius * length) ** 2 + particulars.centre_of_gravity**2)
+    sway_mass = mass + added_mass.sway
+    coupling = static_moment + added_mass.sway_yaw
+    transposed_coupling = static_moment + added_mass.yaw_sway
+    yaw_inertia = inertia + added_mass.yaw
+    unit = 0.5 * particulars.density * length**2 * speed
+    sway_forces = (derivatives["Y_v"] * unit, derivatives["Y_r"] * unit * length - mass * speed)
+    yaw_moments = (
+        derivatives["N_v"] * unit * length,
+        derivatives["N_r"] * unit * length**2 - static_moment * speed,
+    )
+    determinant = sway_mass * yaw_inertia - coupling * transposed_coupling
+    columns = list(zip(sway_forces, yaw_moments, strict=True))
+    return [
+        [(yaw_inertia * force - coupling * moment) / determinant for force, moment in columns],
+        [
+            (sway_mass * moment - transposed_coupling * force) / determinant
+            for force, moment in columns
+        ],
+    ]
