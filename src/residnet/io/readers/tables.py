@@ -901,12 +901,13 @@ def join_excel_sheets(path: Path, tables: Mapping[str, pd.DataFrame]) -> pd.Data
                 f"{path}: column '{min(common_names)}' is in sheet '{name}' and in an earlier one;"
                 " rename it in one of them"
             )
-        column_names += names[1:]
         for k, units in enumerate(table.attrs["unit_rows"]):
             if k == len(unit_rows):
-                unit_rows.append([])
-            missing = len(column_names) - len(names) + 1 - len(unit_rows[k])
-            unit_rows[k] += [""] * missing + list(units if not unit_rows[k] else units[1:])
+                # the first sheet gives the unit of the time
+                unit_rows.append(list(units[:1]))
+            missing = len(column_names) - len(unit_rows[k])
+            unit_rows[k] += [*[""] * missing, *units[1:]]
+        column_names += names[1:]
         timed = table.copy()
         timed.attrs = {}
         timed[time_name] = pd.to_numeric(timed[time_name], errors="coerce")
