@@ -246,7 +246,7 @@ def add_model_error(draws: np.ndarray, errors: Sequence[ModelError]) -> np.ndarr
     return widened.ravel()
 
 
-_N_QUANTILES = 81
+_N_QUANTILES = 401
 """Number of quantiles that represent the model error; odd, so that one of them is zero."""
 
 
