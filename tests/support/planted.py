@@ -167,18 +167,18 @@ def held(log: Log, names: Sequence[str], at: np.ndarray) -> Log:
 
 # what each line damages, for all that one expression says
 _LAGS = (
-    *("lag", "lag_u", "lag_v", "lag_psi", "lag_xy", "follows_u", "follows_v", "follows_r"),
+    *("lag", "lag_u", "lag_v", "lag_psi", "lag_xy"),
     *("acausal", "gain_v", "gain_u", "heading"),
 )
-_SIGNS = ("frames", "follows_u", "follows_v", "follows_r", "gain_v", "gain_u", "rudder_sign")
+_SIGNS = ("frames", "gain", "gain_v", "gain_u", "rudder_sign")
 _PROPELLERS = ("n", "n_port", "n_stbd")
 _KNOT = 1.0 / 0.5144
 _SIMPLE: list[tuple[str, tuple[str, ...], Damage]] = [
     ("time gap", ("gaps",), lambda s, log, g: at_rows(log, ~stretch(log, g, 0.02, 0.1))),
-    ("r in deg/s", ("follows_r", "gain"), lambda s, log, g: scaled(log, ["r"], 180.0 / np.pi)),
+    ("r in deg/s", ("gain",), lambda s, log, g: scaled(log, ["r"], 180.0 / np.pi)),
     (
         "psi in deg",
-        ("follows_r", "frames", "gain", "heading_wrap"),
+        ("frames", "gain", "heading_wrap"),
         lambda s, log, g: scaled(log, ["psi"], 180.0 / np.pi),
     ),
     (
@@ -188,7 +188,7 @@ _SIMPLE: list[tuple[str, tuple[str, ...], Damage]] = [
     ),
     (
         "u in knots",
-        ("frames", "gain", "gain_u", "follows_u"),
+        ("frames", "gain", "gain_u"),
         lambda s, log, g: scaled(log, ["u"], _KNOT),
     ),
     ("r reversed", _SIGNS, lambda s, log, g: scaled(log, ["r"], -1.0)),
@@ -292,7 +292,7 @@ def _steer_reversed(ship: Ship, log: Log, random: Random) -> Log:
     return changed(log, **{a: log[b] for a, b in pairs}, **{b: log[a] for a, b in pairs})
 
 
-@fault("lag of r", "lag", "follows_r")
+@fault("lag of r", "lag")
 def _rate_late(ship: Ship, log: Log, random: Random) -> Log:
     """A late yaw rate; one that hardly changes hides its lag."""
     out = late(log, random.uniform(*ship.lag), "r")
@@ -374,7 +374,7 @@ def course(log: Log) -> np.ndarray:
     return np.asarray(log["psi"] + np.arctan2(log["v"], np.maximum(log["u"], 1e-3)))
 
 
-_COURSE = ("course_as_heading", "gain_v", "frames")
+_COURSE = ("gain_v", "frames")
 fault("course as heading", *_COURSE, ships=())(lambda s, log, g: changed(log, psi=course(log)))
 fault("course swapped", *_COURSE, ships=())(
     lambda s, log, g: changed(log, psi=course(log), course=log["psi"])

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -29,10 +28,8 @@ from residnet.quality.findings import (
     check,
     describe_unit_confusion,
     make_correction,
-    with_channels,
 )
 from residnet.quality.kinematics import (
-    MIN_LAG,
     POSITION_LIMITS,
     YAW_LIMITS,
     estimate_position_causes,
@@ -54,6 +51,8 @@ _CONVENTION_TEXTS = {
     ("earth axes", 0): "u, v as velocities in earth axes (frame: ned)",
 }
 _PLANAR_MOTION = (*POSE_NAMES, "u", "v")
+_MIN_YAW_RATE_STD = math.radians(0.1)
+"""Smallest standard deviation of a yaw rate in rad/s that is compared with another."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,6 @@ class AveragedRates:
         yaw_rate: derivative of psi [T] in rad/s.
         averaged_velocities: averaged u, v, r of the log [T].
         yaw_rate_noise: larger standard deviation of the noise of `yaw_rate` and averaged r, rad/s.
-        sway_noise: standard deviation of the noise of averaged v, m/s.
     """
 
     ground_velocity: np.ndarray
@@ -76,7 +74,6 @@ class AveragedRates:
     yaw_rate: np.ndarray
     averaged_velocities: dict[str, np.ndarray]
     yaw_rate_noise: float
-    sway_noise: float
 
 
 def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
@@ -152,7 +149,6 @@ def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
             yaw_rate_noise,
             log.noise_std("r") / np.sqrt(2.0 * yaw_half_window) if "r" in velocity_names else 0.0,
         ),
-        log.noise_std("v") / np.sqrt(2.0 * position_half_window) if "v" in velocity_names else 0.0,
     )
 
 
@@ -351,165 +347,6 @@ def _report_jumps(
         )
 
 
-@check(
-    "grid",
-    "course_as_heading",
-    fix="take psi from the compass",
-    required_channels=_PLANAR_MOTION,
-    on_subsample=True,
-)
-def check_course_as_heading(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report a heading that equals the course over ground although the vessel drifts."""
-    averaged_rates = log.cached(compute_averaged_rates)
-    agreement = log.cached(compare_frames)
-    # velocities in earth axes have no drift angle
-    is_earth_fixed = agreement is not None and agreement.best_name == "earth axes"
-    if not {"u", "v"} <= averaged_rates.averaged_velocities.keys() or is_earth_fixed:
-        return
-    drift_angles = np.angle(
-        averaged_rates.averaged_velocities["u"] + 1j * averaged_rates.averaged_velocities["v"]
-    )
-    course_angles = np.angle(averaged_rates.ground_velocity * np.exp(-1j * log["psi"]))
-    is_valid = np.isfinite(course_angles) & np.isfinite(drift_angles)
-    speed = np.abs(averaged_rates.ground_velocity)
-    if is_valid.any():
-        is_valid &= (speed > 0.3 * nan_quantiles(speed[is_valid], 0.9)[0]) & (
-            np.abs(drift_angles) < 1.2
-        )
-    drift_std = float(np.std(drift_angles[is_valid])) if is_valid.sum() >= 100 else 0.0
-    # heading and course are distinguishable only if the drift angle varies beyond its noise
-    drift_noise = (
-        float(np.sqrt(np.mean((averaged_rates.sway_noise / speed[is_valid]) ** 2)))
-        if drift_std
-        else 0.0
-    )
-    if drift_std < math.hypot(math.radians(1.0), drift_noise):
-        return
-    rms_as_heading, rms_as_course = (
-        float(np.sqrt(np.mean(np.angle(np.exp(1j * angle)) ** 2)))
-        for angle in (course_angles[is_valid] - drift_angles[is_valid], course_angles[is_valid])
-    )
-    if rms_as_course < 0.6 * min(rms_as_heading, drift_std):
-        text = (
-            "psi is the course over ground: it follows the positions to"
-            f" {math.degrees(rms_as_course):.1f} deg without the drift of v over u, and to"
-            f" {math.degrees(rms_as_heading):.1f} deg with it"
-        )
-        yield make_finding(
-            text,
-            {"as_course": rms_as_course, "as_heading": rms_as_heading},
-            repair=lambda log: with_channels(log, psi=log["psi"] - np.arctan2(log["v"], log["u"])),
-        )
-
-
-@check("grid", "follows", required_channels=_PLANAR_MOTION, on_subsample=True)
-def check_velocities_against_position(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report sign, gain and lag of u and v against the derivative of the position."""
-    frame_agreement = log.cached(compare_frames)
-    body_ground_velocity = log.cached(compute_averaged_rates).ground_velocity * np.exp(
-        -1j * log["psi"]
-    )
-    if (
-        frame_agreement is None
-        or not frame_agreement.is_consistent
-        or not np.isfinite(body_ground_velocity).any()
-    ):
-        return
-    # the comparison of increments detects an offset or a current, but not wrong axes
-    is_certain = any(
-        cause.is_significant for cause in log.cached(estimate_position_causes).values()
-    )
-    min_spread = 0.05 * float(np.sqrt(np.nanmean(np.abs(body_ground_velocity) ** 2)))
-    for name, axis_name, reference in (
-        ("u", "x", body_ground_velocity.real),
-        ("v", "y", body_ground_velocity.imag),
-    ):
-        reference_text = f"the position's rate along {axis_name}"
-        finding_arguments = _compare_channel(
-            log, name, reference, min_spread, reference_text, is_certain
-        )
-        if finding_arguments:
-            yield make_finding(**finding_arguments)
-
-
-def _compare_channel(
-    log: LogStatistics,
-    name: str,
-    reference: np.ndarray,
-    min_spread: float,
-    reference_text: str,
-    is_certain: bool,
-) -> dict[str, Any]:
-    """Return the arguments of a finding about sign, gain and lag of a channel.
-
-    Args:
-        log: statistics of the log.
-        name: channel to compare.
-        reference: derivative of the pose [T].
-        min_spread: smallest standard deviation for a comparison.
-        reference_text: description of the reference.
-        is_certain: whether the comparison of increments found a significant difference. Only then
-            a lag misleads, because slow channels correlate at any lag.
-
-    Returns:
-        Keyword arguments of the check; empty if the comparison is not possible.
-    """
-    averaged_rates = log.cached(compute_averaged_rates)
-    channel_std, reference_std = (
-        nan_std(signal) for signal in (averaged_rates.averaged_velocities[name], reference)
-    )
-    if (
-        name == "r"
-        and reference_std > 5.0 * averaged_rates.yaw_rate_noise
-        and channel_std < NEGLIGIBLE_MOTION_SHARE * reference_std
-    ):
-        return {
-            "text": (
-                f"{name} does not move, while {reference_text} does; the gyro is dead or another"
-                " column"
-            ),
-            "figures": {"correlation": 0.0, "gain": 0.0, "lag": 0.0},
-            "code": f"follows_{name}",
-            "level": "will mislead",
-            "fix": f"leave {name} out of the channel map: it follows from the heading",
-        }
-    channel_agreement = estimate_agreement(
-        reference, averaged_rates.averaged_velocities[name], log.sampling_interval
-    )
-    if channel_agreement is None or channel_agreement.reference_std < min_spread:
-        return {}
-    correlation, gain, lag, reference_spread = channel_agreement
-    text = (
-        f"{name} against {reference_text}: correlation {correlation:.3f}, gain {gain:.3f}, lag"
-        f" {lag:+.2f} s"
-    )
-    level: Level = "will mislead"
-    fix = ""
-    is_above_noise = name != "r" or reference_spread > 5.0 * averaged_rates.yaw_rate_noise
-    if correlation < -0.8 or (correlation < -0.5 and is_above_noise):
-        text = f"{text}; it has the opposite sign"
-        fix = "turn it in the channel map (sign: -1)"
-    elif correlation < 0.5 and name == "r" and is_above_noise:
-        level = "fatal"
-        fix = "are both columns of this vessel and this clock?"
-        text += "; they do not describe one motion"
-    elif correlation > 0.9 and is_above_noise and not 0.6 < gain < 1.6:
-        text += f"; check its unit{describe_unit_confusion(gain, log.units[name])}"
-        fix = "correct the unit in the channel map"
-    else:
-        # the causes of `kinematics` distinguish the channels, so the lag is only a note here
-        level = "note"
-        if (
-            correlation > 0.9
-            and abs(lag) > max(MIN_LAG, log.sampling_interval)
-            and is_above_noise
-            and is_certain
-        ):
-            text += f"; it {'trails' if lag > 0.0 else 'leads'}, a filter or another clock"
-    figures = {"correlation": correlation, "gain": gain, "lag": lag}
-    return {"text": text, "figures": figures, "code": f"follows_{name}", "level": level, "fix": fix}
-
-
 @check("grid", "position_causes", required_channels=_PLANAR_MOTION, on_subsample=True)
 def check_position_causes(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report the causes of differences between position and velocities in correct frames."""
@@ -520,32 +357,43 @@ def check_position_causes(log: LogStatistics, make_finding: Check) -> Iterator[F
         )
 
 
-def compare_yaw_rate(log: LogStatistics) -> dict[str, Any]:
-    """Return the arguments of a finding about r against the derivative of psi."""
-    if "r" not in log.cached(compute_averaged_rates).averaged_velocities:
-        return {}
-    is_certain = any(cause.is_significant for cause in log.cached(estimate_yaw_causes).values())
-    heading_rate = log.cached(compute_averaged_rates).yaw_rate
-    return _compare_channel(
-        log, "r", heading_rate, math.radians(0.1), "the rate of psi", is_certain
-    )
-
-
-def _is_yaw_consistent(log: LogStatistics) -> bool:
-    """Return whether psi and r agree in sign, unit and scale."""
-    has_both_channels = min(int(np.isfinite(log[name]).sum()) for name in ("psi", "r")) > 1
-    return has_both_channels and log.cached(compare_yaw_rate).get("level", "note") == "note"
-
-
 _YAW_MOTION = (*POSE_NAMES, "r")
+_MIN_YAW_CORRELATION = 0.5
+"""Smallest correlation, at any lag and sign, of a yaw rate with the derivative of the heading."""
 
 
-@check("grid", "follows", required_channels=_YAW_MOTION, on_subsample=True)
-def check_yaw_rate_against_heading(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report sign, gain and lag of r against the derivative of psi."""
-    finding_arguments = log.cached(compare_yaw_rate)
-    if finding_arguments:
-        yield make_finding(**finding_arguments)
+@check(
+    "grid",
+    "yaw_rate",
+    "fatal",
+    "are both columns of this vessel and this clock?",
+    required_channels=_YAW_MOTION,
+    on_subsample=True,
+)
+def check_yaw_rate(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report a yaw rate that has nothing in common with the derivative of the heading."""
+    rates = log.cached(compute_averaged_rates)
+    yaw_rate = rates.averaged_velocities.get("r")
+    if yaw_rate is None:
+        return
+    reference_std = nan_std(rates.yaw_rate)
+    if reference_std <= max(5.0 * rates.yaw_rate_noise, _MIN_YAW_RATE_STD):
+        return
+    if nan_std(yaw_rate) < NEGLIGIBLE_MOTION_SHARE * reference_std:
+        yield make_finding(
+            "r does not move, while the rate of psi does; the gyro is dead or another column",
+            {"correlation": 0.0},
+            level="will mislead",
+            fix="leave r out of the channel map: it follows from the heading",
+        )
+        return
+    agreement = estimate_agreement(rates.yaw_rate, yaw_rate, log.sampling_interval)
+    if agreement is not None and abs(agreement.correlation) < _MIN_YAW_CORRELATION:
+        yield make_finding(
+            f"r against the rate of psi: correlation {agreement.correlation:.3f} at a lag of"
+            f" {agreement.lag:+.2f} s; they do not describe one motion",
+            {"correlation": agreement.correlation, "lag": agreement.lag},
+        )
 
 
 @check(
@@ -572,7 +420,9 @@ def check_heading_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Fin
 @check("grid", "yaw_drift", required_channels=_YAW_MOTION, is_record_fault=True)
 def check_yaw_drift(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report the bias of r against psi."""
-    if not _is_yaw_consistent(log.subsample):
+    causes = log.subsample.cached(estimate_yaw_causes)
+    if "gain" in causes and causes["gain"].is_gross:
+        # the sign or the unit of r is wrong
         return
     psi = interpolate_gaps(log.t, log["psi"])
     r = interpolate_gaps(log.t, log["r"])
@@ -584,7 +434,6 @@ def check_yaw_drift(log: LogStatistics, make_finding: Check) -> Iterator[Finding
     duration = float(log.t[-1] - log.t[0])
     yaw_rate_std = max(log.std("r"), 1e-12)
     bias = final_drift / duration
-    causes = log.subsample.cached(estimate_yaw_causes)
     bias_cause = causes.get("bias") or causes.get("ramp")
     # a bias misleads above 1.8 deg per minute and 5 % of the yaw rate, or by its integral
     is_large = abs(bias) > max(math.radians(0.03), 0.05 * yaw_rate_std) or max_drift > math.radians(
@@ -610,11 +459,8 @@ def check_yaw_drift(log: LogStatistics, make_finding: Check) -> Iterator[Finding
 
 @check("grid", "yaw_causes", required_channels=_YAW_MOTION, on_subsample=True)
 def check_yaw_causes(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report gain and lag of r against psi."""
-    if _is_yaw_consistent(log):
-        yield from make_cause_findings(
-            log.cached(estimate_yaw_causes), YAW_LIMITS, log, make_finding
-        )
+    """Report sign, gain and lag of r against psi."""
+    yield from make_cause_findings(log.cached(estimate_yaw_causes), YAW_LIMITS, log, make_finding)
 
 
 _MIN_ROLL_CORRELATION = 0.8

@@ -22,7 +22,14 @@ from residnet.core.log import Log
 from residnet.preprocessing.channel_values import SIGMA_OF_MAD, nan_median, nan_std
 from residnet.preprocessing.derivatives import fit_local_polynomials
 from residnet.preprocessing.statistics import MIN_SAMPLES
-from residnet.quality.findings import Check, Finding, Level, make_correction, with_channels
+from residnet.quality.findings import (
+    Check,
+    Finding,
+    Level,
+    describe_unit_confusion,
+    make_correction,
+    with_channels,
+)
 from residnet.quality.statistics import (
     N_SECTIONS,
     SMOOTHING_SAMPLES,
@@ -46,6 +53,10 @@ _LEAVE_OUT_WEIGHTS = np.zeros(SMOOTHING_SAMPLES)
 _LEAVE_OUT_WEIGHTS[_IS_DISTANT] = np.linalg.pinv(
     np.vander(np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)[_IS_DISTANT], 3)
 )[-1]
+_MIN_SWAY_RATIO_OF_COURSE = 3.0
+"""Smallest ratio of the sway velocity to that of the positions if the heading is the course."""
+_MIN_TRUE_SHARE = 1e-3
+"""Smallest share of measured values that is true, in the conversion of a coefficient to a gain."""
 _COLLINEARITY_TOLERANCE = 1e-9
 """Squared residual of a unit column regressed on others, below which it is collinear."""
 
@@ -66,6 +77,11 @@ class KinematicCause:
     def is_significant(self) -> bool:
         """Whether any estimate differs significantly from zero."""
         return bool((np.abs(self.estimates) > _MIN_T_STATISTIC * self.standard_errors).any())
+
+    @property
+    def is_gross(self) -> bool:
+        """Whether a gain is a wrong sign or unit instead of a scale error."""
+        return self.is_significant and not 0.6 < 1.0 + float(self.estimates[0]) < 1.6
 
 
 # smallest standard deviation of the heading for an estimate of the gain of r, in standard
@@ -396,6 +412,13 @@ def _orthogonal_matching_pursuit(
         np.sqrt(np.maximum(sandwich_variance, np.diag(white_noise_covariance))) / column_norms
     )
     estimates = least_squares_fit.coefficients / column_norms
+    # columns of gains are integrals of the measured values, which are 1 + gain times too large
+    is_gain = np.array([name.startswith("gain") for name in names.tolist()])
+    true_share = np.where(is_gain, 1.0 - estimates, 1.0)
+    true_share = np.copysign(np.maximum(np.abs(true_share), _MIN_TRUE_SHARE), true_share)
+    # the ratio to the standard error stays that of the regression
+    standard_errors = standard_errors / np.abs(true_share)
+    estimates = estimates / true_share
     return {
         name: KinematicCause(estimates[names == name], standard_errors[names == name])
         for name in selected_causes
@@ -413,6 +436,7 @@ class CauseLimit:
         fix: recommended action.
         min_time_steps: lower bound on that size in time steps.
         min_speed_share: lower bound on that size as a share of the RMS speed.
+        si_unit: SI unit of the channel.
     """
 
     text: str
@@ -421,6 +445,7 @@ class CauseLimit:
     fix: str
     min_time_steps: float = 0.0
     min_speed_share: float = 0.0
+    si_unit: str = "m/s"
 
 
 def _lag_limit(text: str, min_size: float = MIN_LAG) -> CauseLimit:
@@ -428,12 +453,14 @@ def _lag_limit(text: str, min_size: float = MIN_LAG) -> CauseLimit:
     return CauseLimit(text, "s", min_size, fix, min_time_steps=1.0)
 
 
-def _gain_limit(text: str, min_size: float, fix: str = "correct its unit or scale") -> CauseLimit:
-    return CauseLimit(f"{text} by a share of", "", min_size, fix)
+def _gain_limit(
+    text: str, min_size: float, fix: str = "correct its unit or scale", si_unit: str = "m/s"
+) -> CauseLimit:
+    return CauseLimit(f"{text} by a share of", "", min_size, fix, si_unit=si_unit)
 
 
 YAW_LIMITS = {
-    "gain": _gain_limit("r is too large against psi", 0.06),
+    "gain": _gain_limit("r is too large against psi", 0.06, si_unit="rad/s"),
     "lag": _lag_limit("r trails psi by"),
 }
 POSITION_LIMITS = {
@@ -518,14 +545,29 @@ def make_cause_findings(
             for estimate, interval_half_width in values_and_errors
         )
         level: Level = "will mislead" if magnitude > min_size else "note"
+        fix = limit.fix
+        unit_text = ""
+        is_gross = name.startswith("gain") and cause.is_gross
+        ratio = 1.0 + float(cause.estimates[0])
+        if is_gross and name == "gain_v" and abs(ratio) > _MIN_SWAY_RATIO_OF_COURSE:
+            text = f"psi is the course over ground, so that {text}"
+            fix = "take psi from the compass"
+        elif is_gross and ratio < 0.0:
+            text = f"the sign is wrong: {text}"
+            fix = "turn it in the channel map (sign: -1)"
+        elif is_gross:
+            unit_text = describe_unit_confusion(ratio, limit.si_unit)
         figures = {f"value_{i + 1}": float(estimate) for i, estimate in enumerate(cause.estimates)}
         yield make_finding(
-            f"{text}: {sizes_text} {limit.unit}".rstrip(),
+            f"{text}: {sizes_text} {limit.unit}".rstrip() + unit_text,
             {"size": magnitude, **figures, "error": cause.standard_errors.max()},
             code=name,
             level=level,
-            fix=limit.fix if level != "note" else "",
-            repair=_make_repair(
+            fix=fix if level != "note" else "",
+            # a wrong sign or unit must be corrected regardless of its effect on a fit
+            repair=None
+            if is_gross
+            else _make_repair(
                 name, cause.estimates, ("r",) if limits is YAW_LIMITS else ("u", "v")
             ),
         )
