@@ -11,16 +11,18 @@ import numpy as np
 
 from residnet.core.names import port_starboard_pairs
 from residnet.core.stretches import find_runs
-from residnet.preprocessing.channel_values import SIGMA_OF_MAD, nan_quantiles, nan_std
+from residnet.preprocessing.channel_values import SIGMA_OF_MAD, nan_median, nan_quantiles, nan_std
 from residnet.preprocessing.statistics import CHUNK_SAMPLES, MIN_SAMPLES, OverlappingBlocks
 from residnet.quality.findings import Check, Finding, check, make_correction
 from residnet.quality.statistics import (
+    MIN_TURN_SHARE,
     N_SECTIONS,
     SMOOTHING_SAMPLES,
     STEERING_CHANNELS,
     LeastSquaresFit,
     LogStatistics,
     abs_quantile,
+    compute_port_share,
     fit_least_squares,
     make_blocks,
     make_input_terms,
@@ -137,8 +139,13 @@ def check_propeller_sign(log: LogStatistics, make_finding: Check) -> Iterator[Fi
     is_one_sided = not yaw_rate.size or abs(float(yaw_rate.mean())) > 0.8 * float(
         np.abs(yaw_rate).mean()
     )
-    if len(opposing_propellers) < len(names) and is_one_sided:
-        # a turn with one propeller ahead and one astern is no fault
+    early_speed, *_, late_speed = (
+        nan_median(np.abs(part)) if np.isfinite(part).any() else 0.0
+        for part in np.array_split(log["u"], 3)
+    )
+    is_braking = late_speed < _MAX_SPEED_RATIO_OF_BRAKING * early_speed
+    if is_braking or (len(opposing_propellers) < len(names) and is_one_sided):
+        # propellers that run astern stop a vessel; in a turn one runs ahead and one astern
         opposing_propellers = []
     for name in opposing_propellers:
         text = f"{name} turns against the direction of motion"
@@ -148,6 +155,10 @@ def check_propeller_sign(log: LogStatistics, make_finding: Check) -> Iterator[Fi
     ):
         text = f"more {name} decelerates the vessel ({t_statistic:.0f} standard errors)"
         yield make_finding(text, {"t": t_statistic}, repair=make_correction((name,), factor=-1.0))
+
+
+_MAX_SPEED_RATIO_OF_BRAKING = 0.5
+"""Largest ratio of the speeds in the last and the first third of a log that is a stop."""
 
 
 def _find_reversed_propellers(log: LogStatistics, names: Sequence[str]) -> dict[str, float]:
@@ -215,9 +226,14 @@ class NeutralRudderAngle:
 
 
 def estimate_neutral_angle(log: LogStatistics) -> NeutralRudderAngle | None:
-    """Estimate the neutral angle of delta by a yaw model; None if it is not identifiable."""
+    """Estimate the neutral angle of delta by a yaw model; None if it is not identifiable.
+
+    Turns to one side only are extrapolated to a straight course, and identify no neutral angle.
+    """
     yaw_fit = _fit_yaw_model(log)
-    if yaw_fit is None or not abs(yaw_fit.coefficients[1]) > 4.0 * yaw_fit.standard_errors[1]:
+    if yaw_fit is None or not MIN_TURN_SHARE < compute_port_share([log]) < 1.0 - MIN_TURN_SHARE:
+        return None
+    if not abs(yaw_fit.coefficients[1]) > 4.0 * yaw_fit.standard_errors[1]:
         return None
     moment, rudder_effect = (float(value) for value in yaw_fit.coefficients[:2])
     gradient = np.array([-1.0 / rudder_effect, moment / rudder_effect**2])

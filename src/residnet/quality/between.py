@@ -40,9 +40,11 @@ from residnet.quality.findings import (
     format_share,
 )
 from residnet.quality.statistics import (
+    MIN_TURN_SHARE,
     MOTION_CHANNELS,
     LogStatistics,
     abs_quantile,
+    compute_port_share,
     moving_average,
 )
 from residnet.regression.pair_symmetry import assess_pair_symmetry
@@ -419,14 +421,6 @@ def _relative_spread(*value_arrays: np.ndarray) -> float:
     )
 
 
-_MIN_TURN_SHARE = 0.05
-"""Smallest share of yaw motion to one side that counts as turning to that side.
-
-Noise and overshoots reach .0001 in circles after a straight run; zigzags and random steps of five
-vessels reach .3 and more.
-"""
-
-
 def _excitation_ratio(log: LogStatistics, name: str) -> float:
     """Return the standard deviation of a smoothed velocity over the smallest one that counts.
 
@@ -461,19 +455,12 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
             level="fatal",
         )
     elif logs.inputs and "r" in excitation_by_velocity:
-        smoothed_rates = [
-            moving_average(log["r"], max(round(2.0 / log.sampling_interval), 5))
-            for log in subsamples
-        ]
-        yaw_rates = np.concatenate(smoothed_rates)
-        port_share = float(
-            np.nansum(np.abs(yaw_rates[yaw_rates < 0.0])) / np.nansum(np.abs(yaw_rates))
-        )
+        port_share = compute_port_share(subsamples)
         text = ""
         turning_side = "port" if port_share > 0.5 else "starboard"
         if excitation_by_velocity["r"] < 1.0:
             text = f"none of {n_logs} logs turns beyond its noise: steering cannot be learned"
-        elif min(port_share, 1.0 - port_share) < _MIN_TURN_SHARE:
+        elif min(port_share, 1.0 - port_share) < MIN_TURN_SHARE:
             text = (
                 f"all of {n_logs} logs turn to {turning_side}: turns to the other side are unknown"
             )
