@@ -26,6 +26,8 @@ from residnet.quality.records import CompatibilityRow, CurrentTest, InstrumentEr
 
 _MAX_NODES = 300
 """Largest number of nodes of a reconstruction; bounds the computing time of the check."""
+_MIN_NODES = 60
+"""Smallest number of nodes of a reconstruction, except of logs with fewer samples."""
 _STEP_SHARE = 0.3
 """Step between nodes over the time scale of the yaw rate."""
 _MAX_CURRENT_P_VALUE = 1e-3
@@ -119,7 +121,8 @@ def _select_stretch(log: Log) -> tuple[Log, float]:
     yaw_rate = np.gradient(heading[::stride], log.t[::stride])
     acceleration = np.gradient(yaw_rate, log.t[::stride])
     time_scale = nan_std(yaw_rate) / max(nan_std(acceleration), 1e-12)
-    step = max(min(_STEP_SHARE * time_scale, 5.0), interval)
+    max_step = min(5.0, float(log.t[-1] - log.t[0]) / _MIN_NODES)
+    step = max(min(_STEP_SHARE * time_scale, max_step), interval)
     # samples on nodes are cheaper
     step = max(math.floor(step / interval + 1e-6), 1) * interval
     activity = (yaw_rate - yaw_rate.mean()) ** 2
@@ -187,7 +190,7 @@ def _test_current(ranking: list[RankedHypothesis], log: Log) -> CurrentTest:
     penalty = 2.0 * math.log(max(water.n_measurements, 2))
     statistic = by_name[_DECLARED].margin - by_name[_THROUGH_WATER].margin + penalty
     north, east = (water.errors[name] for name in CURRENT_NAMES)
-    standard_error = max(north.standard_error, east.standard_error)
+    standard_error = max(math.hypot(e.standard_error, e.change) for e in (north, east))
     size = math.hypot(north.value, east.value)
     p_value = float(chi2.sf(max(statistic, 0.0), 2))
     speed = float(np.nanmedian(np.hypot(log["u"], log["v"])))

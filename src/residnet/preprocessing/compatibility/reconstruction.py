@@ -58,13 +58,13 @@ _WEAKENED_SMOOTHNESS = 100.0
 motion the standard error of other errors grows.
 """
 _PROBED_SMOOTHNESS = 10.0
-"""Factor on the jerk intensities whose effect on the errors is part of their standard error."""
+"""Factor on the jerk intensities for the test whether smoothness changes the errors."""
 _N_REESTIMATIONS = 3
 """Number of Gauss-Newton steps with this factor."""
+_MIN_T_STATISTIC = 3.5
+"""Smallest ratio of a significant error to its standard error."""
 _MAX_GROWTH = 3.0
 """Largest growth of the standard error of an error that the sensors determine."""
-_STANDARD_ERROR_FACTOR = 1.2
-"""Factor on standard errors for coverage of 95 % in simulated draws (scripts/bench/coverage.py)."""
 _MAX_NODES = 20_000
 """Largest number of nodes."""
 _MIN_SAMPLES = 20
@@ -96,25 +96,39 @@ class ErrorEstimate:
     Attributes:
         value: estimate in SI units.
         standard_error: larger one of the standard errors from the curvature and from a sandwich
-            over sections of the log, and the change of the value with less smoothness.
+            over sections of the log.
+        change: change of the value if the jerk intensities are ten times larger.
         growth: factor on the standard error if the jerk intensities are a hundred times larger.
         prior_std: standard deviation of the prior.
     """
 
     value: float
     standard_error: float
+    change: float
     growth: float
     prior_std: float
 
     @property
     def is_determined(self) -> bool:
-        """Whether sensors determine the error; otherwise the smoothness of the motion does."""
-        return self.growth <= _MAX_GROWTH and self.standard_error < 0.5 * self.prior_std
+        """Whether sensors determine the error; otherwise the smoothness of the motion does.
+
+        This is a specification test (Hausman 1978, Econometrica 46): with less smoothness the value
+        must not change by more than its standard error. An error that is significant beyond this
+        change is determined, too.
+        """
+        is_insensitive = self.growth <= _MAX_GROWTH and abs(self.change) <= self.standard_error
+        has_information = self.standard_error < 0.5 * self.prior_std
+        return has_information and (is_insensitive or self._is_beyond_change(self.growth))
 
     @property
     def is_significant(self) -> bool:
         """Whether the error is determined and differs from zero by 3.5 standard errors."""
-        return self.is_determined and abs(self.value) > 3.5 * self.standard_error
+        return self.is_determined and self._is_beyond_change(1.0)
+
+    def _is_beyond_change(self, factor: float) -> bool:
+        """Return whether the value exceeds its change and standard error times a factor."""
+        total = float(np.hypot(factor * self.standard_error, self.change))
+        return abs(self.value) > _MIN_T_STATISTIC * total
 
 
 @dataclass(frozen=True)
@@ -735,10 +749,11 @@ class _Problem:
     ) -> Reconstruction:
         """Return estimates with standard errors, growth and evidence."""
         solver = self._factorize(residuals, errors)
-        standard_errors = self._compute_standard_errors(residuals, errors, solver)
+        standard_errors = self._compute_standard_errors(residuals, errors)
         deviance = self._compute_deviance(residuals, errors, solver)
         intensity = self.jerk_intensity.copy()
         growth = np.ones(errors.size)
+        change = np.zeros(errors.size)
         if errors.size:
             # A rudder accelerates sway and yaw together. Smoothness alone prefers errors under
             # which the jerk is small: a lever arm to the point of the hull that the rudder does
@@ -746,7 +761,6 @@ class _Problem:
             # contains it.
             self.jerk_intensity = _PROBED_SMOOTHNESS * intensity
             change = self._reestimate_errors(states, errors) - errors
-            standard_errors = np.hypot(standard_errors, change)
             self.jerk_intensity = _WEAKENED_SMOOTHNESS * intensity
             weakened = self._factorize(self._linearize(states, errors), errors)
             self.jerk_intensity = intensity
@@ -760,6 +774,7 @@ class _Problem:
                 name: ErrorEstimate(
                     float(errors[k]),
                     float(standard_errors[k]),
+                    float(change[k]),
                     float(growth[k]),
                     float(self.prior_stds[k]),
                 )
@@ -786,15 +801,21 @@ class _Problem:
         return errors
 
     def _compute_standard_errors(
-        self, residuals: Sequence[_Residuals], errors: np.ndarray, solver: _Solver
+        self, residuals: Sequence[_Residuals], errors: np.ndarray
     ) -> np.ndarray:
-        """Return standard errors [P]: the larger of curvature and sandwich over sections."""
+        """Return standard errors [P]: the larger of curvature and sandwich over sections.
+
+        Both are those of an M-estimator (Huber 1981, Robust Statistics, sec. 7.6): the weights of
+        the Student distribution overstate the information of noise without outliers.
+        """
         if not errors.size:
             return np.zeros(0)
+        groups = [_linearize_score(group) for group in residuals]
+        solver = self._factorize(groups, errors)
         covariance = np.linalg.inv(solver.schur)
         prior_gradient = (errors - self.prior_means) / self.prior_stds**2
         scores = np.tile(prior_gradient / _N_SECTIONS, (_N_SECTIONS, 1))
-        for group in residuals:
+        for group in groups:
             # derivative by the errors with the states eliminated
             profile = np.zeros((group.values.size, errors.size))
             for index, derivative in group.by_error.items():
@@ -802,13 +823,12 @@ class _Problem:
             for key, derivative in group.by_state.items():
                 rows = np.minimum(group.nodes * N_STATES + key, self.n_nodes * N_STATES - 1)
                 profile -= derivative[:, None] * solver.border_solution[rows]
-            profile *= (group.weights * group.values)[:, None]
+            profile *= group.values[:, None]
             sections = group.nodes * _N_SECTIONS // self.n_nodes
             for index in range(errors.size):
                 scores[:, index] += np.bincount(sections, profile[:, index], _N_SECTIONS)
         sandwich = covariance @ (scores.T @ scores) @ covariance * _N_SECTIONS / (_N_SECTIONS - 1)
-        variance = np.maximum(np.diag(covariance), np.diag(sandwich))
-        return np.asarray(_STANDARD_ERROR_FACTOR * np.sqrt(variance))
+        return np.asarray(np.sqrt(np.maximum(np.diag(covariance), np.diag(sandwich))))
 
     def _summarize_sensors(self, residuals: Sequence[_Residuals]) -> dict[str, SensorFit]:
         fits = {}
@@ -848,6 +868,38 @@ class _Problem:
         return deviance - 2.0 * (self.n_nodes - 1) * float(
             np.log(heading_weight) + 2.0 * np.log(position_weight)
         )
+
+
+def _linearize_score(group: _Residuals) -> _Residuals:
+    """Return Gaussian residuals with the information and the scores of a group with weights.
+
+    With the score psi = w r, the information of a residual is E[psi']^2 / E[psi^2] (Huber 1981,
+    Robust Statistics, eq. 7.6.2), reduced by the autocorrelation of successive scores to that of an
+    autoregressive process of first order.
+    """
+    if group.squares is None:
+        return group
+    dimension = group.dimension
+    numerator = _STUDENT_DOF + dimension
+    denominator = _STUDENT_DOF + group.squares
+    score = numerator / denominator * group.values
+    # means over all columns of a sensor
+    slope = numerator / denominator - 2.0 * numerator * group.squares / (dimension * denominator**2)
+    mean_slope = max(float(slope.mean()), 0.1)
+    mean_square = float(((numerator / denominator) ** 2 * group.squares).mean()) / dimension
+    centred = score - score.mean()
+    energy = max(float(centred @ centred), 1e-300)
+    autocorrelation = max(float(centred[1:] @ centred[:-1]) / energy, 0.0)
+    information = mean_slope**2 / max(mean_square, 1e-300)
+    information *= (1.0 - autocorrelation) / (1.0 + autocorrelation)
+    root = float(np.sqrt(information))
+    return replace(
+        group,
+        values=root / mean_slope * score,
+        by_state={key: root * derivative for key, derivative in group.by_state.items()},
+        by_error={key: root * derivative for key, derivative in group.by_error.items()},
+        squares=None,
+    )
 
 
 def _compute_student_constant(dimension: int) -> float:
