@@ -144,7 +144,9 @@ def check_propeller_sign(log: LogStatistics, make_finding: Check) -> Iterator[Fi
         for part in np.array_split(log["u"], 3)
     )
     is_braking = late_speed < _MAX_SPEED_RATIO_OF_BRAKING * early_speed
-    if is_braking or (len(opposing_propellers) < len(names) and is_one_sided):
+    # the bucket of a water jet reverses its thrust, not the direction of its propeller
+    has_bucket = any("nozzle" in name for name in log)
+    if is_braking or has_bucket or (len(opposing_propellers) < len(names) and is_one_sided):
         # propellers that run astern stop a vessel; in a turn one runs ahead and one astern
         opposing_propellers = []
     for name in opposing_propellers:

@@ -526,6 +526,10 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
         )
 
 
+_MIN_DEVIANCE_DIFFERENCE = 10.8
+"""Smallest difference of deviances of a significant change: 99.9 % quantile of chi-squared."""
+
+
 @check("between", "contradicts", fix="")
 def check_contradicting_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     """Report logs that a model of the other logs does not explain, with the likeliest cause."""
@@ -555,17 +559,16 @@ def check_contradicting_logs(logs: LogSet, make_finding: Check) -> Iterator[Find
         if adequate is not consensus and not adequate.is_outlier(i):
             continue
         log = fleet.logs[i]
-        hypothesis = rank_hypotheses(consensus, i)[0]
+        hypotheses = rank_hypotheses(consensus, i)
+        hypothesis = hypotheses[0]
+        unexplained = next(h for h in hypotheses if h.kind == "vessel")
+        is_explained = hypothesis.deviance < unexplained.deviance - _MIN_DEVIANCE_DIFFERENCE
         split = logs.splits.get(log.name, "")
         # new inputs are no contradiction: the polynomial does not extrapolate
-        if (
-            hypothesis.kind == "vessel"
-            and consensus.has_majority
-            and consensus.is_only_extrapolating(i)
-        ):
+        if not is_explained and consensus.has_majority and consensus.is_only_extrapolating(i):
             text = (
-                f"{log.name} has inputs outside the range of the {n_inliers} other logs that agree:"
-                " they cannot confirm or contradict it"
+                f"{log.name} has inputs or motions outside the range of the {n_inliers} other logs"
+                " that agree: they cannot confirm or contradict it"
             )
             yield make_finding(text, code="beyond_others", level="note")
             continue

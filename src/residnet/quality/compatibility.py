@@ -190,7 +190,7 @@ def _test_current(ranking: list[RankedHypothesis], log: Log) -> CurrentTest:
     penalty = 2.0 * math.log(max(water.n_measurements, 2))
     statistic = by_name[_DECLARED].margin - by_name[_THROUGH_WATER].margin + penalty
     north, east = (water.errors[name] for name in CURRENT_NAMES)
-    standard_error = max(math.hypot(e.standard_error, e.change) for e in (north, east))
+    standard_error = max(north.standard_error, east.standard_error)
     size = math.hypot(north.value, east.value)
     p_value = float(chi2.sf(max(statistic, 0.0), 2))
     speed = float(np.nanmedian(np.hypot(log["u"], log["v"])))

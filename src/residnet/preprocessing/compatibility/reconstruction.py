@@ -57,6 +57,8 @@ _WEAKENED_SMOOTHNESS = 100.0
 """Factor on the jerk intensities in the test whether sensors determine an error: without a smooth
 motion the standard error of other errors grows.
 """
+_MIN_FREE_SHARE = 0.05
+"""Smallest share of the noise in the residuals of a sensor, in the rescaling to the noise."""
 _PROBED_SMOOTHNESS = 10.0
 """Factor on the jerk intensities for the test whether smoothness changes the errors."""
 _N_REESTIMATIONS = 3
@@ -95,7 +97,7 @@ class ErrorEstimate:
 
     Attributes:
         value: estimate in SI units.
-        standard_error: larger one of the standard errors from the curvature and from a sandwich
+        statistical_error: larger one of the standard errors from the curvature and from a sandwich
             over sections of the log.
         change: change of the value if the jerk intensities are ten times larger.
         growth: factor on the standard error if the jerk intensities are a hundred times larger.
@@ -103,32 +105,41 @@ class ErrorEstimate:
     """
 
     value: float
-    standard_error: float
+    statistical_error: float
     change: float
     growth: float
     prior_std: float
 
     @property
+    def is_independent_of_smoothness(self) -> bool:
+        """Whether less smoothness changes the value by no more than its standard error.
+
+        This is a specification test (Hausman 1978, Econometrica 46).
+        """
+        return self.growth <= _MAX_GROWTH and abs(self.change) <= self.statistical_error
+
+    @property
+    def standard_error(self) -> float:
+        """Standard error; it contains the effect of smoothness on errors that depend on it."""
+        if self.is_independent_of_smoothness:
+            return self.statistical_error
+        return float(np.hypot(self.growth * self.statistical_error, self.change))
+
+    @property
     def is_determined(self) -> bool:
         """Whether sensors determine the error; otherwise the smoothness of the motion does.
 
-        This is a specification test (Hausman 1978, Econometrica 46): with less smoothness the value
-        must not change by more than its standard error. An error that is significant beyond this
-        change is determined, too.
+        An error that is significant beyond the effect of smoothness is determined, too.
         """
-        is_insensitive = self.growth <= _MAX_GROWTH and abs(self.change) <= self.standard_error
+        is_distinct = abs(self.value) > _MIN_T_STATISTIC * self.standard_error
         has_information = self.standard_error < 0.5 * self.prior_std
-        return has_information and (is_insensitive or self._is_beyond_change(self.growth))
+        return has_information and (self.is_independent_of_smoothness or is_distinct)
 
     @property
     def is_significant(self) -> bool:
         """Whether the error is determined and differs from zero by 3.5 standard errors."""
-        return self.is_determined and self._is_beyond_change(1.0)
-
-    def _is_beyond_change(self, factor: float) -> bool:
-        """Return whether the value exceeds its change and standard error times a factor."""
-        total = float(np.hypot(factor * self.standard_error, self.change))
-        return abs(self.value) > _MIN_T_STATISTIC * total
+        total = float(np.hypot(self.statistical_error, self.change))
+        return self.is_determined and abs(self.value) > _MIN_T_STATISTIC * total
 
 
 @dataclass(frozen=True)
@@ -881,12 +892,16 @@ def _linearize_score(group: _Residuals) -> _Residuals:
         return group
     dimension = group.dimension
     numerator = _STUDENT_DOF + dimension
-    denominator = _STUDENT_DOF + group.squares
-    score = numerator / denominator * group.values
+    weights = numerator / (_STUDENT_DOF + group.squares)
+    score = weights * group.values
+    # residuals are smaller than the noise, whose weighted mean square is one by its estimate
+    free_share = float((weights * group.squares).mean()) / dimension
+    noise_squares = group.squares / max(free_share, _MIN_FREE_SHARE)
+    denominator = _STUDENT_DOF + noise_squares
     # means over all columns of a sensor
-    slope = numerator / denominator - 2.0 * numerator * group.squares / (dimension * denominator**2)
+    slope = numerator / denominator - 2.0 * numerator * noise_squares / (dimension * denominator**2)
     mean_slope = max(float(slope.mean()), 0.1)
-    mean_square = float(((numerator / denominator) ** 2 * group.squares).mean()) / dimension
+    mean_square = float(((numerator / denominator) ** 2 * noise_squares).mean()) / dimension
     centred = score - score.mean()
     energy = max(float(centred @ centred), 1e-300)
     autocorrelation = max(float(centred[1:] @ centred[:-1]) / energy, 0.0)
