@@ -61,9 +61,10 @@ _MANOEUVRES: tuple[dict[str, Any], ...] = (
     {"kind": "three_two_one_one"},
     {"kind": "turning_circle"},
 )
-_KNOWN_FAULTS = {"esso_osaka": ("frozen", "spikes", "yaw_drift")}
+_KNOWN_FAULTS = {"esso_osaka": ("frozen", "spikes", "yaw_drift", "lag", "jump")}
 """Measured logs -> codes of faults that they have (tests/io/test_measured.py): repeated positions,
-outliers, and a gyro that drifts by 29 deg in one log.
+outliers, a gyro that drifts by 29 deg in one log, and one that is .7 to 1 s late in all six
+berthings; a sway velocity that jumps at the end of repeated positions.
 """
 _MAX_DEVIATION = 0.02
 """Deviation of a drafted channel from its values that is no change of its meaning."""

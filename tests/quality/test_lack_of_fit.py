@@ -6,15 +6,28 @@ import numpy as np
 import pytest
 
 from residnet.core.log import Log
-from residnet.quality import inspect_log_set
+from residnet.quality import inspect_log, inspect_log_set
+from residnet.quality.actuators import estimate_neutral_angle
+from residnet.quality.statistics import LogStatistics
 
 
-def sail(seed: int, speed: float, rudder: float, *, rudder_scale: float = 1.0) -> Log:
-    """Return a run of a boat with cubic damping and yaw damping that grows with the speed."""
+def sail(
+    seed: int, speed: float, rudder: float, *, rudder_scale: float = 1.0, side: float = 0.0
+) -> Log:
+    """Return a run of a boat with cubic damping and yaw damping that grows with the speed.
+
+    Args:
+        seed: seed of the commands and of the noise.
+        speed: largest revolutions.
+        rudder: largest rudder angle in rad.
+        rudder_scale: factor by which the recorded rudder angle is too large.
+        side: 1 for turns to starboard, -1 to port; 0 for both.
+    """
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, 120.0, 0.1)
     n = speed * rng.uniform(0.6, 1.0, 40)[(t / 4.0).astype(int)]
     delta = rudder * rng.uniform(-1.0, 1.0, 60)[(t / 3.0).astype(int)]
+    delta = side * np.abs(delta) if side else delta
     u, v, r = np.zeros((3, t.size))
     u[0] = 0.7 * speed
     for k in range(t.size - 1):
@@ -49,3 +62,33 @@ def test_a_scaled_rudder_is_still_a_contradiction() -> None:
     accusing = [f for f in report.findings if f.code.startswith("contradicts")]
     assert [finding.code for finding in accusing] == ["contradicts_scale"]
     assert accusing[0].text.startswith("run40")
+
+
+def test_turns_to_the_other_side_are_no_contradiction() -> None:
+    starboard = [sail(50 + k, 1.5 + 0.1 * k, 0.5, side=1.0) for k in range(7)]
+    report = inspect_log_set([*starboard, sail(60, 1.8, 0.5, side=-1.0)], ["n", "delta"])
+    accusing = [f for f in report.findings if f.code.startswith("contradicts")]
+    assert [finding.to_line for finding in accusing] == []
+
+
+@pytest.mark.parametrize(("side", "is_identified"), [(0.0, True), (1.0, False)])
+def test_neutral_angle_needs_turns_to_both_sides(side: float, *, is_identified: bool) -> None:
+    log = sail(70, 1.8, 0.5, side=side)
+    neutral = estimate_neutral_angle(LogStatistics(log, ["n", "delta"]))
+    assert (neutral is not None) == is_identified
+
+
+@pytest.mark.parametrize(
+    ("speed", "channel", "is_reported"),
+    [(-0.4, "delta", True), (-0.4, "nozzle", False), (0.0, "delta", False)],
+)
+def test_a_stop_or_a_water_jet_is_no_reversed_propeller(
+    speed: float, channel: str, *, is_reported: bool
+) -> None:
+    """A propeller with n > 0 moves a vessel astern, by the bucket of a jet, or stops it."""
+    t = np.arange(0.0, 100.0, 0.1)
+    rng = np.random.default_rng(0)
+    u = speed + rng.normal(0.0, 0.01, t.size) - (speed == 0.0) * np.exp(-t / 20.0)
+    channels = {"u": u, "r": rng.normal(0.0, 0.01, t.size), "n": 4.0 + 0.0 * t}
+    log = Log("astern", t, {**channels, channel: 0.1 * np.sin(t)})
+    assert bool(inspect_log(log).find_by_code("propeller_sign")) == is_reported

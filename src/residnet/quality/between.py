@@ -526,8 +526,8 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
         )
 
 
-_MIN_DEVIANCE_DIFFERENCE = 10.8
-"""Smallest difference of deviances of a significant change: 99.9 % quantile of chi-squared."""
+_MIN_DEVIANCE_DIFFERENCE = 3.84
+"""Smallest difference of deviances of a significant change: 95 % quantile of chi-squared."""
 
 
 @check("between", "contradicts", fix="")

@@ -320,6 +320,8 @@ def count_reversals(heading: np.ndarray, min_swing: float) -> int:
     return n_reversals
 
 
+_N_EXCERPT_VALUES = 1000
+"""Number of values that are tested before all values of a channel."""
 _MAX_SIGNIFICANT_DIGITS = 5
 """Most significant digits of printed values that count as few; noise is usually above the sixth."""
 
@@ -345,10 +347,19 @@ def printed_resolution(values: np.ndarray) -> np.ndarray | None:
         resolution: np.ndarray = 10.0 ** (magnitude + 1 - n_digits)
         return resolution
 
+    def count_digits(numbers: np.ndarray, n_digits: int) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Return resolution, values in units of it, and whether these are integers."""
+        resolution = resolution_of(numbers, n_digits)
+        counts = numbers / resolution
+        return resolution, counts, bool((np.abs(counts - np.round(counts)) < 1e-6).all())
+
+    # some values of a long channel refute most numbers of digits
+    excerpt = finite[:: -(-finite.size // _N_EXCERPT_VALUES)]
     for n_digits in range(1, _MAX_SIGNIFICANT_DIGITS + 1):
-        resolution = resolution_of(finite, n_digits)
-        counts = finite / resolution
-        if (np.abs(counts - np.round(counts)) < 1e-6).all():
+        if not count_digits(excerpt, n_digits)[2]:
+            continue
+        resolution, counts, are_integers = count_digits(finite, n_digits)
+        if are_integers:
             # a fixed number of decimals gives the digits of small values a coarser last one
             is_finer_below = resolution.max() > 5.0 * resolution.min()
             has_printed_digits = bool(

@@ -10,13 +10,13 @@ Laplace's approximation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.special import gammaln
 
 from residnet.core.errors import DataError
 from residnet.core.frames import unwrap_angle
@@ -920,8 +920,8 @@ def _linearize_score(group: _Residuals) -> _Residuals:
 def _compute_student_constant(dimension: int) -> float:
     """Return minus twice the logarithm of the Student density's constant, per dimension."""
     half = 0.5 * _STUDENT_DOF
-    constant = gammaln(half + 0.5 * dimension) - gammaln(half)
-    return -2.0 * float(constant) / dimension + float(np.log(_STUDENT_DOF * np.pi))
+    constant = math.lgamma(half + 0.5 * dimension) - math.lgamma(half)
+    return -2.0 * constant / dimension + float(np.log(_STUDENT_DOF * np.pi))
 
 
 def _guess_noise(sensor: Sensor) -> Sensor:
