@@ -84,8 +84,10 @@ class Scaling:
         index = list(columns)
         mean = 0.5 * (mean + np.array(signs) * mean[index])
         std = 0.5 * (std + std[index])
-        self.x_mean, self.w_mean = mean[:n], mean[n:]
-        self.x_std, self.w_std = std[:n], std[n:]
+        self.x_mean = mean[:n]
+        self.w_mean = mean[n:]
+        self.x_std = std[:n]
+        self.w_std = std[n:]
 
     def decimate(self, log: PreparedLog, start: int = 0, stop: int | None = None) -> Series:
         """Return the samples from `start` to `stop` of a log at the step of the peers."""
