@@ -1,15 +1,15 @@
-"""Print what learning brings under stated conditions, from finished runs of the task `autopilot`.
+"""Compare learned policies with classical laws in finished runs of the task `autopilot`.
 
     python scripts/bench/autopilot_margins.py RUN [RUN...] [--policy learned]
     python scripts/bench/autopilot_margins.py --config autopilot_conditions --seeds 10 --seed 43
     python scripts/bench/autopilot_margins.py --draw 10 --logs 3 --seed 43 --out runs/drawn
 
-Each run may have another seed; the last columns hold mean, standard deviation and the range. With
-`--seeds`, a config is run first, with so many seeds from `--seed` on. The constants of its peers
-are tuned by the first seed and kept; of its policies `--policy` is trained and compared. With
-`--draw`, vessels are drawn and trained first, as `residnet autopilot` does: K, T, rate of the
-rudder and largest delay at random. `--logs` draws further ones that are known by simulated zigzags
-in noise alone.
+Runs may have different seeds; the last columns are mean, standard deviation and range. With
+`--seeds`, a config is run first with this number of seeds from `--seed` on. The constants of its
+peers are tuned with the first seed and used for the others; of its policies `--policy` is trained
+and compared. With `--draw`, vessels are drawn and trained first, as `residnet autopilot` does:
+random K, T, rate of the rudder and largest delay. `--logs` draws further vessels of which only
+simulated zigzags with noise are available.
 """
 
 from __future__ import annotations
@@ -31,71 +31,82 @@ from residnet.autopilot.tasks.design import draft_autopilot_config
 DEG = 180.0 / math.pi
 
 
-def read(run: Path, name: str) -> Any:
+def read_run_file(run: Path, name: str) -> Any:
     """Return a file of a finished run."""
     if not (run / name).is_file():
         raise SystemExit(f"{run} holds no {name}: name the folder of a finished run")
     return json.loads((run / name).read_text())
 
 
-def margins(run: Path, name: str) -> dict[str, float]:
-    """Return the figures of one run; those that a run lacks are no numbers."""
-    rows = read(run, "metrics.json")["rows"]
-    find = {(row["model"], row["protocol"]): row for row in rows}
-    judged = [row for row in rows if row["protocol"] == "conditions"]
-    costs = {row["model"]: row["cost"]["mean"] for row in judged}
-    laws = [row["model"] for row in judged if row["kind"] == "classical"]
-    constants = [row["model"] for row in judged if row["kind"] == "constants"]
-    own, pd = find[name, "conditions"], find.get(("pd", "conditions"))
-    quiet = find[name, "quiet"]
-    nominal = find[name, "nominal"]
+def compute_margins(run: Path, name: str) -> dict[str, float]:
+    """Return the figures of one run; NaN for missing ones."""
+    rows = read_run_file(run, "metrics.json")["rows"]
+    row_by_test = {(row["model"], row["protocol"]): row for row in rows}
+    condition_rows = [row for row in rows if row["protocol"] == "conditions"]
+    costs = {row["model"]: row["cost"]["mean"] for row in condition_rows}
+    laws = [row["model"] for row in condition_rows if row["kind"] == "classical"]
+    constants = [row["model"] for row in condition_rows if row["kind"] == "constants"]
+    policy_row = row_by_test[name, "conditions"]
+    pd_row = row_by_test.get(("pd", "conditions"))
+    quiet_row = row_by_test[name, "quiet"]
+    nominal_row = row_by_test[name, "nominal"]
     cost = costs[name]
-    best = min(costs[law] for law in laws)
-    off = costs.get(f"{name} network off", math.nan)
-    beyond = [policy / law - 1 for policy, law, _ in outside(run, name).values()]
-    cpu = run / "cpu.txt"
+    best_cost = min(costs[law] for law in laws)
+    network_off_cost = costs.get(f"{name} network off", math.nan)
+    relative_costs = [
+        policy / law - 1 for policy, law, _ in compute_outside_costs(run, name).values()
+    ]
+    cpu_file = run / "cpu.txt"
     return {
         "cost [s]": cost,
-        "best classical [s]": best,
-        "below it [%]": 100 * (1 - cost / best),
+        "best classical [s]": best_cost,
+        "below it [%]": 100 * (1 - cost / best_cost),
         "below PD [%]": 100 * (1 - cost / costs.get("pd", math.nan)),
-        "network off [%]": 100 * (off / cost - 1),
+        "network off [%]": 100 * (network_off_cost / cost - 1),
         "constants alone [%]": 100 * (1 - cost / costs[constants[0]]) if constants else math.nan,
-        "overshoot 95 % [deg]": DEG * own["overshoot"]["p95"],
-        "travel / PD's": own["travel"]["mean"] / pd["travel"]["mean"] if pd else math.nan,
-        "swing heading [deg]": DEG * quiet["heading_swing"]["max"],
-        "swing rudder [deg]": DEG * quiet["rudder_swing"]["max"],
-        "nominal entry [s]": nominal["settling"]["max"],
-        "nominal overshoot [deg]": DEG * nominal["overshoot"]["max"],
-        "worst beyond [%]": 100 * max(beyond, default=math.nan),
+        "overshoot 95 % [deg]": DEG * policy_row["overshoot"]["p95"],
+        "travel / PD's": policy_row["travel"]["mean"] / pd_row["travel"]["mean"]
+        if pd_row
+        else math.nan,
+        "swing heading [deg]": DEG * quiet_row["heading_swing"]["max"],
+        "swing rudder [deg]": DEG * quiet_row["rudder_swing"]["max"],
+        "nominal entry [s]": nominal_row["settling"]["max"],
+        "nominal overshoot [deg]": DEG * nominal_row["overshoot"]["max"],
+        "worst beyond [%]": 100 * max(relative_costs, default=math.nan),
         "diverged": float(sum(row.get("diverged", 0) for row in rows if row["model"] == name)),
-        "training [s]": read(run, "controllers.json")["controllers"][name].get("seconds", math.nan),
-        "whole run, CPU [s]": float(cpu.read_text()) if cpu.is_file() else math.nan,
+        "training [s]": read_run_file(run, "controllers.json")["controllers"][name].get(
+            "seconds", math.nan
+        ),
+        "whole run, CPU [s]": float(cpu_file.read_text()) if cpu_file.is_file() else math.nan,
     }
 
 
-def outside(run: Path, name: str) -> dict[str, tuple[float, float, float]]:
-    """Return the costs [s] of the policy, the best law and PD by what lies beyond the conditions.
+def compute_outside_costs(run: Path, name: str) -> dict[str, tuple[float, float, float]]:
+    """Return the costs in s of the policy, the best law and PD by further conditions.
 
-    The law is the one that costs least there, whichever that is.
+    The best law of each condition is the one with the smallest cost.
     """
     costs: dict[str, dict[str, float]] = {}
     laws = set()
-    for row in read(run, "metrics.json")["rows"]:
+    for row in read_run_file(run, "metrics.json")["rows"]:
         if row["protocol"].startswith("beyond_"):
             costs.setdefault(row["protocol"], {})[row["model"]] = row["cost"]["mean"]
             laws |= {row["model"]} if row["kind"] == "classical" else set()
     return {
-        protocol: (each[name], min(each[law] for law in laws), each.get("pd", math.nan))
-        for protocol, each in costs.items()
+        protocol: (
+            costs_by_model[name],
+            min(costs_by_model[law] for law in laws),
+            costs_by_model.get("pd", math.nan),
+        )
+        for protocol, costs_by_model in costs.items()
     }
 
 
-class Drawn:
+class DrawnVessel:
     """A vessel: K [1/s], T [s], rate of the rudder [deg/s] and largest delay [s].
 
-    T lies within 2.5 and 40 s, and K T within 0.8 and 3. The rudder needs a tenth to 0.6 of T for
-    20 deg, and commands come up to 0.02 to 0.12 of T late.
+    T is between 2.5 and 40 s, and K T between 0.8 and 3. The rudder needs 0.1 T to 0.6 T for 20
+    deg; the largest delay of commands is between 0.02 T and 0.12 T.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -111,31 +122,33 @@ class Drawn:
         )
 
     def zigzag(self, file: Path, angle: float, rng: np.random.Generator) -> Path:
-        """Write a zigzag in noise at 10 Hz, with half of the delay, by Euler's rule."""
+        """Write a noisy zigzag at 10 Hz with half of the delay, integrated by Euler's method."""
         dt = 0.1
-        fine = 10
-        late = round(0.5 * self.delay / (dt / fine))
+        n_substeps = 10
+        n_delay_steps = round(0.5 * self.delay / (dt / n_substeps))
         r = psi = rudder = 0.0
         side = 1.0
-        held = [0.0] * (late + 1)
+        commands = [0.0] * (n_delay_steps + 1)
         rows = []
         for k in range(round(60.0 * self.time / dt)):
             side = -side if side * psi > angle else side
             noise = rng.normal(size=2) * (0.2, 0.15)
             rows.append((k * dt, psi + noise[0], r + noise[1], side * angle))
-            for _ in range(fine):
-                held.append(side * angle)
-                step = self.rate * dt / fine
-                rudder += min(max(held[-1 - late] - rudder, -step), step)
-                r += dt / fine * (self.gain * rudder - r) / self.time
-                psi += dt / fine * r
+            for _ in range(n_substeps):
+                commands.append(side * angle)
+                step = self.rate * dt / n_substeps
+                rudder += min(max(commands[-1 - n_delay_steps] - rudder, -step), step)
+                r += dt / n_substeps * (self.gain * rudder - r) / self.time
+                psi += dt / n_substeps * r
         names = ("time [s]", "heading [deg]", "yaw rate [deg/s]", "rudder command [deg]")
         pd.DataFrame(rows, columns=list(names)).to_csv(file, index=False)
         return file
 
 
-def trained(name: str, vessel: Drawn, out: Path, rng: np.random.Generator, *, logs: bool) -> Path:
-    """Draft, train and compare for a vessel; returns the folder of the run."""
+def train_for_vessel(
+    name: str, vessel: DrawnVessel, out: Path, rng: np.random.Generator, *, logs: bool
+) -> Path:
+    """Draft a config for a vessel and run it; return the folder of the run."""
     out.mkdir(parents=True, exist_ok=True)
     file = out / f"{name}.yaml"
     run = out / name
@@ -149,29 +162,29 @@ def trained(name: str, vessel: Drawn, out: Path, rng: np.random.Generator, *, lo
         draft_autopilot_config(source, file, rate=f"{vessel.rate:.4g} deg/s", overwrite=True)
         config = yaml.safe_load(file.read_text())
         conditions = config["conditions"]
-        for one in (conditions["stated"], *conditions["beyond"].values()):
-            one["delay"] = ["0 s", f"{vessel.delay:.4g} s"]
+        for condition in (conditions["stated"], *conditions["beyond"].values()):
+            condition["delay"] = ["0 s", f"{vessel.delay:.4g} s"]
         for peer in ("lqr", "ptos"):
             config["peers"][peer]["lag"] = f"{0.75 * vessel.delay:.4g} s"
         file.write_text(yaml.safe_dump(config, sort_keys=False))
-    carried_out(file, run)
+    run_config(file, run)
     return run
 
 
-def carried_out(file: Path, run: Path) -> None:
-    """Carry out a config, and note its processor time beside it."""
-    words = ("-m", "residnet", "run", file, "--out", run, "--overwrite")
-    seconds, _, _ = called(*words, said=run.with_suffix(".log"))
+def run_config(file: Path, run: Path) -> None:
+    """Run a config, and write its processor time into the run folder."""
+    arguments = ("-m", "residnet", "run", file, "--out", run, "--overwrite")
+    seconds, _, _ = called(*arguments, said=run.with_suffix(".log"))
     (run / "cpu.txt").write_text(f"{seconds:.1f}")
 
 
-def seeded(config: str, policy: str, seeds: Sequence[int], out: Path) -> list[Path]:
-    """Train a config's policy with each seed, its peers tuned by the first; returns the runs."""
+def run_seeds(config: str, policy: str, seeds: Sequence[int], out: Path) -> list[Path]:
+    """Train the policy of a config with each seed; peers are tuned with the first one only."""
     out.mkdir(parents=True, exist_ok=True)
     base = yaml.safe_load((bench.CONFIGS / f"{config}.yaml").read_text())
     base["policies"] = {policy: base["policies"][policy]}
     base.pop("predictive", None)
-    tuned = out / "peers.json"
+    tuned_file = out / "peers.json"
     runs = []
     for seed in seeds:
         file = out / f"seed_{seed}.yaml"
@@ -179,49 +192,51 @@ def seeded(config: str, policy: str, seeds: Sequence[int], out: Path) -> list[Pa
         runs.append(run)
         if (run / "metrics.json").is_file():
             continue
-        peers = json.loads(tuned.read_text()) if tuned.is_file() else base["peers"]
+        peers = json.loads(tuned_file.read_text()) if tuned_file.is_file() else base["peers"]
         content = base | {"name": run.name, "seed": seed, "peers": peers}
         file.write_text(yaml.safe_dump(content, sort_keys=False))
-        carried_out(file, run)
-        told = read(run, "controllers.json")["controllers"]
-        tuned.write_text(json.dumps({name: told[name]["config"] for name in peers}))
+        run_config(file, run)
+        controllers = read_run_file(run, "controllers.json")["controllers"]
+        tuned_file.write_text(json.dumps({name: controllers[name]["config"] for name in peers}))
     return runs
 
 
 def main() -> None:
-    """Print a line for each figure, a column for each run, their spread, and costs outside."""
-    given = bench.options(
+    """Print the figures of all runs with their statistics, and costs under further conditions."""
+    options = bench.options(
         __doc__, runs=(), policy="learned", draw=0, logs=0, config="autopilot_conditions",
         seeds=0, seed=0, out="runs/drawn",
     )  # fmt: skip
-    runs = [Path(run) for run in given.runs]
-    out = Path(given.out)
-    rng = np.random.default_rng(given.seed)
-    for k in range(given.draw + given.logs):
-        vessel = Drawn(rng)
-        logs = k >= given.draw
+    runs = [Path(run) for run in options.runs]
+    out = Path(options.out)
+    rng = np.random.default_rng(options.seed)
+    for k in range(options.draw + options.logs):
+        vessel = DrawnVessel(rng)
+        logs = k >= options.draw
         name = f"{'logs' if logs else 'vessel'}_{k + 1}"
         print(f"{name}: {vessel}", flush=True)
-        noise = np.random.default_rng((given.seed, k))
-        runs.append(trained(name, vessel, out, noise, logs=logs))
-    seeds = range(given.seed, given.seed + given.seeds)
-    runs += seeded(given.config, given.policy, seeds, out) if given.seeds else []
+        noise = np.random.default_rng((options.seed, k))
+        runs.append(train_for_vessel(name, vessel, out, noise, logs=logs))
+    seeds = range(options.seed, options.seed + options.seeds)
+    runs += run_seeds(options.config, options.policy, seeds, out) if options.seeds else []
     if not runs:
         raise SystemExit("name the folders of finished runs, or give --draw, --logs or --seeds")
-    found = [margins(run, given.policy) for run in runs]
+    figures_of_runs = [compute_margins(run, options.policy) for run in runs]
     names = [*(run.name for run in runs), "mean", "deviation", "least", "most"]
     print(f"{'':24s}" + "".join(f"{name:>12s}" for name in names))
-    for title in found[0]:
-        values = np.array([each[title] for each in found])
+    for title in figures_of_runs[0]:
+        values = np.array([figures[title] for figures in figures_of_runs])
         deviation = values.std(ddof=1) if len(values) > 1 else math.nan
-        shown = [*values, values.mean(), deviation, values.min(), values.max()]
-        print(f"{title:24s}" + "".join(f"{value:12.3f}" for value in shown))
-    beyond = [outside(run, given.policy) for run in runs]
-    for protocol in [one for one in beyond[0] if all(one in each for each in beyond)]:
-        costs = np.array([each[protocol] for each in beyond])
-        spread = costs.std(axis=0, ddof=1) if len(costs) > 1 else np.full(3, math.nan)
-        told = [f"{m:.3f} ({d:.3f})" for m, d in zip(costs.mean(axis=0), spread, strict=True)]
-        print(f"{protocol:24s}policy {told[0]}, best law {told[1]}, PD {told[2]} s")
+        cells = [*values, values.mean(), deviation, values.min(), values.max()]
+        print(f"{title:24s}" + "".join(f"{value:12.3f}" for value in cells))
+    outside_costs = [compute_outside_costs(run, options.policy) for run in runs]
+    for protocol in [
+        name for name in outside_costs[0] if all(name in figures for figures in outside_costs)
+    ]:
+        costs = np.array([figures[protocol] for figures in outside_costs])
+        deviations = costs.std(axis=0, ddof=1) if len(costs) > 1 else np.full(3, math.nan)
+        texts = [f"{m:.3f} ({d:.3f})" for m, d in zip(costs.mean(axis=0), deviations, strict=True)]
+        print(f"{protocol:24s}policy {texts[0]}, best law {texts[1]}, PD {texts[2]} s")
 
 
 if __name__ == "__main__":
