@@ -283,20 +283,19 @@ def _vessel_section(
 
 def _describe_gear(run: RunFiles) -> str:
     """Return the steering gear of the manoeuvring booklet as text; empty without one."""
-    booklet = run.resolved_config.get("booklet")
-    inputs = booklet.get("inputs", {}) if isinstance(booklet, dict) else {}
+    booklet = run.fit_settings.booklet
     parts = []
-    for share in inputs.values():
-        if not isinstance(share, dict) or share.get("steer") in (0, 0.0, None):
+    for share in booklet.inputs.values() if booklet is not None else ():
+        if not share.steer:
             continue
-        rate = share.get("rate")
-        if isinstance(rate, int | float):
-            parts.append(f"rate {math.degrees(rate):.3g} deg/s")
-        elif rate:
-            parts.append(f"rate {rate}")
-        for key, title in (("lag", "time constant"), ("delay", "dead time")):
-            if share.get(key):
-                parts.append(f"{title} {share[key]:.3g} s")
+        if isinstance(share.rate, float):
+            parts.append(f"rate {math.degrees(share.rate):.3g} deg/s")
+        elif share.rate:
+            parts.append(f"rate {share.rate}")
+        if share.lag:
+            parts.append(f"time constant {share.lag:.3g} s")
+        if share.delay:
+            parts.append(f"dead time {share.delay:.3g} s")
     return ", ".join(parts)
 
 

@@ -144,6 +144,29 @@ class TrainingSettings(ShownSettings):
     multi_step: tuple[TrainingStage, ...] = ()
 
 
+class InputShareSettings(ShownSettings):
+    """An input in the manoeuvres of a booklet.
+
+    Attributes:
+        steer: value at the full steering command, SI or text with a unit; None or 0 for an input
+            that does not steer.
+        rate: rate of the steering gear in rad/s or text with a unit; None if it is not limited.
+        lag: time constant of the steering gear in s; None for none.
+        delay: dead time of the steering gear in s; None for none.
+    """
+
+    steer: float | str | None = None
+    rate: float | str | None = None
+    lag: float | None = None
+    delay: float | None = None
+
+
+class BookletSettings(ShownSettings):
+    """The manoeuvring booklet; `inputs` are the inputs of the models by name."""
+
+    inputs: Mapping[str, InputShareSettings] = Field(default_factory=dict)
+
+
 class FitRunSettings(RunSettings):
     """The settings of a fit.
 
@@ -152,12 +175,14 @@ class FitRunSettings(RunSettings):
         baseline: first baseline; None if it is not recorded.
         evaluation: evaluation by free runs.
         training: training of the networks by model.
+        booklet: manoeuvring booklet; None without one.
     """
 
     signals: SignalSettings = SignalSettings()
     baseline: PartSettings | None = None
     evaluation: EvaluationSettings = EvaluationSettings()
     training: Mapping[str, TrainingSettings] = Field(default_factory=dict)
+    booklet: BookletSettings | None = None
 
 
 class HeadSettings(ShownSettings):
