@@ -1,12 +1,13 @@
-"""How many planted faults the data doctor finds, and what it says about clean logs.
+"""Evaluate the data checks: detection of planted faults, and findings in clean logs.
 
     python scripts/bench/doctor.py [FAULT...] [--vessels 10] [--seed 1000]
     python scripts/bench/doctor.py [FAULT...] --long ROWS [--seed 1000]
 
-The hosts are so many vessels of each kind drawn at random, and measured logs where RESIDNET_DATA
-names them. For each fault and kind of host: logs in which a finding above a note names it. Then the
-clean logs that have a finding above a note. Limits were tuned on seeds below 1000; report on
-others. With --long both ways of looking at one long log of so many rows stand beside each other.
+Faults are planted in logs of random vessels of each kind, and in measured logs if RESIDNET_DATA is
+set. The table has the number of logs in which a finding above a note names the fault, by fault and
+kind of vessel. The last line is the number of clean logs with a finding above a note. Limits were
+tuned on seeds below 1000; use other seeds for an evaluation. With --long the findings in a long log
+from a subsample and from all rows are compared.
 """
 
 from __future__ import annotations
@@ -30,14 +31,15 @@ from residnet.core.log import Log
 from residnet.preprocessing.masks import MaskRule
 from residnet.quality import Finding, inspect_log, inspect_log_set, statistics
 
-_TOGETHER = 3
-_MEASURED = 4
-"""Measured logs that are looked at together, and how often."""
+_LOGS_PER_HOST = 3
+"""Number of measured logs that are checked together."""
+_MAX_MEASURED_HOSTS = 4
+"""Largest number of groups of measured logs."""
 
 
 @dataclass(frozen=True)
 class Host:
-    """Logs of one vessel, and what a config says of them."""
+    """Logs of one vessel, with inputs and masks of its config."""
 
     ship: Ship
     logs: list[Log]
@@ -45,14 +47,14 @@ class Host:
     masks: tuple[MaskRule, ...] = ()
 
 
-def simulated(seed: int, count: int) -> Iterator[Host]:
+def simulate_hosts(seed: int, count: int) -> Iterator[Host]:
     """Yield vessels drawn at random."""
     for kind in KINDS:
         for logs in random_logs(kind, seed, count):
             yield Host(ship_of(kind, logs[0]), logs)
 
 
-def measured(seed: int) -> list[Host]:
+def read_measured_hosts(seed: int) -> list[Host]:
     """Return measured model tankers, three logs at a time."""
     from residnet.tasks.registry import load_task
 
@@ -71,32 +73,37 @@ def measured(seed: int) -> list[Host]:
             "tanker", name, "0 s", "0 s", {}, arm=arm, lag=(0.7, 1.4), bias=(0.1, 0.3),
             steer=("delta",), actual="delta", demand="delta",
         )  # fmt: skip
-        for start in range(0, len(files) - _TOGETHER + 1, _TOGETHER):
-            logs = [reader.read(file) for file in files[start : start + _TOGETHER]]
+        for start in range(0, len(files) - _LOGS_PER_HOST + 1, _LOGS_PER_HOST):
+            logs = [reader.read(file) for file in files[start : start + _LOGS_PER_HOST]]
             hosts.append(Host(ship, logs, fit.signals.columns, fit.prepare.masks))
-    return [hosts[i] for i in random.permutation(len(hosts))][:_MEASURED]
+    return [hosts[i] for i in random.permutation(len(hosts))][:_MAX_MEASURED_HOSTS]
 
 
-def named(fault: Fault, host: Host, logs: list[Log]) -> bool:
-    """Return whether the doctor names a fault of the first log, or of all together."""
+def is_detected(fault: Fault, host: Host, logs: list[Log]) -> bool:
+    """Return whether the data checks name a fault of the first log, or of all logs together."""
     try:
-        said = list(inspect_log(logs[0], host.inputs, host.masks).findings)
-        said += inspect_log_set(logs, host.inputs).findings
+        findings = list(inspect_log(logs[0], host.inputs, host.masks).findings)
+        findings += inspect_log_set(logs, host.inputs).findings
     except ResidnetError as error:
-        said = [Finding("fatal", fault.codes[0], str(error))]
-    # what the masks of the run leave out is a note
-    loud = [
+        findings = [Finding("fatal", fault.codes[0], str(error))]
+    # samples that the masks of the run exclude are a note
+    counted_findings = [
         f
-        for f in said
+        for f in findings
         if f.level != "note" or fault.harmless or f.action == "the config masks these samples"
     ]
-    return any(f.code in fault.codes for f in loud)
+    return any(f.code in fault.codes for f in counted_findings)
 
 
-def loud(log: Log, longest: float) -> set[str]:
-    """Return the codes above a note where logs of more than `longest` samples are told by a part.
+def find_codes(log: Log, longest: float) -> set[str]:
+    """Return the codes of the findings above a note.
 
-    An unreadable log has none but `unreadable`.
+    Args:
+        log: the checked log.
+        longest: number of samples above which a subsample is checked.
+
+    Returns:
+        The codes; `unreadable` for a log that cannot be checked.
     """
     statistics._MAX_SUBSAMPLE = longest
     try:
@@ -105,12 +112,12 @@ def loud(log: Log, longest: float) -> set[str]:
         return {"unreadable"}
 
 
-def long_logs(rows: int, seed: int, faults: Sequence[Fault]) -> None:
-    """Print of each fault in a long log what either look alone finds."""
-    usual = statistics._MAX_SUBSAMPLE
-    alike = 0
-    count = 0
-    ship = next(one for one in SHIPS if one.name == "wam_v")
+def compare_long_logs(rows: int, seed: int, faults: Sequence[Fault]) -> None:
+    """Print the findings in long logs that only a subsample or only all rows give, by fault."""
+    usual_limit = statistics._MAX_SUBSAMPLE
+    n_equal = 0
+    n_logs = 0
+    ship = next(candidate for candidate in SHIPS if candidate.name == "wam_v")
     hosts = simulate(2, rows, seed)
     for number, fault in enumerate([None, *faults]):
         if fault is not None and ship.name not in fault.ships and "twin" not in fault.hosts:
@@ -121,51 +128,57 @@ def long_logs(rows: int, seed: int, faults: Sequence[Fault]) -> None:
         except (Undecidable, KeyError):
             # the boat has no such channel
             continue
-        few = loud(log, usual)
-        whole = loud(log, math.inf)
-        alike = alike + (few == whole)
-        count = count + 1
-        told = f"by stretches alone {sorted(few - whole)}, by all rows {sorted(whole - few)}"
-        said = "alike" if few == whole else told
-        print(f"{'none' if fault is None else fault.name}: {said}; {sorted(whole)}", flush=True)
-    print(f"both looks say the same of {alike} of {count} logs of {rows} rows")
+        subsample_codes = find_codes(log, usual_limit)
+        all_codes = find_codes(log, math.inf)
+        n_equal = n_equal + (subsample_codes == all_codes)
+        n_logs = n_logs + 1
+        difference_text = (
+            f"by stretches alone {sorted(subsample_codes - all_codes)}, by all rows"
+            f" {sorted(all_codes - subsample_codes)}"
+        )
+        text = "alike" if subsample_codes == all_codes else difference_text
+        print(f"{'none' if fault is None else fault.name}: {text}; {sorted(all_codes)}", flush=True)
+    print(f"both looks say the same of {n_equal} of {n_logs} logs of {rows} rows")
 
 
 def main() -> None:
     """Print both tables."""
-    given = bench.options(__doc__, faults=(), vessels=10, seed=1000, long=0)
-    faults = [f for f in FAULTS if not given.faults or f.name in given.faults]
-    if given.long:
-        long_logs(given.long, given.seed, faults)
+    options = bench.options(__doc__, faults=(), vessels=10, seed=1000, long=0)
+    faults = [f for f in FAULTS if not options.faults or f.name in options.faults]
+    if options.long:
+        compare_long_logs(options.long, options.seed, faults)
         return
-    hosts = [*simulated(given.seed, given.vessels), *measured(given.seed)]
+    hosts = [*simulate_hosts(options.seed, options.vessels), *read_measured_hosts(options.seed)]
     names = list(dict.fromkeys(host.ship.name for host in hosts))
     table: dict[tuple[str, str], list[bool]] = {}
-    checked = 0
-    loud = 0
+    n_checked = 0
+    n_alarms = 0
     for number, host in enumerate(hosts):
-        for log in host.logs if not given.faults else ():
-            said = inspect_log(log, host.inputs, host.masks).findings
-            told = [f"{f.code} ({f.effect}): {f.text}" for f in said if f.level != "note"]
-            checked = checked + 1
-            loud = loud + bool(told)
-            if told:
-                print(f"alarm: {log.name}: {'; '.join(told)}", file=sys.stderr)
+        for log in host.logs if not options.faults else ():
+            findings = inspect_log(log, host.inputs, host.masks).findings
+            texts = [f"{f.code} ({f.effect}): {f.text}" for f in findings if f.level != "note"]
+            n_checked = n_checked + 1
+            n_alarms = n_alarms + bool(texts)
+            if texts:
+                print(f"alarm: {log.name}: {'; '.join(texts)}", file=sys.stderr)
         for fault in faults:
             if host.ship.name not in (*fault.ships, *fault.hosts):
                 continue
-            random = np.random.default_rng([given.seed, number, len(fault.name)])
+            random = np.random.default_rng([options.seed, number, len(fault.name)])
             logs = [host.logs[i] for i in random.permutation(len(host.logs))]
             try:
-                planted = fault.plant(host.ship, logs, random)
+                planted_logs = fault.plant(host.ship, logs, random)
             except Undecidable:
                 continue
-            rest = [log for log in logs[1:] if len(planted) == 1]
-            hit = named(fault, host, [*planted, *rest])
-            table.setdefault((fault.name, host.ship.name), []).append(hit)
+            other_logs = [log for log in logs[1:] if len(planted_logs) == 1]
+            has_finding = is_detected(fault, host, [*planted_logs, *other_logs])
+            table.setdefault((fault.name, host.ship.name), []).append(has_finding)
     print_table(table, faults, names)
-    if checked:
-        print(f"clean logs with a finding above a note: {loud} of {checked}, {loud / checked:.1%}")
+    if n_checked:
+        print(
+            f"clean logs with a finding above a note: {n_alarms} of {n_checked},"
+            f" {n_alarms / n_checked:.1%}"
+        )
 
 
 def print_table(

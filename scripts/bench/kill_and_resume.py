@@ -1,10 +1,10 @@
 """Interrupt a small but complete fit at random moments, resume it, and compare the metrics.
 
 The fit has a refitted baseline, PLSR, an MLP, an LSTM and an ensemble, and exports. Each chain
-stops it one to four times by SIGKILL, SIGINT or SIGTERM and resumes it with `--resume`. The rows of
-metrics.json have to be bit for bit those of an undisturbed run. After SIGINT the exit code has to
-be 130, after SIGTERM 143, and standard error has to end with one line that names `--resume` and to
-hold no traceback.
+interrupts it one to four times by SIGKILL, SIGINT or SIGTERM and resumes it with `--resume`. The
+rows of metrics.json must be identical to those of an uninterrupted run. The exit code must be 130
+after SIGINT and 143 after SIGTERM, and standard error must end with one line that names `--resume`,
+without a traceback.
 
     python scripts/bench/kill_and_resume.py [--chains 20] [--seed 0]
 """
@@ -47,88 +47,94 @@ OVERRIDES = (
     "export.models=[lstm]",
 )
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGINT: 130, signal.SIGTERM: 143}
-DRAWN = (signal.SIGKILL, signal.SIGKILL, signal.SIGINT, signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGINT, signal.SIGINT, signal.SIGTERM)
 
 
-def attempt(
-    run: Path, *words: str, after: float = 600.0, number: int = signal.SIGKILL
+def run_and_interrupt(
+    run: Path, *options: str, timeout: float = 600.0, number: int = signal.SIGKILL
 ) -> tuple[int, str]:
-    """Begin a run or go on with it, and send a signal; return the exit code and what was said."""
-    overrides = [word for override in OVERRIDES for word in ("-s", override)]
-    command = [sys.executable, "-m", "residnet", "run", "quickstart", "--out", str(run), *words]
-    said = run.with_suffix(".txt")
-    with said.open("w") as stream:
+    """Start or resume a run and send a signal; return the exit code and standard error."""
+    overrides = [part for override in OVERRIDES for part in ("-s", override)]
+    command = [sys.executable, "-m", "residnet", "run", "quickstart", "--out", str(run), *options]
+    output_file = run.with_suffix(".txt")
+    with output_file.open("w") as stream:
         process = subprocess.Popen([*command, *overrides], stdout=subprocess.DEVNULL, stderr=stream)
         try:
-            process.wait(after)
+            process.wait(timeout)
         except subprocess.TimeoutExpired:
             process.send_signal(number)
             process.wait(600.0)
-    return process.returncode, said.read_text(errors="backslashreplace")
+    return process.returncode, output_file.read_text(errors="backslashreplace")
 
 
-def faults(code: int, error: str, number: signal.Signals) -> list[str]:
-    """Return what is wrong with how a run ended that a signal was sent to."""
+def find_faults(code: int, error: str, number: signal.Signals) -> list[str]:
+    """Return the faults in exit code and messages of an interrupted run."""
     if code == 0:
-        return []  # it was done before the signal came
-    found = []
-    last = (error.splitlines() or [""])[-1]
+        return []  # the run finished before the signal
+    texts = []
+    last_line = (error.splitlines() or [""])[-1]
     if code != CODES[number]:
-        found.append(f"exit code {code} after {number.name}")
+        texts.append(f"exit code {code} after {number.name}")
     if "Traceback" in error:
-        found.append(f"traceback after {number.name}: {error[-3000:]}")
-    if number != signal.SIGKILL and "--resume" not in last:
-        found.append(f"no hint to --resume after {number.name}, but: {last}")
-    return found
+        texts.append(f"traceback after {number.name}: {error[-3000:]}")
+    if number != signal.SIGKILL and "--resume" not in last_line:
+        texts.append(f"no hint to --resume after {number.name}, but: {last_line}")
+    return texts
 
 
-def rows(run: Path) -> str:
-    """Return the rows of metrics.json as text, which shows every bit."""
+def read_rows(run: Path) -> str:
+    """Return the rows of metrics.json as text with all digits."""
     return json.dumps(json.loads((run / "metrics.json").read_text())["rows"])
 
 
-def chain(run: Path, seconds: float, truth: str, draw: random.Random) -> bool:
-    """Interrupt and resume one run; print what was done and tell whether something was wrong."""
-    found = []
-    told = []
-    for place in range(draw.randint(1, 4)):
-        after = draw.uniform(0.2, 1.05 * seconds)
-        number = draw.choice(DRAWN)
-        words = ["--resume"] if place else []
-        code, error = attempt(run, *words, after=after, number=number)
-        told.append(f"{number.name} at {after:.1f} s" if code else "done before that")
-        found += faults(code, error, number)
+def run_chain(run: Path, seconds: float, truth: str, draw: random.Random) -> bool:
+    """Interrupt and resume one run; print the events and return whether there was a fault."""
+    faults_of_chain = []
+    events = []
+    for index in range(draw.randint(1, 4)):
+        timeout = draw.uniform(0.2, 1.05 * seconds)
+        number = draw.choice(SIGNALS)
+        options = ["--resume"] if index else []
+        code, error = run_and_interrupt(run, *options, timeout=timeout, number=number)
+        events.append(f"{number.name} at {timeout:.1f} s" if code else "done before that")
+        faults_of_chain += find_faults(code, error, number)
         if code == 0:
             break
-    # a resumed run that is done says so again
-    code, error = attempt(run, "--resume")
+    # a finished run can be resumed again
+    code, error = run_and_interrupt(run, "--resume")
     if code:
-        found.append(f"exit code {code} of the last: {error[-2000:]}")
-    elif rows(run) != truth:
-        found.append("other rows in metrics.json")
-    found += [f"{file} is left over" for file in run.rglob("*.partial")]
-    print(f"{run.name}: {', '.join(told)}: {'; '.join(found) or 'the same rows'}", flush=True)
-    return bool(found)
+        faults_of_chain.append(f"exit code {code} of the last: {error[-2000:]}")
+    elif read_rows(run) != truth:
+        faults_of_chain.append("other rows in metrics.json")
+    faults_of_chain += [f"{file} is left over" for file in run.rglob("*.partial")]
+    print(
+        f"{run.name}: {', '.join(events)}: {'; '.join(faults_of_chain) or 'the same rows'}",
+        flush=True,
+    )
+    return bool(faults_of_chain)
 
 
 def main() -> None:
     """Run the chains and print the tally."""
-    given = bench.options(__doc__, chains=20, seed=0)
+    options = bench.options(__doc__, chains=20, seed=0)
     with tempfile.TemporaryDirectory(prefix="interrupted-") as name:
-        whole = Path(name) / "whole"
-        begun = time.monotonic()
-        code, error = attempt(whole)
+        reference_run = Path(name) / "whole"
+        start_time = time.monotonic()
+        code, error = run_and_interrupt(reference_run)
         if code:
             sys.exit(f"the undisturbed run ends with {code}: {error[-2000:]}")
-        seconds = time.monotonic() - begun
-        draw = random.Random(given.seed)
+        seconds = time.monotonic() - start_time
+        draw = random.Random(options.seed)
         print(f"undisturbed: {seconds:.0f} s", flush=True)
-        bad = sum(
-            chain(Path(name) / f"chain_{number:02d}", seconds, rows(whole), draw)
-            for number in range(given.chains)
+        n_faulty = sum(
+            run_chain(Path(name) / f"chain_{number:02d}", seconds, read_rows(reference_run), draw)
+            for number in range(options.chains)
         )
-    print(f"{given.chains - bad} of {given.chains} chains end with the rows of the undisturbed run")
-    sys.exit(bad > 0)
+    print(
+        f"{options.chains - n_faulty} of {options.chains} chains end with the rows of the"
+        " undisturbed run"
+    )
+    sys.exit(n_faulty > 0)
 
 
 if __name__ == "__main__":

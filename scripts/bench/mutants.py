@@ -1,14 +1,14 @@
-"""Draw faults of the source at random and count how many the tests find.
+"""Draw random faults of the source and count how many the tests detect.
 
 A mutant changes one operator, comparison, number or condition of src/residnet. It is run against
-the tests that reach its line, quickest first, up to the first failure. Needs pytest-cov, and a
-coverage map with contexts of the whole suite:
+the tests that reach its line, the fastest first, until the first failure. Needs pytest-cov, and a
+coverage map with contexts of all tests:
 
     pytest -n 2 -m "not long and not exporters" --cov=src/residnet --cov-context=test --cov-report=
     python scripts/bench/mutants.py --count 120 --seed 1 [--seconds 120] [--out FILE]
 
-`--map` is the coverage map, `--seconds` the processor time that a mutant has, `--junit` a file with
-the durations of the tests as pytest writes them, and `--out` takes a line of JSON for each mutant.
+`--map` is the coverage map, `--seconds` the limit of the processor time of a mutant, `--junit` a
+file of pytest with the durations of the tests, and `--out` a file for a line of JSON per mutant.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ class Mutant:
     what: str
 
 
-def changed(node: ast.AST) -> str | None:
-    """Change a node in place; returns what was done, or nothing where there is nothing to do."""
+def change_node(node: ast.AST) -> str | None:
+    """Change a node in place; return a description of the change, or None if it has no change."""
     if isinstance(node, ast.BinOp) and type(node.op) in SWAPS:
-        before = node.op
-        node.op = SWAPS[type(before)]()  # type: ignore[assignment]
-        return f"{type(before).__name__} to {type(node.op).__name__}"
+        operator = node.op
+        node.op = SWAPS[type(operator)]()  # type: ignore[assignment]
+        return f"{type(operator).__name__} to {type(node.op).__name__}"
     if isinstance(node, ast.BoolOp):
         node.op = SWAPS[type(node.op)]()  # type: ignore[assignment]
         return f"to {type(node.op).__name__}"
@@ -76,8 +76,8 @@ def changed(node: ast.AST) -> str | None:
     return None
 
 
-def places(file: Path) -> Iterator[int]:
-    """Yield the numbers, in the order of `ast.walk`, of the expressions that can be changed."""
+def iterate_places(file: Path) -> Iterator[int]:
+    """Yield the indices, in the order of `ast.walk`, of the expressions that can be changed."""
     tree = ast.parse(file.read_text())
     formatted = {
         id(part)
@@ -86,60 +86,67 @@ def places(file: Path) -> Iterator[int]:
         for part in ast.walk(node)
     }
     for number, node in enumerate(ast.walk(tree)):
-        if id(node) not in formatted and changed(node) is not None:
+        if id(node) not in formatted and change_node(node) is not None:
             yield number
 
 
-def mutant(file: Path, place: int) -> Mutant:
+def make_mutant(file: Path, index: int) -> Mutant:
     """Return the fault at a place of a file."""
     source = file.read_text()
-    node = list(ast.walk(ast.parse(source)))[place]
+    node = list(ast.walk(ast.parse(source)))[index]
     assert isinstance(node, ast.expr)
-    what = changed(node) or ""
+    description = change_node(node) or ""
     first = node.lineno
     last = node.end_lineno or node.lineno
     lines = [line.encode() for line in source.splitlines()[first - 1 : last]]
-    before = lines[0][: node.col_offset]
-    after = lines[-1][node.end_col_offset :]
-    text = (before + f"({ast.unparse(node)})".encode() + after).decode()
-    return Mutant(file.relative_to(ROOT).as_posix(), first, last, text, what)
+    prefix = lines[0][: node.col_offset]
+    suffix = lines[-1][node.end_col_offset :]
+    text = (prefix + f"({ast.unparse(node)})".encode() + suffix).decode()
+    return Mutant(file.relative_to(ROOT).as_posix(), first, last, text, description)
 
 
-def draw(count: int, seed: int) -> list[Mutant]:
-    """Draw faults over all places of the source alike."""
+def draw_mutants(count: int, seed: int) -> list[Mutant]:
+    """Draw faults uniformly from all places of the source."""
     files = sorted((ROOT / "src" / "residnet").rglob("*.py"))
-    everywhere = [(file, place) for file in files for place in places(file)]
-    return [mutant(*found) for found in random.Random(seed).sample(everywhere, count)]
+    all_places = [(file, place) for file in files for place in iterate_places(file)]
+    return [
+        make_mutant(*file_and_place)
+        for file_and_place in random.Random(seed).sample(all_places, count)
+    ]
 
 
-def reaching(drawn: list[Mutant], map_file: str, durations: dict[str, float]) -> list[list[str]]:
-    """Return the tests that reach each fault, quickest first.
+def find_reaching_tests(
+    mutants: list[Mutant], map_file: str, durations: dict[str, float]
+) -> list[list[str]]:
+    """Return the tests that reach each fault, the fastest first.
 
-    Of a line that only an import reaches, they are those that reach any line of its file.
+    For a line that only an import reaches they are the tests that reach any line of its file.
     """
     data = CoverageData(map_file)
     data.read()
-    measured = {name.split("/src/residnet/")[-1]: name for name in data.measured_files()}
-    found = []
-    for one in drawn:
-        name = measured.get(one.file.removeprefix("src/residnet/"))
+    measured_files = {name.split("/src/residnet/")[-1]: name for name in data.measured_files()}
+    tests_of_mutants = []
+    for mutant in mutants:
+        name = measured_files.get(mutant.file.removeprefix("src/residnet/"))
         lines = data.contexts_by_lineno(name) if name else {}
-        own = [lines.get(number, []) for number in range(one.first, one.last + 1)]
-        tests = {context for contexts in own for context in contexts if context}
+        contexts_of_lines = [
+            lines.get(number, []) for number in range(mutant.first, mutant.last + 1)
+        ]
+        tests = {context for contexts in contexts_of_lines for context in contexts if context}
         tests = tests or {context for contexts in lines.values() for context in contexts if context}
         ids = {test.rsplit("|", 1)[0] for test in tests}
-        found.append(sorted(ids, key=lambda test: (durations.get(test, 1.0), test)))
-    return found
+        tests_of_mutants.append(sorted(ids, key=lambda test: (durations.get(test, 1.0), test)))
+    return tests_of_mutants
 
 
-def judged(one: Mutant, tests: list[str], scratch: Path, seconds: int) -> str:
+def evaluate_mutant(mutant: Mutant, tests: list[str], scratch: Path, seconds: int) -> str:
     """Return `killed`, `survived`, `time` or `unreached`; a fork runs the tests on a copy."""
     if not tests:
         return "unreached"
-    file = scratch / one.file
-    whole = file.read_text()
-    lines = whole.splitlines()
-    lines[one.first - 1 : one.last] = one.text.splitlines()
+    file = scratch / mutant.file
+    source = file.read_text()
+    lines = source.splitlines()
+    lines[mutant.first - 1 : mutant.last] = mutant.text.splitlines()
     file.write_text("\n".join(lines) + "\n")
     child = os.fork()
     if child == 0:
@@ -147,12 +154,12 @@ def judged(one: Mutant, tests: list[str], scratch: Path, seconds: int) -> str:
         os.chdir(scratch)
         sys.path[:0] = [str(scratch / "src")]
         os.environ["PYTHONPATH"] = str(scratch / "src")
-        silent = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(silent, 1)
-        os.dup2(silent, 2)
+        null_device = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null_device, 1)
+        os.dup2(null_device, 2)
         os._exit(int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests[:400]])))
     _, status = os.waitpid(child, 0)
-    file.write_text(whole)
+    file.write_text(source)
     if os.WIFSIGNALED(status):
         return "time"
     return "survived" if os.WEXITSTATUS(status) == 0 else "killed"
@@ -160,31 +167,39 @@ def judged(one: Mutant, tests: list[str], scratch: Path, seconds: int) -> str:
 
 def main() -> None:
     """Draw, run and count."""
-    given = bench.options(
+    options = bench.options(
         __doc__, count=120, seed=1, seconds=120, map=str(ROOT / ".coverage"), junit=None, out=None
     )
     durations = {}
-    if given.junit:
-        for case in tree.parse(given.junit).iter("testcase"):
+    if options.junit:
+        for case in tree.parse(options.junit).iter("testcase"):
             module = case.get("classname", "").replace(".", "/") + ".py"
             durations[f"{module}::{case.get('name')}"] = float(case.get("time", 1.0))
-    mutants = draw(given.count, given.seed)
-    tests = reaching(mutants, given.map, durations)
+    mutants = draw_mutants(options.count, options.seed)
+    tests = find_reaching_tests(mutants, options.map, durations)
     counts: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder) / "copy"
         # `src/residnet/runs` is no folder of runs
-        left_out = {str(ROOT): [".venv", ".git", "runs", "build", "dist"]}
-        shutil.copytree(ROOT, scratch, ignore=lambda folder, _: left_out.get(folder, []))
-        for number, (one, reached) in enumerate(zip(mutants, tests, strict=True)):
-            started = time.monotonic()
-            state = judged(one, reached, scratch, given.seconds)
+        ignored_names = {str(ROOT): [".venv", ".git", "runs", "build", "dist"]}
+        shutil.copytree(ROOT, scratch, ignore=lambda folder, _: ignored_names.get(folder, []))
+        for number, (mutant, reaching_tests) in enumerate(zip(mutants, tests, strict=True)):
+            start_time = time.monotonic()
+            state = evaluate_mutant(mutant, reaching_tests, scratch, options.seconds)
             counts[state] = counts.get(state, 0) + 1
-            row = {"file": one.file, "line": one.first, "what": one.what, "state": state}
-            row |= {"tests": len(reached), "seconds": round(time.monotonic() - started, 1)}
+            row = {
+                "file": mutant.file,
+                "line": mutant.first,
+                "what": mutant.what,
+                "state": state,
+            }
+            row |= {
+                "tests": len(reaching_tests),
+                "seconds": round(time.monotonic() - start_time, 1),
+            }
             print(number, json.dumps(row), flush=True)
-            if given.out:
-                with Path(given.out).open("a") as stream:
+            if options.out:
+                with Path(options.out).open("a") as stream:
                     stream.write(json.dumps(row) + "\n")
     print(", ".join(f"{state} {count}" for state, count in sorted(counts.items())))
 
