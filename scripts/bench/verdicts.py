@@ -4,7 +4,7 @@
 
 Vessels are drawn at random (`tests/support/fleets.py`); twenty logs of each are fitted by a linear
 baseline, PLSR and an MLP, and as many others as were tested on are new trials. Printed for each
-vessel: the level, up to when the verdict says "good", and for each horizon up to there whether the
+vessel: the level, and for each horizon that the verdict rates good whether the
 errors of position and heading on the new trials lie within the interval that the verdict states.
 Then the shares over all vessels.
 """
@@ -19,7 +19,7 @@ import bench
 from fleets import drawn
 
 import residnet
-from residnet.evaluation.verdict import known_horizons, longest_good_horizon, rate_model
+from residnet.evaluation.verdict import GOOD_LEVEL, known_horizons, rate_horizon, rate_model
 
 _FITTED = 20
 _NEW = 8
@@ -29,7 +29,6 @@ def judged(models: residnet.Models, new: Any) -> tuple[list[int], str]:
     """Return where errors called good lie: below the interval (-1), within or above; and a line."""
     evidence = models.evidence
     own = evidence.selected
-    until = longest_good_horizon(evidence)
     found = residnet.free_run(models, residnet.prepare(new, settings_from=models.data), "external")
     seen = {
         row.seconds: row for row in found.evaluation.limits_by_protocol[evidence.protocol].horizons
@@ -37,14 +36,14 @@ def judged(models: residnet.Models, new: Any) -> tuple[list[int], str]:
     places = []
     texts = []
     for _, row in known_horizons(evidence):
-        if row.seconds > until:
+        if rate_horizon(evidence, row) != GOOD_LEVEL or row.seconds not in seen:
             continue
         fresh = seen[row.seconds].models[own].by_name
         for of in ("position", "heading"):
             low, high = row.models[own].intervals[of] or (0.0, math.inf)
             places.append(int(fresh[of] > high) - int(fresh[of] < low))
             texts.append(f"{of} {fresh[of]:.3g} of {low:.3g} to {high:.3g}")
-    return places, f"{rate_model(evidence):12s} {until:6.4g} s  {'; '.join(texts)}"
+    return places, f"{rate_model(evidence):12s} {'; '.join(texts)}"
 
 
 def main() -> None:

@@ -158,34 +158,32 @@ def evidence(error: float = 0.2, **change: Any) -> VerdictEvidence:
     return VerdictEvidence(**{**given, **change})
 
 
-def test_the_first_sentence_compares_with_zero_and_the_baseline() -> None:
+def test_velocity_errors_are_compared_with_constant_velocity_and_the_baseline() -> None:
     first = write_verdict(evidence())[0]
     assert first.startswith(
-        "On test data model mlp is 60 % better than constant velocity (paired 95 % interval"
+        "On test data the velocity errors of mlp (NRMSE 0.200) are 60 % lower than those of"
+        " constant velocity (paired 95 % confidence interval"
     )
     for part in (
         "-0.4 to -0.2)",
-        "20 % better than the baseline",
+        "20 % lower than those of the baseline",
         "zero: the difference is not significant",
     ):
         assert part in first
     worse = write_verdict(
         evidence(error=0.608, rows_by_model={"constant_velocity": row(0.506), "mlp": row(0.608)})
     )[0]
-    assert worse.startswith(
-        "WORSE THAN CONSTANT VELOCITY: on test data the selected model mlp has an NRMSE of"
-    )
-    for part in ("0.608", "0.506"):
-        assert part in worse
+    assert worse.startswith("Do not use: on test data the velocity errors of mlp (NRMSE 0.608)")
+    assert "larger than those of constant velocity (0.506)" in worse
     assert write_verdict(evidence(selected="constant_velocity"))[0].startswith(
-        "NOTHING BEATS CONSTANT VELOCITY"
+        "Do not use: no model of this run is better than constant velocity"
     )
 
 
 def test_logs_that_trained_the_model_are_not_external_data() -> None:
     known = evidence(split="external", n_logs=2, n_logs_of_fit=2)
     sentences = write_verdict(known)
-    assert sentences[0].startswith("On data of the fit model mlp is 60 % better")
+    assert sentences[0].startswith("On data of the fit the velocity errors of mlp")
     assert sentences[1].startswith(
         "The rating is at most limited, because 2 of 2 logs trained the model (same SHA-256)"
     )
@@ -223,66 +221,94 @@ def test_unsound_models_and_divergences_are_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("entries", "expected", "said"),
+    ("entries", "expected", "reason"),
     [
         (
             [horizon(10, errors(0.5, 2.0)), horizon(30, errors(3.0, 5.0))],
             "good",
-            "Up to 30 s ahead, where",
+            "Good: upper limits within 10 % of the distance travelled and 10 deg",
         ),
+        # the main horizon counts: the longest that half of the windows reach
         (
             [horizon(10, errors(0.5, 2.0)), horizon(30, errors(9.0, 5.0))],
-            "good",
-            "Up to 10 s ahead",
+            "limited",
+            "the upper limit of its position error is 9.9 m, 16 % of the distance travelled"
+            " (good: at most 10 %)",
         ),
-        # a tenth of the way is no use where the bow points elsewhere
-        ([horizon(30, errors(3.0, 67.0))], "do not use", "30 s ahead mlp is off by 3.0 m"),
-        # of limited use up to the horizon that meets its limits
+        (
+            [horizon(10, errors(0.5, 2.0)), horizon(30, errors(9.0, 5.0), windows=5)],
+            "good",
+            "Good: upper limits within",
+        ),
+        # a tenth of the distance is no use where the bow points elsewhere
+        (
+            [horizon(30, errors(3.0, 67.0))],
+            "do not use",
+            "Do not use: its heading error is not significantly smaller than that of constant"
+            " velocity; the upper limit of its heading error is 74 deg (limited: at most 30 deg)",
+        ),
         (
             [horizon(10, errors(3.0, 5.0)), horizon(30, errors(25.0, 25.0))],
-            "limited",
-            "10 s ahead mlp is off by 3.0 m",
+            "do not use",
+            "46 % of the distance travelled (limited: at most 25 %)",
         ),
-        # the upper end of the interval counts, and where there is none nobody can say
-        ([horizon(30, errors(5.0, 5.0, half=0.5))], "limited", "A good model has"),
-        ([horizon(30, errors(3.0, 5.0, half=None))], "too few windows", "5 of 3 logs are needed"),
-        # nor is a model that errs far more than another one of the run
-        ([horizon(30, errors(3.0, 5.0), best=errors(1.0, 4.0))], "limited", "A good model has"),
+        # the upper limit of the prediction interval counts; without one there is no rating
+        (
+            [horizon(30, errors(5.0, 5.0, half=0.5))],
+            "limited",
+            "Limited: the upper limit of its position error is 7.5 m, 12 % of",
+        ),
+        (
+            [horizon(30, errors(3.0, 5.0, half=None))],
+            "too few windows",
+            "at least 5 of 3 logs are needed",
+        ),
+        # a model with a far larger error than another one of the run is not good
+        (
+            [horizon(30, errors(3.0, 5.0), best=errors(1.0, 4.0))],
+            "limited",
+            "its position error is 3.0 times that of baseline",
+        ),
         (
             [horizon(60, errors(35.0, 160.0), windows=1)],
             "too few windows",
-            "1 window of 4 logs on test data cannot say",
+            "Too few test data for a rating: 1 free run of 4 logs",
         ),
-        # as near as the sensors tell is good, however short the way
-        ([horizon(0.5, errors(0.15, 0.3))], "good", "Up to 0.50 s ahead"),
+        # a large noise floor does not raise the limits
+        ([horizon(0.5, errors(0.15, 0.3))], "limited", "0.17 m, 16 % of the distance travelled"),
     ],
 )
-def test_a_model_is_good_in_metres_and_degrees(
-    entries: list[HorizonRow], expected: str, said: str
+def test_the_level_is_that_of_the_main_horizon(
+    entries: list[HorizonRow], expected: str, reason: str
 ) -> None:
-    given = evidence(limits_by_protocol=under(horizons=entries))
-    assert rate_model(given) == expected
-    assert any(said in sentence for sentence in write_verdict(given)[:3])
+    judged = evidence(limits_by_protocol=under(horizons=entries))
+    assert rate_model(judged) == expected
+    sentences = write_verdict(judged)
+    assert sentences[0].startswith("After a ")
+    assert reason in sentences[1]
 
 
-def test_the_verdict_names_what_stands_beside_and_for_what_it_holds() -> None:
+def test_the_verdict_names_references_other_horizons_and_the_free_runs() -> None:
     entries = [horizon(10, errors(0.5, 2.0)), horizon(30, errors(3.0, 5.0))]
     said = write_verdict(evidence(limits_by_protocol=under(horizons=entries)))
-    assert said[0].endswith(
-        "is off by 3.0 m (95 % prediction interval 2.7 to 3.3, 5.0 % of the 60 m sailed) and 5.0"
-        " deg (4.5 to 5.5)."
+    assert said[0] == (
+        "After a 30 s free run the position error of mlp is 3.0 m (95 % prediction interval 2.7 to"
+        " 3.3 m; 5.0 % of the 60 m travelled) and the heading error is 5.0 deg (95 % prediction"
+        " interval 4.5 to 5.5 deg)."
     )
-    assert said[1].startswith(
+    assert said[2].startswith(
         "Reference models (95 % prediction intervals): constant velocity 30 m (27 to 33) and 40 deg"
         " (36 to 44); baseline"
     )
-    assert said[1].endswith("noise floor (measured velocities, integrated) 0.10 m and 0.20 deg.")
-    assert said[2] == "At other times of these free runs: 0.50 m and 2.0 deg after 10 s."
-    assert said[3] == "It holds for 12 free runs (T30) of 4 logs at mean speeds of 1.5 to 2.5 m/s."
-    # no number has an exponent that a reader must work out
+    assert said[2].endswith("noise floor (measured velocities, integrated) 0.10 m and 0.20 deg.")
+    assert said[3] == "Other horizons: 0.50 m and 2.0 deg after 10 s (good)."
+    assert said[4] == (
+        "The errors are means of 12 free runs (T30) of 4 logs at mean speeds of 1.5 to 2.5 m/s."
+    )
+    # no number has an exponent
     limits = under(horizons=[horizon(100, errors(1234.0, 113.0))])
     lost = " ".join(write_verdict(evidence(limits_by_protocol=limits)))
-    assert "off by 1234 m (95 % prediction interval 1111 to 1357, 617 % of the 200 m" in lost
+    assert "is 1234 m (95 % prediction interval 1111 to 1357 m; 617 % of the 200 m" in lost
 
 
 def test_a_model_as_near_as_the_plant_itself_is_good() -> None:
@@ -310,18 +336,17 @@ def test_what_diverges_or_is_no_better_than_zero_is_never_good() -> None:
     assert rate_model(evidence(selected="unknown")) == ""
 
 
-def test_a_horizon_is_judged_by_the_protocol_of_most_windows() -> None:
-    few = protocol_limits(horizons=[horizon(10, errors(0.5, 2.0), windows=4)])
-    many = protocol_limits(
-        horizons=[horizon(10, errors(0.6, 2.0), windows=20), horizon(20, errors(1, 3))]
+def test_other_protocols_add_horizons_and_do_not_change_the_level() -> None:
+    main = protocol_limits(horizons=[horizon(10, errors(0.5, 2.0), windows=6)])
+    other = protocol_limits(
+        horizons=[horizon(10, errors(0.6, 2.0), windows=20), horizon(20, errors(9, 3))]
     )
-    given = evidence(limits_by_protocol={"T10": many, "T30": few})
-    assert rate_model(given) == "good"
-    said = write_verdict(given)
-    assert said[0].startswith("Up to 10 s ahead, where mlp is off by 0.60 m")
-    assert any("12 free runs" not in text and "20 free runs (T10)" in text for text in said)
-    # a horizon that only another protocol has is not asked for
-    assert "20 s" not in " ".join(said)
+    judged = evidence(limits_by_protocol={"whole": other, "T30": main})
+    assert rate_model(judged) == "good"
+    text = " ".join(write_verdict(judged))
+    assert "After a 10 s free run the position error of mlp is 0.50 m" in text
+    assert "6 free runs (T30)" in text
+    assert "Other horizons: 9.0 m and 3.0 deg after 20 s (limited)." in text
 
 
 def test_a_model_that_the_data_cannot_tell_from_zero_is_not_to_be_used() -> None:
@@ -330,7 +355,9 @@ def test_a_model_that_the_data_cannot_tell_from_zero_is_not_to_be_used() -> None
         limits_by_protocol=under(compared=compared, horizons=[horizon(30, errors(1, 1))])
     )
     assert rate_model(given) == "do not use"
-    assert write_verdict(given)[0].startswith("NO BETTER THAN CONSTANT VELOCITY")
+    text = " ".join(write_verdict(given))
+    assert "are not significantly smaller than those of constant velocity (0.500)" in text
+    assert "lower than" not in text
     # too few logs for an interval tell neither
     unknown = under(compared={"mlp": {"constant_velocity": difference(-0.01, None)}})
     assert rate_model(evidence(limits_by_protocol=unknown)) == "limited"
@@ -362,9 +389,8 @@ def test_windows_unlike_those_that_calibrated_the_intervals_are_named() -> None:
 def test_an_old_run_without_these_files_still_has_a_verdict() -> None:
     said = write_verdict(evidence(selection=None, limits_by_protocol={}))
     assert said == [
-        "On test data model mlp is 60 % better than constant velocity and 20 % better than the"
-        " baseline; its"
-        " NRMSE is 0.200."
+        "On test data the velocity errors of mlp (NRMSE 0.200) are 60 % lower than those of"
+        " constant velocity and 20 % lower than those of the baseline."
     ]
 
 
@@ -374,6 +400,13 @@ def test_a_split_that_is_too_short_is_judged_by_a_shorter_protocol() -> None:
     assert order_protocols(short, "test", "T100") == ["T30", "T10", "T100"]
     assert order_protocols([*short, row(0.1, protocol="T100")], "test", "T100")[0] == "T100"
     assert order_protocols(short, "validation", "T100")[0] == "T100"
+
+
+def test_the_main_protocol_has_windows_of_equal_length() -> None:
+    rows = [row(0.1, protocol=name) for name in ("manoeuvre", "T30", "T10")]
+    assert order_protocols(rows, "test", "manoeuvre")[0] == "manoeuvre"
+    assert order_protocols(rows, "test", "manoeuvre", {"T30", "T10"})[0] == "T30"
+    assert order_protocols(rows, "test", "T10", {"T30", "T10"})[0] == "T10"
 
 
 def excitation(state: str, **change: Any) -> ExcitationFile:
@@ -425,7 +458,8 @@ def test_velocities_that_leave_the_positions_make_no_model_good() -> None:
     limits = under(horizons=[contradicting])
     assert rate_model(evidence(limits_by_protocol=limits)) == "limited"
     sentences = " ".join(write_verdict(evidence(limits_by_protocol=limits)))
-    assert "integrated, leave the measured positions by 21 % of the way" in sentences
+    assert "the measured velocities do not reproduce the measured track" in sentences
+    assert "(21 % of the distance travelled; good: at most 10 %)" in sentences
 
 
 @pytest.mark.parametrize(
@@ -447,6 +481,14 @@ def test_a_useful_model_is_significantly_better_than_constant_velocity_in_both(
     judged = evidence(limits_by_protocol=under(horizons=[entry]))
     assert rate_model(judged) == level
     text = " ".join(write_verdict(judged))
-    assert ("significantly better than constant velocity in position and heading" in text) == (
+    assert ("is not significantly smaller than that of constant velocity" in text) == (
         level == "do not use"
     )
+
+
+def test_without_a_paired_interval_prediction_intervals_must_not_overlap() -> None:
+    """Constant velocity has 30 m (27 to 33 m); an error of 26 m is smaller, not significantly."""
+    for position, level in ((3.0, "good"), (26.0, "do not use")):
+        entry = horizon(30, errors(position, 5.0)).model_copy(update={"sailed": 300.0})
+        judged = evidence(limits_by_protocol=under(horizons=[entry]))
+        assert rate_model(judged) == level

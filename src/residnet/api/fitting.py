@@ -30,6 +30,7 @@ from residnet.core.processes import worker_limit
 from residnet.core.progress import ProgressCallback
 from residnet.core.trust import trusting
 from residnet.evaluation.metrics import build_metrics_table, iterate_rollout_columns, mark_selected
+from residnet.evaluation.protocol import WindowProtocol
 from residnet.evaluation.records import ExcitationFile, MetricsRow
 from residnet.evaluation.selection import Selection
 from residnet.evaluation.verdict import VerdictEvidence, order_protocols, write_verdict
@@ -351,7 +352,13 @@ class Models(dict[str, Model]):
         """
         split = "test" if "test" in self.runs else "validation"
         evaluation = self.runs[split].evaluation
-        protocol = order_protocols(evaluation.rows, split, self.settings.evaluation.selection)[0]
+        settings = self.settings.evaluation
+        fixed_length = [
+            name
+            for name, protocol in settings.protocols.items()
+            if isinstance(protocol, WindowProtocol)
+        ]
+        protocol = order_protocols(evaluation.rows, split, settings.selection, fixed_length)[0]
         rows_by_model = {
             row.model: row
             for row in evaluation.rows

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -30,15 +30,22 @@ UNSEEN_SPLITS = ("test", "external")
 """Splits that are not used in a fit."""
 
 
-def order_protocols(rows: Sequence[MetricsRow], split: str, selection_protocol: str) -> list[str]:
+def order_protocols(
+    rows: Sequence[MetricsRow],
+    split: str,
+    selection_protocol: str,
+    fixed_length: Collection[str] = (),
+) -> list[str]:
     """Return the protocols of rows, first the main one of a split.
 
-    The main protocol is that of the model selection, unless the logs of the split are too short.
+    The main protocol has windows of equal length, so that all its free runs have one horizon. Among
+    such protocols it is that of the model selection, unless the logs of the split are too short.
 
     Args:
         rows: rows of metrics.json.
         split: the split.
         selection_protocol: protocol of the model selection; empty without a selection.
+        fixed_length: names of the protocols with windows of equal length.
     """
     protocol_names = dict.fromkeys(row.protocol for row in rows)
     protocols_of_split = {row.protocol for row in rows if row.split == split}
@@ -46,6 +53,7 @@ def order_protocols(rows: Sequence[MetricsRow], split: str, selection_protocol: 
         protocol_names,
         key=lambda protocol_name: (
             protocol_name not in protocols_of_split,
+            protocol_name not in fixed_length,
             protocol_name != selection_protocol,
         ),
     )
@@ -63,7 +71,7 @@ class VerdictEvidence:
         selection: contents of selection.json; None without a selection.
         limits_by_protocol: contents of limits.json for the split by protocol; may be empty.
         data_quality_text: one sentence on the data checks; empty without them.
-        protocol: protocol of the rows.
+        protocol: main protocol, that of the rows.
         one_sided_text: finding of the data checks on logs without turns to both sides; free runs on
             such logs cannot validate the turning motion.
         excitation: contents of excitation.json; None for runs of earlier versions.
@@ -120,52 +128,55 @@ _MIN_WINDOWS = 5
 MIN_LOGS_FOR_INTERVAL = 3
 """Smallest number of logs for an interval, and therefore for a rating."""
 _MAX_DISTANCE_SHARE = 0.10
-"""Largest position error of a good model, as a share of the distance travelled."""
+"""Largest position error of a good model, as a share of the distance travelled.
+
+The same limit applies to the noise floor: beyond it velocities and positions are not one motion.
+"""
 _MAX_ANGLE_ERROR = math.radians(10.0)
 """Largest heading error of a good model in rad.
 
-Both limits apply to the upper limit of the prediction interval; twice the noise floor is allowed in
-any case. The values are a convention of residnet, and the verdict states them.
+Both limits apply to the upper limit of the prediction interval. The values are a convention of
+residnet, and the verdict states them.
 """
 _MAX_LIMITED_DISTANCE_SHARE = 0.25
 """Largest position error of a model of limited use, as a share of the distance travelled."""
 _MAX_LIMITED_ANGLE_ERROR = math.radians(30.0)
-"""Largest heading error of a model of limited use in rad; it must be better than constant velocity,
-too.
-"""
+_MAX_LIMITED_DISTANCE_SHARE = 0.25
+"""Largest position error of a model of limited use, as a share of the distance travelled."""
+_MAX_LIMITED_ANGLE_ERROR = math.radians(30.0)
+"""Largest heading error of a model of limited use in rad."""
 _POSE_ERROR_SUFFIXES = {"depth": " of depth", "attitude": " of attitude"}
 """Suffixes of pose errors other than horizontal position and heading."""
 _MAX_RATIO_TO_BEST = 1.5
 """Largest ratio of the error of a good model to that of the best model of the run."""
+_MIN_SHARE_OF_WINDOWS = 0.5
+"""Smallest share of the windows of the main protocol that reach the main horizon."""
 
 
 def write_verdict(evidence: VerdictEvidence) -> list[str]:
     """Return the verdict sentence by sentence, the most important first.
 
-    Position and heading errors of the selected model at the horizons, findings of the data checks,
-    comparison with constant velocity, baseline and noise floor, number of windows and range of
-    speeds, velocity errors, failed checks, reason of the selection, and the share of data outside
-    the training range. Sentences without data are omitted.
+    Position and heading errors of the selected model at the main horizon, the reasons for its
+    level, findings of the data checks, reference models and noise floor, other horizons, number of
+    windows and range of speeds, velocity errors, failed checks, reason of the selection, and the
+    share of data outside the training range. Sentences without data are omitted.
     """
-    lead_sentence, *horizon_sentences = (
-        [compare_velocity_errors(evidence)] if is_useless(evidence) else describe_horizons(evidence)
-    )
-    limitations = [
-        evidence.logs_of_fit_text,
-        evidence.one_sided_text,
-        *list_unidentifiable_inputs(evidence),
+    main = main_horizon(evidence)
+    limitation_sentences = [
+        f"The rating is at most limited, because {limitation}."
+        for limitation in list_limitations(evidence)
     ]
     sentences = [
-        lead_sentence,
         *(
-            f"The rating is at most limited, because {limitation}."
-            for limitation in limitations
-            if limitation
+            [compare_velocity_errors(evidence), *limitation_sentences]
+            if main is None
+            else describe_main_horizon(evidence, main)
         ),
-        describe_unexcited(evidence),
         evidence.data_quality_text,
+        describe_unexcited(evidence),
         evidence.current_text,
-        *horizon_sentences,
+        *([] if main is None else describe_references(evidence, main)),
+        "" if main is None or is_useless(evidence) else compare_velocity_errors(evidence),
         describe_soundness(evidence),
         "" if evidence.selection is None else evidence.selection.reason,
         describe_extrapolation(evidence),
@@ -175,22 +186,40 @@ def write_verdict(evidence: VerdictEvidence) -> list[str]:
 
 
 def rate_model(evidence: VerdictEvidence) -> str:
-    """Return a key of `LEVEL_TEXTS`; empty if the selected model has no free runs."""
+    """Return the level at the main horizon, a key of `LEVEL_TEXTS`.
+
+    Empty if the selected model has no free runs. Without known pose errors, a model whose velocity
+    errors are smaller than those of constant velocity is of limited use.
+    """
     if is_useless(evidence):
         return DO_NOT_USE
     if evidence.selected not in evidence.rows_by_model:
         return ""
-    horizons = known_horizons(evidence)
-    if horizons and not any(_has_enough_data(evidence, horizon.row) for horizon in horizons):
+    main = main_horizon(evidence)
+    return LIMITED_LEVEL if main is None else rate_horizon(evidence, main.row)
+
+
+def rate_horizon(evidence: VerdictEvidence, row: HorizonRow) -> str:
+    """Return the level of the selected model at one horizon, a key of `LEVEL_TEXTS`."""
+    if is_useless(evidence):
+        return DO_NOT_USE
+    if not _is_sufficient(row, evidence.selected):
         return TOO_FEW_WINDOWS
-    has_limitation = (
-        bool(evidence.logs_of_fit_text)
-        or bool(evidence.one_sided_text)
-        or bool(list_unidentifiable_inputs(evidence))
-    )
-    if longest_good_horizon(evidence) and not has_limitation:
-        return GOOD_LEVEL
-    return LIMITED_LEVEL if not horizons or longest_limited_horizon(evidence) else DO_NOT_USE
+    if list_shortfalls_of_limited(evidence, row):
+        return DO_NOT_USE
+    if list_shortfalls_of_good(evidence, row) or list_limitations(evidence):
+        return LIMITED_LEVEL
+    return GOOD_LEVEL
+
+
+def list_limitations(evidence: VerdictEvidence) -> list[str]:
+    """Return facts on the logs by which no model is rated good at any horizon."""
+    limitations = [
+        evidence.logs_of_fit_text,
+        evidence.one_sided_text,
+        *list_unidentifiable_inputs(evidence),
+    ]
+    return [limitation for limitation in limitations if limitation]
 
 
 def list_unidentifiable_inputs(evidence: VerdictEvidence) -> list[str]:
@@ -237,29 +266,56 @@ class ProtocolHorizon(NamedTuple):
 def known_horizons(evidence: VerdictEvidence) -> list[ProtocolHorizon]:
     """Return the horizons with known errors of the selected model, in ascending order.
 
-    A horizon may occur in several protocols; the one with the most windows is used.
+    A horizon of the main protocol has the free runs of the verdict; a horizon that only other
+    protocols have is that of the protocol with the most windows.
     """
     horizons: dict[float, ProtocolHorizon] = {}
-    # the protocol of the rows first, so that others only add horizons or more windows
+    # the main protocol comes first, so that others only add horizons
     for protocol in sorted(evidence.limits_by_protocol, key=lambda name: name != evidence.protocol):
         for row in evidence.limits_by_protocol[protocol].horizons:
             if evidence.selected not in row.models:
                 continue
             known_horizon = horizons.get(row.seconds)
-            if known_horizon is None:
-                # the protocol of the verdict determines the horizons, others only add windows
-                is_used = protocol == evidence.protocol
-            else:
-                is_used = row.windows > known_horizon.row.windows
-            if is_used:
+            if known_horizon is None or (
+                known_horizon.protocol != evidence.protocol
+                and row.windows > known_horizon.row.windows
+            ):
                 horizons[row.seconds] = ProtocolHorizon(protocol, row)
     return [horizons[seconds] for seconds in sorted(horizons)]
 
 
-def _has_enough_data(evidence: VerdictEvidence, row: HorizonRow) -> bool:
+def main_horizon(evidence: VerdictEvidence) -> ProtocolHorizon | None:
+    """Return the horizon of badge, first sentence, table and picture; None without pose errors."""
+    return find_main_horizon(evidence.limits_by_protocol, evidence.protocol, evidence.selected)
+
+
+def find_main_horizon(
+    limits_by_protocol: Mapping[str, ProtocolLimits], protocol: str, model: str
+) -> ProtocolHorizon | None:
+    """Return the longest horizon of the main protocol that at least half of its windows reach.
+
+    This is the length of the windows if these are equally long. Horizons with enough data are
+    preferred. None if the errors of the model are unknown.
+
+    Args:
+        limits_by_protocol: contents of limits.json for a split.
+        protocol: the main protocol.
+        model: the model of the verdict.
+    """
+    limits = limits_by_protocol.get(protocol)
+    rows = [] if limits is None else [row for row in limits.horizons if model in row.models]
+    if not rows:
+        return None
+    min_windows = _MIN_SHARE_OF_WINDOWS * max(row.windows for row in rows)
+    frequent_rows = [row for row in rows if row.windows >= min_windows]
+    sufficient_rows = [row for row in frequent_rows if _is_sufficient(row, model)]
+    longest = max(sufficient_rows or frequent_rows, key=lambda row: row.seconds)
+    return ProtocolHorizon(protocol, longest)
+
+
+def _is_sufficient(row: HorizonRow, model: str) -> bool:
     """Return whether a horizon has enough windows, and logs for an interval, for a rating."""
-    has_intervals = all(row.models[evidence.selected].intervals.values())
-    return has_intervals and row.windows >= _MIN_WINDOWS
+    return all(row.models[model].intervals.values()) and row.windows >= _MIN_WINDOWS
 
 
 def _protocol_limits(evidence: VerdictEvidence) -> ProtocolLimits | None:
@@ -267,76 +323,103 @@ def _protocol_limits(evidence: VerdictEvidence) -> ProtocolLimits | None:
     return evidence.limits_by_protocol.get(evidence.protocol)
 
 
-def longest_good_horizon(evidence: VerdictEvidence) -> float:
-    """Return the horizon in s up to which the selected model is good; 0 for none."""
-    # one divergence on unseen data excludes the model at any horizon
-    if evidence.rows_by_model[evidence.selected].diverged and evidence.split in UNSEEN_SPLITS:
-        return 0.0
-    plant_models = {name for name, row in evidence.rows_by_model.items() if row.kind == PLANT}
-    longest_horizon = 0.0
-    for _, row in known_horizons(evidence):
-        if not _has_enough_data(evidence, row):
-            return longest_horizon
-        if contradicts_positions(row):
-            continue
-        errors_by_model = {name: errors.by_name for name, errors in row.models.items()}
-        selected_errors = errors_by_model[evidence.selected]
-        # the errors of the plant itself, started from noisy measured states, are also a noise floor
-        noise_floors = [
-            row.floor.by_name,
-            *(errors_by_model[name] for name in plant_models & set(errors_by_model)),
-        ]
-        rival_models = set(errors_by_model) - {evidence.selected} - plant_models
-        for error_name, interval in row.models[evidence.selected].intervals.items():
-            assert interval is not None, "checked by _has_enough_data"
-            error_limit = (
-                _MAX_ANGLE_ERROR
-                if POSE_ERROR_UNITS[error_name] == "rad"
-                else _MAX_DISTANCE_SHARE * row.sailed
-            )
-            rival_errors = [errors_by_model[name][error_name] for name in rival_models]
-            # errors near the noise floor are not the fault of the model
-            twice_noise_floor = 2.0 * max(noise_floor[error_name] for noise_floor in noise_floors)
-            selected_error = selected_errors[error_name]
-            # a model that is far worse than another one of the run should not be called good
-            is_near_best = selected_error <= max(
-                twice_noise_floor,
-                _MAX_RATIO_TO_BEST * min(rival_errors, default=selected_error),
-            )
-            if not (
-                is_near_best
-                and is_better_than_constant_velocity(evidence, row, error_name)
-                and interval[1] <= max(error_limit, twice_noise_floor)
-            ):
-                return longest_horizon
-        longest_horizon = row.seconds
-    return longest_horizon
+def list_shortfalls_of_good(evidence: VerdictEvidence, row: HorizonRow) -> list[str]:
+    """Return the criteria of a good model that the selected model does not meet at a horizon.
 
-
-def longest_limited_horizon(evidence: VerdictEvidence) -> float:
-    """Return the horizon in s up to which the selected model is of limited use; 0 for none.
-
-    All pose errors must be significantly smaller than those of the constant-velocity model, and
-    within the limits of a limited model up to the upper end of their prediction intervals.
+    The horizon must have enough data for a rating.
     """
-    longest_horizon = 0.0
-    for _, row in known_horizons(evidence):
-        if not _has_enough_data(evidence, row):
-            return longest_horizon
-        for error_name, interval in row.models[evidence.selected].intervals.items():
-            assert interval is not None, "checked by _has_enough_data"
-            error_limit = (
-                _MAX_LIMITED_ANGLE_ERROR
-                if POSE_ERROR_UNITS[error_name] == "rad"
-                else _MAX_LIMITED_DISTANCE_SHARE * row.sailed
+    shortfalls = list_shortfalls(evidence, row, _MAX_DISTANCE_SHARE, _MAX_ANGLE_ERROR, GOOD_LEVEL)
+    selected_row = evidence.rows_by_model[evidence.selected]
+    # one divergence on unseen data excludes the model at any horizon
+    if selected_row.diverged and evidence.split in UNSEEN_SPLITS:
+        shortfalls.append(f"{selected_row.diverged} of {selected_row.windows} free runs diverged")
+    if contradicts_positions(row):
+        floor = row.floor.position or 0.0
+        shortfalls.append(
+            "the measured velocities do not reproduce the measured track: integrated over"
+            f" {format_number(row.seconds, 2)} s they deviate by {format_number(floor, 2)} m"
+            f" ({100.0 * floor / row.sailed:.0f} % of the distance travelled;"
+            f" good: at most {100.0 * _MAX_DISTANCE_SHARE:.0f} %); check frames, units and clocks"
+        )
+    plant_models = {name for name, other in evidence.rows_by_model.items() if other.kind == PLANT}
+    errors_by_model = {name: errors.by_name for name, errors in row.models.items()}
+    # the errors of the plant itself, started from noisy measured states, are also a noise floor
+    noise_floors = [
+        row.floor.by_name,
+        *(errors_by_model[name] for name in plant_models & set(errors_by_model)),
+    ]
+    rival_models = set(errors_by_model) - {evidence.selected} - plant_models
+    for error_name, error in errors_by_model[evidence.selected].items():
+        # differences near the noise floor are not the fault of a model
+        twice_noise_floor = 2.0 * max(floor[error_name] for floor in noise_floors)
+        best_model = min(
+            rival_models,
+            key=lambda name: (errors_by_model[name][error_name], name),
+            default=evidence.selected,
+        )
+        best_error = errors_by_model[best_model][error_name]
+        # a model that is far worse than another one of the run should not be called good
+        if error > max(twice_noise_floor, _MAX_RATIO_TO_BEST * best_error):
+            shortfalls.append(
+                f"its {error_name} error is {format_number(error / best_error, 2)} times that of"
+                f" {best_model}"
             )
-            twice_noise_floor = 2.0 * row.floor.by_name[error_name]
-            if interval[1] > max(error_limit, twice_noise_floor):
-                return longest_horizon
-            if not is_better_than_constant_velocity(evidence, row, error_name):
-                return longest_horizon
-        longest_horizon = row.seconds
-    return longest_horizon
+    return shortfalls
+
+
+def list_shortfalls_of_limited(evidence: VerdictEvidence, row: HorizonRow) -> list[str]:
+    """Return the criteria of a model of limited use that the selected model does not meet.
+
+    The horizon must have enough data for a rating.
+    """
+    return list_shortfalls(
+        evidence, row, _MAX_LIMITED_DISTANCE_SHARE, _MAX_LIMITED_ANGLE_ERROR, LIMITED_LEVEL
+    )
+
+
+def list_shortfalls(
+    evidence: VerdictEvidence,
+    row: HorizonRow,
+    max_distance_share: float,
+    max_angle_error: float,
+    level: str,
+) -> list[str]:
+    """Return which pose errors are too large for a level, or not better than constant velocity.
+
+    Args:
+        evidence: data of the verdict.
+        row: the horizon.
+        max_distance_share: limit of errors in m, as a share of the distance travelled.
+        max_angle_error: limit of errors in rad.
+        level: name of the level in the texts.
+    """
+    shortfalls = []
+    for error_name, interval in row.models[evidence.selected].intervals.items():
+        assert interval is not None, "checked by _is_sufficient"
+        if not is_better_than_constant_velocity(evidence, row, error_name):
+            shortfalls.append(
+                f"its {error_name} error is not significantly smaller than that of constant"
+                " velocity"
+            )
+        is_angle = POSE_ERROR_UNITS[error_name] == "rad"
+        if interval[1] > (max_angle_error if is_angle else max_distance_share * row.sailed):
+            share_text = (
+                ""
+                if is_angle
+                else f", {format_number(100.0 * interval[1] / row.sailed, 2)} % of the distance"
+                " travelled"
+            )
+            limit_text = (
+                f"{math.degrees(max_angle_error):.0f} deg"
+                if is_angle
+                else f"{100.0 * max_distance_share:.0f} %"
+            )
+            shortfalls.append(
+                f"the upper limit of its {error_name} error is"
+                f" {format_pose_error(error_name, interval[1])}{share_text}"
+                f" ({level}: at most {limit_text})"
+            )
+    return shortfalls
 
 
 def is_better_than_constant_velocity(
@@ -344,8 +427,8 @@ def is_better_than_constant_velocity(
 ) -> bool:
     """Return whether a pose error is significantly smaller than that of constant velocity.
 
-    Without a confidence interval of the difference the mean errors decide. True without a
-    constant-velocity model.
+    Without a confidence interval of the difference, the prediction intervals must not overlap. True
+    without a constant-velocity model.
     """
     reference_errors = row.models.get(CONSTANT_VELOCITY)
     if reference_errors is None or evidence.selected == CONSTANT_VELOCITY:
@@ -353,120 +436,126 @@ def is_better_than_constant_velocity(
     changes = row.change_from_constant_velocity.get(evidence.selected, {})
     if (interval := changes.get(error_name)) is not None:
         return interval[1] < 0.0
-    selected_error = row.models[evidence.selected].by_name[error_name]
-    return selected_error < reference_errors.by_name[error_name]
+    selected_interval = row.models[evidence.selected].intervals[error_name]
+    reference_interval = reference_errors.intervals[error_name]
+    if selected_interval is None or reference_interval is None:
+        return False
+    return selected_interval[1] < reference_interval[0]
 
 
 def contradicts_positions(row: HorizonRow) -> bool:
-    """Return whether measured velocities, integrated, leave the positions by a tenth of the way.
+    """Return whether the noise floor exceeds a tenth of the distance travelled.
 
     Then velocities and positions are not one motion, and no model is good by them.
     """
     return (row.floor.position or 0.0) > _MAX_DISTANCE_SHARE * row.sailed
 
 
-def describe_horizons(evidence: VerdictEvidence) -> list[str]:
-    """Return sentences on pose errors of the selected model and of the reference models."""
-    horizons = known_horizons(evidence)
-    if not horizons:
-        return [compare_velocity_errors(evidence)]
-    error_names = list(horizons[0].row.floor.by_name)
-    sufficient_horizons = [
-        horizon for horizon in horizons if _has_enough_data(evidence, horizon.row)
-    ]
-    longest_horizon = longest_good_horizon(evidence) if sufficient_horizons else 0.0
-    # the horizon of the level, so that badge and sentence are about the same free runs
-    level_horizon = longest_horizon or longest_limited_horizon(evidence)
-    main_horizon = next(
-        (horizon for horizon in horizons if horizon.row.seconds == level_horizon),
-        (sufficient_horizons or horizons)[-1],
+def describe_main_horizon(evidence: VerdictEvidence, main: ProtocolHorizon) -> list[str]:
+    """Return the errors of the selected model at the main horizon, and the reasons for its level.
+
+    Args:
+        evidence: data of the verdict.
+        main: the main horizon.
+    """
+    row = main.row
+    errors_text = (
+        f"After a {format_number(row.seconds, 2)} s free run"
+        f" {_describe_errors(evidence.selected, row)}."
     )
-    main_row = main_horizon.row
-    error_text = _format_errors_with_intervals(main_row.models[evidence.selected], main_row.sailed)
-    horizon_text = f"{format_number(main_row.seconds, 2)} s ahead"
-    criterion_sentences = []
-    if not sufficient_horizons:
-        lead_sentence = (
-            f"{format_count(main_row.windows, 'window')} of"
-            f" {format_count(main_row.logs, 'log')} on"
-            f" {evidence.data_name} cannot say how good {evidence.selected} is ({_MIN_WINDOWS} of"
-            f" {MIN_LOGS_FOR_INTERVAL} logs are needed); {horizon_text} it is off by {error_text}."
-        )
-    elif longest_horizon:
-        lead_sentence = f"Up to {horizon_text}, where {evidence.selected} is off by {error_text}."
-    else:
-        lead_sentence = (
-            f"{horizon_text[0].upper()}{horizon_text[1:]} {evidence.selected} is off"
-            f" by {error_text}."
-        )
-        limits_by_unit = {
-            "m": f"{100.0 * _MAX_DISTANCE_SHARE:.0f} % of the way",
-            "rad": f"{math.degrees(_MAX_ANGLE_ERROR):.0f} deg",
-        }
-        good_limits_text = join_list(
-            list(
-                dict.fromkeys(
-                    limits_by_unit[POSE_ERROR_UNITS[error_name]] for error_name in error_names
-                )
-            )
-        )
-        criterion_sentences = [
-            f"A good model has errors within {good_limits_text} up to the upper end of the"
-            " prediction interval, or within twice the noise floor, no diverged window, and errors"
-            " near those of the best model of the run."
+    error_names = list(row.models[evidence.selected].by_name)
+    both_errors = f"{join_list(error_names)} errors"
+    level = rate_horizon(evidence, row)
+    if evidence.selected == CONSTANT_VELOCITY or is_useless(evidence):
+        return [errors_text, f"Do not use: {_explain_uselessness(evidence)}."]
+    if level == TOO_FEW_WINDOWS:
+        return [
+            errors_text,
+            f"Too few {evidence.data_name} for a rating: {format_count(row.windows, 'free run')}"
+            f" of {format_count(row.logs, 'log')}, at least {_MIN_WINDOWS} of"
+            f" {MIN_LOGS_FOR_INTERVAL} logs are needed.",
         ]
-    if sufficient_horizons and not level_horizon:
-        criterion_sentences.append(
-            "A model of limited use has errors within"
-            f" {100.0 * _MAX_LIMITED_DISTANCE_SHARE:.0f} % of the way and"
-            f" {math.degrees(_MAX_LIMITED_ANGLE_ERROR):.0f} deg, and is significantly better than"
-            " constant velocity in position and heading: do not use this one."
+    if level == DO_NOT_USE:
+        return [errors_text, f"Do not use: {'; '.join(list_shortfalls_of_limited(evidence, row))}."]
+    if shortfalls := [*list_shortfalls_of_good(evidence, row), *list_limitations(evidence)]:
+        return [errors_text, f"Limited: {'; '.join(shortfalls)}."]
+    limits_by_unit = {
+        "m": f"{100.0 * _MAX_DISTANCE_SHARE:.0f} % of the distance travelled",
+        "rad": f"{math.degrees(_MAX_ANGLE_ERROR):.0f} deg",
+    }
+    limits = dict.fromkeys(limits_by_unit[POSE_ERROR_UNITS[name]] for name in error_names)
+    comparison = (
+        f", {both_errors} significantly smaller than those of constant velocity"
+        if CONSTANT_VELOCITY in row.models
+        else ""
+    )
+    return [
+        errors_text,
+        f"Good: upper limits within {join_list(list(limits))}{comparison}, no divergence.",
+    ]
+
+
+def _describe_errors(model: str, row: HorizonRow) -> str:
+    """Return a clause with the pose errors of a model, each with its prediction interval."""
+    texts = []
+    errors = row.models[model]
+    for error_name, error in errors.by_name.items():
+        unit, factor = display_unit(POSE_ERROR_UNITS[error_name])
+        details = []
+        if interval := errors.intervals[error_name]:
+            details.append(
+                f"95 % prediction interval {format_interval(interval, factor, 2)} {unit}"
+            )
+        if error_name == "position" and row.sailed > 0.0:
+            details.append(
+                f"{format_number(100.0 * error / row.sailed, 2)} % of the"
+                f" {format_number(row.sailed, 2)} m travelled"
+            )
+        text = (
+            f"the {error_name} error{'' if texts else f' of {model}'} is"
+            f" {format_number(factor * error, 2)} {unit}"
         )
+        texts.append(text + (f" ({'; '.join(details)})" if details else ""))
+    return join_list(texts)
+
+
+def describe_references(evidence: VerdictEvidence, main: ProtocolHorizon) -> list[str]:
+    """Return the errors of the reference models, those at other horizons, and the free runs.
+
+    Args:
+        evidence: data of the verdict.
+        main: the main horizon.
+    """
+    row = main.row
     reference_labels = {CONSTANT_VELOCITY: "constant velocity", evidence.baseline: "baseline"}
-    reference_texts = [
-        f"{label} {_format_errors_with_intervals(main_row.models[name])}"
+    references = [
+        f"{label} {_format_errors_with_intervals(row.models[name])}"
         for name, label in reference_labels.items()
-        if name in main_row.models and name != evidence.selected
+        if name in row.models and name != evidence.selected
     ]
     # a pose that was itself integrated from the velocities has only rounding errors
-    has_noise_floor = any(error > 1e-9 for error in main_row.floor.by_name.values())
-    noise_floor_text = (
-        f"noise floor (measured velocities, integrated) {_format_pose_errors(main_row.floor)}"
-    )
+    if any(error > 1e-9 for error in row.floor.by_name.values()):
+        references.append(
+            f"noise floor (measured velocities, integrated) {_format_pose_errors(row.floor)}"
+        )
     other_horizons = [
-        f"{_format_pose_errors(row.models[evidence.selected])} after {row.seconds:.4g} s"
-        for _, row in horizons
-        if row is not main_row
+        f"{_format_pose_errors(horizon.row.models[evidence.selected])} after"
+        f" {horizon.row.seconds:.4g} s ({rate_horizon(evidence, horizon.row)})"
+        for horizon in known_horizons(evidence)
+        if horizon.row.seconds != row.seconds
     ]
-    has_position = "position" in error_names
-    scope_sentence = (
-        f"It holds for {format_count(main_row.windows, 'free run')}"
-        f" ({main_horizon.protocol}) of"
-        f" {format_count(main_row.logs, 'log')}"
-        + f" at mean speeds of {format_number(main_row.slowest, 2)} to"
-        f" {format_number(main_row.fastest, 2)} m/s" * has_position + "."
+    speeds = (
+        f" at mean speeds of {format_number(row.slowest, 2)} to {format_number(row.fastest, 2)} m/s"
+        if "position" in row.models[evidence.selected].by_name
+        else ""
     )
-    contradiction_sentences = []
-    if contradicts_positions(main_row):
-        share = (main_row.floor.position or 0.0) / main_row.sailed
-        contradiction_sentences = [
-            "The measured velocities, integrated, leave the measured positions by"
-            f" {100.0 * share:.0f} % of the way: check frames, units and clocks of both before any"
-            " model is used."
-        ]
     return [
-        lead_sentence,
-        *contradiction_sentences,
-        f"Reference models (95 % prediction intervals):"
-        f" {'; '.join([*reference_texts, *([noise_floor_text] if has_noise_floor else [])])}.",
-        *criterion_sentences,
-        *(
-            [f"At other times of these free runs: {'; '.join(other_horizons)}."]
-            if other_horizons
-            else []
-        ),
-        scope_sentence,
-        compare_velocity_errors(evidence),
+        f"Reference models (95 % prediction intervals): {'; '.join(references)}."
+        if references
+        else "",
+        f"Other horizons: {'; '.join(other_horizons)}." if other_horizons else "",
+        f"The errors are means of {format_count(row.windows, 'free run')} ({main.protocol}) of"
+        f" {format_count(row.logs, 'log')}{speeds}.",
     ]
 
 
@@ -482,25 +571,15 @@ def _format_pose_errors(errors: PoseErrors) -> str:
     return join_list([format_pose_error(name, error) for name, error in errors.by_name.items()])
 
 
-def _format_errors_with_intervals(errors: PoseErrors, distance_travelled: float = 0.0) -> str:
-    """Return errors of position and heading with their intervals as text."""
+def _format_errors_with_intervals(errors: PoseErrors) -> str:
+    """Return errors of position and heading, each with the limits of its prediction interval."""
     texts: list[str] = []
     for error_name, error in errors.by_name.items():
         interval = errors.intervals[error_name]
-        unit_factor = display_unit(POSE_ERROR_UNITS[error_name]).factor
-        details = [format_interval(interval, unit_factor, 2)] if interval else []
-        if details and distance_travelled > 0.0 and not texts:
-            # stated once; the interval of the heading is of the same kind
-            details[0] = f"95 % prediction interval {details[0]}"
-        if error_name == "position" and distance_travelled > 0.0:
-            details.append(
-                f"{format_number(100.0 * error / distance_travelled, 2)} % of"
-                f" the {format_number(distance_travelled, 2)} m sailed"
-            )
-        error_text = format_pose_error(error_name, error)
-        texts.append(error_text + (f" ({', '.join(details)})" if details else ""))
-    has_intervals = all(errors.intervals.values()) or distance_travelled == 0.0
-    return join_list(texts) + ("" if has_intervals else ", from too few logs for an interval")
+        factor = display_unit(POSE_ERROR_UNITS[error_name]).factor
+        limits = f" ({format_interval(interval, factor, 2)})" if interval else ""
+        texts.append(format_pose_error(error_name, error) + limits)
+    return join_list(texts)
 
 
 def list_model_objections(evidence: VerdictEvidence) -> list[str]:
@@ -534,59 +613,62 @@ def is_useless(evidence: VerdictEvidence) -> bool:
     )
 
 
+def _explain_uselessness(evidence: VerdictEvidence) -> str:
+    """Return why the selected model is not shown to be better than constant velocity."""
+    if evidence.selected == CONSTANT_VELOCITY:
+        return (
+            "no model of this run is better than constant velocity, which holds the initial"
+            " velocities of each free run"
+        )
+    selected_row = evidence.rows_by_model[evidence.selected]
+    reference_nrmse = evidence.rows_by_model[CONSTANT_VELOCITY].mean_nrmse
+    comparison = (
+        "not significantly smaller than"
+        if selected_row.mean_nrmse <= reference_nrmse
+        else "larger than"
+    )
+    return (
+        f"on {evidence.data_name} the velocity errors of {evidence.selected}"
+        f" (NRMSE {format_number(selected_row.mean_nrmse)}{_diverged_suffix(selected_row)}) are"
+        f" {comparison} those of constant velocity ({format_number(reference_nrmse)})"
+        f"{_format_paired_interval(evidence, CONSTANT_VELOCITY)}"
+    )
+
+
 def compare_velocity_errors(evidence: VerdictEvidence) -> str:
-    """Return a sentence that compares the velocity errors with constant velocity and the
-    baseline.
-    """
+    """Return a sentence on the velocity errors, against constant velocity and the baseline."""
     model_name = evidence.selected
     data_name = evidence.data_name
-    if model_name == CONSTANT_VELOCITY:
-        return (
-            "NOTHING BEATS CONSTANT VELOCITY, which keeps the initial velocities of each free"
-            " run: no model of this run is useful for prediction."
-        )
+    if is_useless(evidence):
+        return f"Do not use: {_explain_uselessness(evidence)}."
     selected_row = evidence.rows_by_model.get(model_name)
-    constant_velocity_row = evidence.rows_by_model.get(CONSTANT_VELOCITY)
     if selected_row is None:
         return f"The run holds no free runs of its selected model on {data_name}."
     selected_nrmse = selected_row.mean_nrmse
-    if constant_velocity_row is not None and is_useless(evidence):
-        comparison_text = (
-            "NO BETTER" if selected_row.mean_nrmse <= constant_velocity_row.mean_nrmse else "WORSE"
-        )
-        return (
-            f"{comparison_text} THAN CONSTANT VELOCITY: on {data_name} the selected model"
-            f" {model_name} has an NRMSE of"
-            f" {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}, and the"
-            " constant-velocity model"
-            f" {format_number(constant_velocity_row.mean_nrmse)}"
-            f"{_format_paired_interval(evidence, CONSTANT_VELOCITY)}."
-            " DO NOT USE it for prediction."
-        )
     comparisons = []
-    for reference_name, reference_row in (
-        (CONSTANT_VELOCITY, constant_velocity_row),
-        (evidence.baseline, evidence.rows_by_model.get(evidence.baseline)),
+    for reference_name, label in (
+        (CONSTANT_VELOCITY, "constant velocity"),
+        (evidence.baseline, "the baseline"),
     ):
+        reference_row = evidence.rows_by_model.get(reference_name)
         if reference_row is None or reference_name == model_name:
             continue
         percent_change = (
-            100.0 * (1.0 - selected_nrmse / reference_row.mean_nrmse)
+            100.0 * (selected_nrmse / reference_row.mean_nrmse - 1.0)
             if reference_row.mean_nrmse > 0
             else 0.0
         )
-        comparison = "better" if percent_change >= 0 else "WORSE"
-        reference_label = {"baseline": "the baseline", CONSTANT_VELOCITY: "constant velocity"}.get(
-            reference_name, reference_name
-        )
+        direction = "lower" if percent_change <= 0.0 else "HIGHER"
         comparisons.append(
-            f"{abs(percent_change):.0f} % {comparison} than"
-            f" {reference_label}{_format_paired_interval(evidence, reference_name)}"
+            f"{abs(percent_change):.0f} % {direction} than those of {label}"
+            f"{_format_paired_interval(evidence, reference_name)}"
         )
-    comparison_clause = f" is {' and '.join(comparisons)};" if comparisons else ""
+    error_text = f"NRMSE {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}"
+    if not comparisons:
+        return f"On {data_name} the velocity errors of {model_name} are {error_text}."
     return (
-        f"On {data_name} model {model_name}{comparison_clause} its NRMSE is"
-        f" {format_number(selected_nrmse)}{_diverged_suffix(selected_row)}."
+        f"On {data_name} the velocity errors of {model_name} ({error_text}) are"
+        f" {' and '.join(comparisons)}."
     )
 
 
@@ -681,14 +763,16 @@ def _format_paired_interval(evidence: VerdictEvidence, reference_name: str) -> s
     if difference is None:
         return ""
     if difference.ci95 is None:
-        return " (too few logs for an interval)"
+        return " (too few logs for a confidence interval)"
     lower, upper = difference.ci95
     suffix = (
         ""
         if difference.excludes_zero
         else ", which includes zero: the difference is not significant"
     )
-    return f" (paired 95 % interval of the difference {lower:+.3g} to {upper:+.3g}{suffix})"
+    return (
+        f" (paired 95 % confidence interval of the difference {lower:+.3g} to {upper:+.3g}{suffix})"
+    )
 
 
 def _format_percent(share: float) -> str:

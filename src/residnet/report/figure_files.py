@@ -104,7 +104,7 @@ def _pack_curves(panel_curves: Mapping[str, Curve]) -> dict[str, Any]:
     columns: dict[str, np.ndarray] = {}
     for name, (x, y) in panel_curves.items():
         curve_parts = split_at_gaps(x, y)
-        max_points = max(20, min(400, 4_000 // max(len(curve_parts), 1)))
+        max_points = max(20, min(300, 4_000 // max(len(curve_parts), 1)))
         subsampled = join_with_gaps(
             tuple(axis[subsample_indices(len(axis), max_points)] for axis in curve_part)
             for curve_part in curve_parts
@@ -144,9 +144,14 @@ def read_figures(folder: Path, names: str = ".*") -> list[Figure]:
     return [figure for figure in read if figure and re.fullmatch(names, figure.name)]
 
 
-def figures_section(folder: Path) -> list[Section]:
-    """Return a section with the figures of a folder; an empty list if there are none."""
-    figures = read_figures(folder)
+def figures_section(folder: Path, names: str = ".*") -> list[Section]:
+    """Return a section with the figures of a folder; an empty list if there are none.
+
+    Args:
+        folder: folder that `write_figures` wrote.
+        names: regular expression that the figure name must match.
+    """
+    figures = read_figures(folder, names)
     return [Section("Figures", figures)] if figures else []
 
 

@@ -29,6 +29,7 @@ from residnet.evaluation.records import (
     BandRow,
     BandsFile,
     DataQualityFile,
+    HorizonRow,
     LimitsFile,
     LogQuality,
     MetricsFile,
@@ -38,7 +39,7 @@ from residnet.evaluation.records import (
     SanityRow,
     SelectionFile,
 )
-from residnet.evaluation.verdict import order_protocols
+from residnet.evaluation.verdict import find_main_horizon, order_protocols
 from residnet.identification.records import FitNotes
 from residnet.quality.records import InspectionFile
 from residnet.report.run_settings import (
@@ -416,6 +417,26 @@ class RunFiles:
         return next((split for split in _SPLIT_PRIORITY if split in self.splits), self.splits[0])
 
     @cached_property
+    def logs_of_fit(self) -> tuple[int, int]:
+        """How many logs of an evaluation are among the data of the fit, and how many it has.
+
+        Only the evaluation on other logs names those of the fit; (0, 0) for a fit.
+        """
+        if self.report_split != "external" or self.inspection is None:
+            return 0, 0
+        marks = [
+            any(finding.code == "log_of_fit" for finding in log.findings)
+            for log in self.inspection.logs
+        ]
+        return sum(marks), len(marks)
+
+    @property
+    def report_data_name(self) -> str:
+        """Name of the data of the report; logs that trained the model are not external."""
+        n_known, n_logs = self.logs_of_fit
+        return "data of the fit" if n_known and n_known == n_logs else f"{self.report_split} data"
+
+    @cached_property
     def report_splits(self) -> list[str]:
         """Splits that the report compares: the training split, if any, and the report split."""
         return [
@@ -424,22 +445,22 @@ class RunFiles:
 
     @cached_property
     def protocols(self) -> list[str]:
-        """The protocols of the rows; that of the verdict comes first."""
-        return order_protocols(self.rows, self.report_split, self.evaluation.selection)
+        """The protocols of the rows; the main one, that of the verdict, comes first."""
+        settings = self.evaluation.protocols
+        fixed_length = [name for name, protocol in settings.items() if protocol.length is not None]
+        return order_protocols(
+            self.rows, self.report_split, self.evaluation.selection, fixed_length
+        )
 
     @property
     def selection_protocol(self) -> str:
         """The protocol by whose errors models were selected."""
         return self.evaluation.selection or self.protocols[0]
 
-    @cached_property
+    @property
     def main_protocol(self) -> str:
-        """The protocol at the top of the page: the first one with windows of equal length, if any.
-
-        The protocol that selects models is the first candidate.
-        """
-        fixed_length = [name for name in self.protocols if self._window_length(name)]
-        return (fixed_length or self.protocols)[0]
+        """The protocol of badge, first sentence, table and picture; see `order_protocols`."""
+        return self.protocols[0]
 
     def _window_length(self, protocol: str) -> float | None:
         """Return the length of the windows of a protocol in s; None if it has none."""
@@ -447,12 +468,24 @@ class RunFiles:
         return None if settings is None else settings.length
 
     @cached_property
-    def horizon_text(self) -> str:
-        """Text for the prediction horizon of the main protocol, such as `after 30 s`.
+    def main_horizon(self) -> HorizonRow | None:
+        """The pose errors at the main horizon of the report split; None if they are unknown."""
+        horizon = find_main_horizon(
+            {} if self.limits is None else self.limits.splits.get(self.report_split, {}),
+            self.main_protocol,
+            self.main_model,
+        )
+        return None if horizon is None else horizon.row
 
-        It is `at the end` if the protocol has no windows of equal length.
+    @cached_property
+    def horizon_text(self) -> str:
+        """Text for the main horizon, such as `after 30 s`.
+
+        It is `at the end` if the errors at horizons are unknown and the windows differ in length.
         """
         length = self._window_length(self.main_protocol)
+        if self.main_horizon is not None:
+            length = self.main_horizon.seconds
         return f"after {length:g} s" if length else "at the end"
 
     @property

@@ -45,11 +45,11 @@ class WindowKey(NamedTuple):
 
 
 class EvaluatedRun(RunFiles):
-    """A finished fit in a comparison, represented by its selected model.
+    """A finished fit in a comparison, represented by the model of its verdict.
 
     Attributes:
         name: unique name of the run in the comparison.
-        model: name of the selected model.
+        model: name of the model that the report of the run evaluates.
     """
 
     def __init__(self, name: str, path: Path) -> None:
@@ -57,7 +57,7 @@ class EvaluatedRun(RunFiles):
         if not (path / "metrics.json").is_file():
             raise UsageError(f"{path}: has no metrics.json; compare finished runs of the task fit")
         self.name = name
-        self.model = self.metrics.selected
+        self.model = self.main_model
 
     @cached_property
     def windows_by_key(self) -> dict[WindowKey, StoredWindow]:
@@ -111,9 +111,9 @@ def compare_runs(paths: Sequence[Path], output_folder: Path) -> tuple[str, Path]
             first_protocol = {protocol: comparisons[protocol] for protocol in list(comparisons)[:1]}
             # the first screen has space for NRMSE, difference and interval of each run only
             summary_table = _build_paired_table(runs, first_protocol).select_columns(3, 6)
-            summary_table.caption = f"Selected models, {next(iter(first_protocol))}."
+            summary_table.caption = f"Models of the verdicts, {next(iter(first_protocol))}."
             sections.append(Section("", [_plot_error_growth(runs, output_folder), summary_table]))
-            sections.append(Section("Selected models over common windows", paired_tables))
+            sections.append(Section("Models of the verdicts over common windows", paired_tables))
         sections += [
             Section("Every model of every run", error_tables),
             Section("Where the runs differ", [difference_table]),
@@ -159,17 +159,20 @@ def common_velocities(runs: Sequence[EvaluatedRun]) -> list[str]:
 
 
 def _common_windows(runs: Sequence[EvaluatedRun]) -> dict[str, list[WindowKey]]:
-    """Return the windows by protocol that all runs evaluated with the same length."""
+    """Return the windows by protocol that all runs evaluated with the same length.
+
+    The main protocol of the first run comes first.
+    """
     common_keys = set.intersection(*(set(run.windows_by_key) for run in runs))
-    windows_by_protocol: dict[str, list[WindowKey]] = {}
+    windows_by_protocol: dict[str, list[WindowKey]] = {name: [] for name in runs[0].protocols}
     for window in sorted(common_keys):
         if len({len(run.windows_by_key[window].t) for run in runs}) == 1:
             windows_by_protocol.setdefault(window.evaluation_protocol, []).append(window)
-    return windows_by_protocol
+    return {protocol: windows for protocol, windows in windows_by_protocol.items() if windows}
 
 
 class RunComparison(NamedTuple):
-    """The error of the selected model of one run over the common windows of one protocol.
+    """The error of the model of one run over the common windows of one protocol.
 
     Attributes:
         windows: number of windows.
@@ -259,10 +262,11 @@ def _build_paired_table(
             ("windows", lambda row: row.comparison.windows, str),
             ("NRMSE [-]", lambda row: row.comparison.nrmse, format_number),
             ("difference", format_difference, str),
-            ("95 % interval", format_interval),
+            ("95 % confidence interval", format_interval),
         ],
-        caption="Selected models over the windows that all runs evaluated, with the scales of"
-        f" {reference_name}; differences from {reference_name}, negative where the run is better.",
+        caption="Models of the verdicts over the windows that all runs evaluated, with the scales"
+        f" of {reference_name}; differences from {reference_name}, negative where the error is"
+        " smaller.",
         is_selected=lambda row: row.comparison.nrmse == lowest_error[row.protocol],
         group_key=lambda row: row.protocol,
     )
@@ -324,7 +328,7 @@ def _write_conclusion(
 
 
 def _plot_error_growth(runs: Sequence[EvaluatedRun], output_folder: Path) -> Block:
-    """Plot the growth of the errors of the selected models over the common windows."""
+    """Plot the growth of the errors of the models over the common windows."""
     protocol, windows = next(iter(_common_windows(runs).items()))
     scales = pd.Series(_reference_scales(runs))
     error_curves = {}
@@ -339,7 +343,7 @@ def _plot_error_growth(runs: Sequence[EvaluatedRun], output_folder: Path) -> Blo
     figure = Figure(
         "horizon",
         "Error against horizon",
-        f"Selected models over {len(windows)} common windows of {protocol}, mean over"
+        f"Models of the verdicts over {len(windows)} common windows of {protocol}, mean over"
         f" {', '.join(scales.index)}.",
         style_family(error_curves),
         [Panel("error [-]", "time from the start of a free run [s]", height=MAX_PREVIEW_HEIGHT)],

@@ -48,6 +48,10 @@ _MAX_TIME_BINS = 60
 _TRACK_PANEL = Panel("north [m]", "east [m]", kind="map", height=380)
 _N_OPENING_PANELS = 3
 """Number of motion panels on the first screen: surge, sway and yaw rate of a planar vessel."""
+_STEADY_SHARE = 0.3
+"""Largest standard deviation of the yaw rate in a steady run, as a share of its mean magnitude."""
+_MIN_YAW_RATE = math.radians(0.5)
+"""Yaw rate in rad/s below which a run is a straight line."""
 _OPENING_PANEL_HEIGHT = 62
 """Height of a motion panel on the first screen, so that the table fits below it on a phone."""
 _MOTION_TITLES = {
@@ -177,7 +181,7 @@ def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | 
         "free_runs",
         "Free runs",
         "Each free run starts from a measured state and uses only the measured inputs"
-        f" ({run.report_split} data)."
+        f" ({run.report_data_name})."
         + (
             " North is up, and each track begins at its start. Compare the radius of turns,"
             if run.dof.has_position and run.dof.has_heading
@@ -194,16 +198,37 @@ def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | 
 
 
 def track_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
-    """Draw the free run with median error under the main protocol, for the first screen.
+    """Draw a free run of median error up to the main horizon, for the first screen.
 
-    The panels are the track, where there is one, and the first three velocities.
+    The panels are the track, where there is one, and the first three velocities. A steady run (a
+    straight line or a circle) is only drawn if all are steady.
     """
+    horizon = math.inf if run.main_horizon is None else run.main_horizon.seconds
     ranked_windows = _rank_by_error(
-        run, [candidate for candidate in windows if candidate.protocol == run.main_protocol]
+        run,
+        [
+            _truncate_window(candidate, horizon)
+            for candidate in windows
+            if candidate.protocol == run.main_protocol
+        ],
     )
     if not ranked_windows:
         return None
-    window = ranked_windows[(len(ranked_windows) - 1) // 2]
+    middle = (len(ranked_windows) - 1) // 2
+    position = min(
+        range(len(ranked_windows)),
+        key=lambda index: (_is_steady(ranked_windows[index]), abs(index - middle), index),
+    )
+    window = ranked_windows[position]
+    if position == middle:
+        caption = (
+            f"Median of {len(ranked_windows)} free runs on {run.report_data_name}: {window.log}."
+        )
+    else:
+        caption = (
+            f"The unsteady run nearest to the median of {len(ranked_windows)} free runs on"
+            f" {run.report_data_name}: {window.log}, error rank {position + 1}."
+        )
     visible_names = {"measured", "start", run.main_model, run.baseline}
     styles = {"measured": MEASURED_STYLE, **model_styles(run), "start": START_STYLE}
     visible_curves = [
@@ -222,8 +247,8 @@ def track_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | Non
     panels[-1] = replace(panels[-1], x_label="time since the start of the free run [s]")
     return Figure(
         "track",
-        "Track of the median run" if has_track else "Median run",
-        f"Median of {len(ranked_windows)} {run.report_split} runs: {window.log}.",
+        "Track of a typical run" if has_track else "Typical run",
+        caption,
         {
             name: replace(style, is_visible=True)
             for name, style in styles.items()
@@ -233,6 +258,32 @@ def track_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | Non
         [Case("", visible_curves[: len(panels)], has_static_image=False)],
         is_drawing=True,
     )
+
+
+def _truncate_window(window: StoredWindow, horizon: float) -> StoredWindow:
+    """Return a free run up to a horizon in s."""
+    n_samples = int(np.searchsorted(window.t, window.t[0] + horizon + 1e-6, side="right"))
+    if n_samples == window.t.size:
+        return window
+    return replace(
+        window,
+        t=window.t[:n_samples],
+        usable=window.usable[:n_samples],
+        measured=window.measured[:n_samples],
+        predicted={name: states[:n_samples] for name, states in window.predicted.items()},
+        inputs={name: values[:n_samples] for name, values in window.inputs.items()},
+        band_lower={name: limits[:n_samples] for name, limits in window.band_lower.items()},
+        band_upper={name: limits[:n_samples] for name, limits in window.band_upper.items()},
+    )
+
+
+def _is_steady(window: StoredWindow) -> bool:
+    """Return whether a measured run is a straight line or a circle: its yaw rate hardly varies."""
+    yaw_rate = window.measured[:, state_column_names(window.dof).index("r")]
+    yaw_rate = yaw_rate[np.isfinite(yaw_rate)]
+    if yaw_rate.size < 2 or np.abs(yaw_rate).max() < _MIN_YAW_RATE:
+        return True
+    return bool(yaw_rate.std() < _STEADY_SHARE * np.abs(yaw_rate).mean())
 
 
 def plot_window(window: StoredWindow, title: str) -> Figure:

@@ -15,12 +15,26 @@ from residnet.core.format import (
     format_percent_change,
 )
 from residnet.core.model_names import CONSTANT_VELOCITY
-from residnet.evaluation.records import SANITY_CHECKS, ExcitationFile, Interval, SanityRow
-from residnet.evaluation.verdict import UNSEEN_SPLITS, VerdictEvidence, describe_divergence
-from residnet.evaluation.verdict import rate_model as judged_level
-from residnet.evaluation.verdict import write_verdict as judged
+from residnet.evaluation.records import (
+    SANITY_CHECKS,
+    ExcitationFile,
+    Interval,
+    MetricsRow,
+    SanityRow,
+)
+from residnet.evaluation.verdict import (
+    LEVEL_TEXTS,
+    UNSEEN_SPLITS,
+    ProtocolHorizon,
+    VerdictEvidence,
+    describe_divergence,
+    known_horizons,
+    rate_horizon,
+    rate_model,
+    write_verdict,
+)
 from residnet.quality import summarize_inspection
-from residnet.report.blocks import Bullets, Cell, Facts, Section, Text, build_table
+from residnet.report.blocks import Bullets, Cell, Facts, Section, Table, Text, build_table
 from residnet.report.figure import Figure
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.free_runs import distinct_manoeuvres
@@ -39,11 +53,11 @@ def verdict_sentences(run: RunFiles) -> list[str]:
             f"The run holds no free runs of its selected model on {run.report_split} data; see"
             f" the tables."
         ]
-    return judged(collect_evidence(run, main_model))
+    return write_verdict(collect_evidence(run, main_model))
 
 
-_MEASUREMENT_ROW = "measurements"
-"""Name of the row with the position error of the integrated measured velocities."""
+_NOISE_FLOOR_ROW = "noise floor"
+"""Name of the row with the pose errors of the integrated measured velocities."""
 _NO_POSE_TEXT = (
     "The logs hold no {}: judge the model by its velocities, for errors of position and heading are"
     " those of integrated velocities."
@@ -83,11 +97,7 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
         for finding in (() if inspection is None else inspection.together)
         if finding.code == "one_side" and finding.level != "note"
     )
-    # only the evaluation on other logs names those of the fit
-    fit_marks = [
-        any(finding.code == "log_of_fit" for finding in log.findings)
-        for log in (() if inspection is None or split != "external" else inspection.logs)
-    ]
+    n_logs_of_fit, n_logs = run.logs_of_fit
     return VerdictEvidence(
         selected,
         split,
@@ -99,8 +109,8 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
         protocol,
         next(one_sided_texts, ""),
         run.read_record(ExcitationFile, "excitation.json"),
-        len(fit_marks),
-        sum(fit_marks),
+        n_logs,
+        n_logs_of_fit,
         current_text=_describe_currents(run),
     )
 
@@ -121,7 +131,7 @@ def _describe_currents(run: RunFiles) -> str:
 
 def verdict_level(run: RunFiles) -> str:
     """Return the level of the verdict on the selected model; empty if it has no free runs."""
-    return judged_level(collect_evidence(run, run.main_model))
+    return rate_model(collect_evidence(run, run.main_model))
 
 
 class _OpeningRow(NamedTuple):
@@ -129,8 +139,8 @@ class _OpeningRow(NamedTuple):
 
     Attributes:
         model: name of the model; None for the integrated measured velocities.
-        errors: name -> pose error at the end of the free runs.
-        intervals: name -> confidence interval of the error.
+        errors: name -> pose error at the main horizon.
+        intervals: name -> prediction interval of the error.
         divergence: number of diverged windows in words; empty without divergence.
     """
 
@@ -140,11 +150,48 @@ class _OpeningRow(NamedTuple):
     divergence: str
 
 
+def _list_opening_rows(run: RunFiles, rows: Mapping[str, MetricsRow]) -> list[_OpeningRow]:
+    """Return the lines of the first table in the order of `opening_section`.
+
+    Runs without errors at single horizons have those at the ends of the free runs, without
+    prediction intervals.
+    """
+    horizon = run.main_horizon
+    lines = {
+        model_name: _OpeningRow(
+            model_name,
+            row.final_pose_errors if horizon is None else horizon.models[model_name].by_name,
+            {} if horizon is None else horizon.models[model_name].intervals,
+            describe_divergence(row),
+        )
+        for model_name, row in rows.items()
+        if horizon is None or model_name in horizon.models
+    }
+    leading_models = [run.main_model, run.selected, run.baseline, CONSTANT_VELOCITY]
+    table = [
+        lines[model_name]
+        for model_name in dict.fromkeys(leading_models)
+        if model_name is not None and model_name in lines
+    ]
+    limits = run.find_limits(run.main_protocol)
+    kinematic_errors = {} if limits is None else limits.kinematics.means
+    noise_floor = kinematic_errors if horizon is None else horizon.floor.by_name
+    # a pose that was integrated from the velocities has no noise floor but rounding
+    if any(error > 1e-9 for error in noise_floor.values()):
+        intervals = {} if horizon is None else horizon.floor.intervals
+        table.append(_OpeningRow(None, noise_floor, intervals, ""))
+    return table + sorted(
+        (line for model_name, line in lines.items() if model_name not in leading_models),
+        key=lambda line: line.errors[run.pose_errors[0]],
+    )
+
+
 def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     """Return the first screen below the verdict: the median free run and the errors of the models.
 
     Row order: predictor, selected model, baseline, constant velocity, noise floor of the
-    measurements, then the other models by increasing error. None if there is no free run.
+    measurements, then the other models by increasing error. A small table has the other horizons.
+    None if there is no free run.
     """
     rows = {
         model_name: row
@@ -156,33 +203,12 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     faults_by_model = {
         entry.model: entry.faults for entry in (run.selection.models if run.selection else ())
     }
-    limits = run.find_limits(run.main_protocol)
-    leading_models = [run.main_model, run.selected, run.baseline, CONSTANT_VELOCITY]
-    lines = {
-        model_name: _OpeningRow(
-            model_name,
-            row.final_pose_errors,
-            row.final_pose_intervals,
-            describe_divergence(row),
-        )
-        for model_name, row in rows.items()
-    }
-    table = [
-        lines[model_name]
-        for model_name in dict.fromkeys(leading_models)
-        if model_name is not None and model_name in lines
-    ]
-    kinematic_errors = {} if limits is None else limits.kinematics.means
-    # a pose that was integrated from the velocities has no floor but rounding
-    if measured := any(error > 1e-9 for error in kinematic_errors.values()):
-        table.append(_OpeningRow(None, kinematic_errors, {}, ""))
-    table += sorted(
-        (line for model_name, line in lines.items() if model_name not in leading_models),
-        key=lambda line: line.errors[run.pose_errors[0]],
-    )
+    table = _list_opening_rows(run, rows)
     smallest_errors = {
         pose_error: min(
-            line.errors[pose_error] for model, line in lines.items() if model != run.plant
+            line.errors[pose_error]
+            for line in table
+            if line.model is not None and line.model != run.plant
         )
         for pose_error in run.pose_errors
     }
@@ -191,11 +217,11 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         error = line.errors[pose_error]
         interval = line.intervals.get(pose_error)
         note = "–".join(format_number(factor * bound, 2) for bound in interval) if interval else ""
-        is_smallest = error == smallest_errors[pose_error]
+        is_smallest = line.model is not None and error == smallest_errors[pose_error]
         return Cell(format_number(factor * error, 2), note, "best" if is_smallest else "")
 
     def model_name(line: _OpeningRow) -> str:
-        return _MEASUREMENT_ROW if line.model is None else run.model_label(line.model)
+        return _NOISE_FLOOR_ROW if line.model is None else run.model_label(line.model)
 
     def fault_text(line: _OpeningRow) -> str:
         return next(iter(faults_by_model.get(line.model or "", ())), "")
@@ -205,21 +231,25 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
             return Cell("✗", line.divergence, "text")
         return Cell("✓" if line.model in faults_by_model else DASH, mark="text")
 
-    is_other_protocol = run.main_protocol != run.protocols[0]
+    windows = rows[run.main_model].windows
+    if run.main_horizon is not None:
+        windows = run.main_horizon.windows
+    has_intervals = any(any(line.intervals.values()) for line in table)
     notes = [
-        f"Mean of {format_count(rows[run.main_model].windows, 'free run')} on"
-        f" {run.report_split} data"
-        f" ({run.main_protocol}"
-        + f", whose starts differ from those of {run.protocols[0]} above" * is_other_protocol
-        + ")"
+        f"Mean of {format_count(windows, 'free run')} on {run.report_data_name}"
+        f" ({run.main_protocol})"
         + (
-            "; small: 95 % interval of this mean (above: of as many new runs)."
-            if rows[run.main_model].final_pose_intervals[run.pose_errors[0]]
+            "; small: 95 % prediction interval of the mean of as many new free runs."
+            if has_intervals
             else "."
         ),
-        "" if run.report_split in UNSEEN_SPLITS else "These data are not unseen: read with care.",
+        ""
+        if run.report_split in UNSEEN_SPLITS and not run.logs_of_fit[0]
+        else "These data are not unseen: read with care.",
         "constant_velocity: the initial velocities are held." if CONSTANT_VELOCITY in rows else "",
-        "Measurements: where the measured velocities themselves lead." if measured else "",
+        "Noise floor: the error of the integrated measured velocities."
+        if any(line.model is None for line in table)
+        else "",
         *(f"✗ {model_name(line)}: {reason}." for line in table if (reason := fault_text(line))),
     ]
     error_table = build_table(
@@ -241,7 +271,47 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         is_selected=lambda line: line.model == run.main_model,
     )
     return Section(
-        "", [*figures, error_table, Text(" ".join(filter(None, notes)), is_secondary=True)]
+        "",
+        [
+            *figures,
+            error_table,
+            Text(" ".join(filter(None, notes)), is_secondary=True),
+            _build_horizon_table(run),
+        ],
+    )
+
+
+def _build_horizon_table(run: RunFiles) -> Table | None:
+    """Return the errors of the main model at all horizons; None if only one is known."""
+    evidence = collect_evidence(run, run.main_model)
+    horizons = known_horizons(evidence)
+    if len(horizons) < 2 or run.main_horizon is None:
+        return None
+    main_seconds = run.main_horizon.seconds
+
+    def error_cell(horizon: ProtocolHorizon, pose_error: str, factor: float) -> Cell:
+        errors = horizon.row.models[run.main_model]
+        interval = errors.intervals[pose_error]
+        note = "–".join(format_number(factor * bound, 2) for bound in interval) if interval else ""
+        return Cell(format_number(factor * errors.by_name[pose_error], 2), note)
+
+    return build_table(
+        horizons,
+        [
+            (f"{run.main_model} after", lambda horizon: f"{horizon.row.seconds:.4g} s"),
+            *(
+                (
+                    f"{name} [{unit}]",
+                    lambda horizon, of=pose_error, factor=factor: error_cell(horizon, of, factor),
+                )
+                for pose_error, (name, unit, factor) in (
+                    (pose_error, run.pose_error_unit(pose_error)) for pose_error in run.pose_errors
+                )
+            ),
+            ("free runs", lambda horizon: f"{horizon.row.windows} ({horizon.protocol})", str),
+            ("level", lambda horizon: LEVEL_TEXTS[rate_horizon(evidence, horizon.row)]),
+        ],
+        is_selected=lambda horizon: horizon.row.seconds == main_seconds,
     )
 
 
