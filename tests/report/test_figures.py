@@ -44,7 +44,7 @@ from residnet.report.records import SweepFile, SweepTrial
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections import runs
 from residnet.report.sections.models import evolution_figures
-from residnet.report.sections.sweep import parallel_coordinates
+from residnet.report.sections.sweep import shorten_keys, slice_figure
 from residnet.report.still import render_matplotlib
 
 T = np.linspace(0.0, 10.0, 900)
@@ -115,7 +115,7 @@ def test_a_figure_is_written_and_read_back(tmp_path: Path) -> None:
     assert (read.panels[1].y_limits, read.panels[2].y_log) == ([-2.0, 2.0], True)
     assert [case.note for case in read.cases] == ["A note.", "Other."]
     x, y = read.cases[0].curves[1]["a"]
-    assert len(x) == 400, "no more samples than a screen shows"
+    assert len(x) == 300, "no more samples than a screen shows"
     np.testing.assert_allclose(y, np.sin(x), atol=1e-3)
     assert (x[0], x[-1]) == pytest.approx((0.0, 10.0), abs=1e-3)
     assert len(split_at_gaps(*read.cases[0].curves[1]["measured"])) == 2, "a gap stays one"
@@ -223,9 +223,9 @@ def test_runs_to_choose_from_are_the_median_worst_and_best_of_each_kind(run: Pat
     assert figure is not None
     cases = {case.title: case for case in figure.cases}
     # errors grow with the number of the log: of zigzags 01, 02, 03 the second is the median
-    median = cases["zigzag, whole: median error (zigzag_02)"]
+    median = cases["zigzag, T30: median error (zigzag_02)"]
     pictured = [case.title.split(":")[0] for case in figure.static_cases]
-    assert pictured == ["zigzag, whole", "turning, whole"]
+    assert pictured == ["zigzag, T30", "turning, T30"]
     looks = figure.styles
     assert all(looks[name].is_visible for name in ("measured", "plsr", "baseline", "plant"))
     assert not looks["constant_velocity"].is_visible
@@ -307,13 +307,19 @@ def test_trials_of_a_sweep_over_their_keys() -> None:
         importance={},
         trials=(*trials, failed),
     )
-    figure = parallel_coordinates(sweep)
-    names = ("heads.size\n0 to 19", 'kind\n"a" to "b"', "score\n0 to 1.9")
-    assert figure.panels[0].x_names == {str(place): name for place, name in enumerate(names)}
-    curves = figure.cases[0].curves[0]
-    assert [values.tolist() for values in curves["best"]] == [[0, 1, 2], [1.0, 1.0, 1.0]]
-    counts = {name: len(split_at_gaps(*curve)) for name, curve in curves.items()}
-    assert counts["best tenth"] + counts["better half"] + counts["worse half"] == len(trials)
+    figure = slice_figure(sweep)
+    size, kind = figure.panels
+    assert (size.title, kind.title, kind.x_label) == ("size", "kind", "score")
+    assert (size.y_names, kind.y_names) == ({}, {"0": '"a"', "1": '"b"'})
+    sizes, kinds = figure.cases[0].curves
+    assert [values.tolist() for values in sizes["best"]] == [[pytest.approx(1.9)], [19.0]]
+    assert kinds["best"][1].tolist() == [1.0]
+    assert sum(len(x) for x, _ in sizes.values()) == len(trials)
+
+
+def test_keys_have_as_many_parts_as_distinguish_them() -> None:
+    keys = ("heads.mlp.hidden", "training.mlp.rate", "training.lstm.rate", "rate")
+    assert list(shorten_keys(keys).values()) == ["hidden", "mlp.rate", "lstm.rate", "rate"]
 
 
 @pytest.mark.long

@@ -86,7 +86,7 @@ def test_a_grid_is_searched_whole_and_resumed(
     assert written["heads"]["ridge"]["degree"] == best["values"]["heads.ridge.degree"]
     assert command("check", out / "best.yaml").code == 0
     names = {path.name for path in (out / "figures").glob("*.png")}
-    assert {"01_parallel_coordinates.png", "02_course.png"} <= names
+    assert {"01_slices.png", "02_course.png"} <= names
     assert "heads.ridge.degree" in (out / "report.html").read_text()
 
 

@@ -141,9 +141,6 @@ residnet, and the verdict states them.
 _MAX_LIMITED_DISTANCE_SHARE = 0.25
 """Largest position error of a model of limited use, as a share of the distance travelled."""
 _MAX_LIMITED_ANGLE_ERROR = math.radians(30.0)
-_MAX_LIMITED_DISTANCE_SHARE = 0.25
-"""Largest position error of a model of limited use, as a share of the distance travelled."""
-_MAX_LIMITED_ANGLE_ERROR = math.radians(30.0)
 """Largest heading error of a model of limited use in rad."""
 _POSE_ERROR_SUFFIXES = {"depth": " of depth", "attitude": " of attitude"}
 """Suffixes of pose errors other than horizontal position and heading."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from residnet.report.figure import (
     GlyphStyle,
     Panel,
     bar_outlines,
-    join_with_gaps,
     step_curve,
     tick_labels,
 )
@@ -31,66 +30,108 @@ from residnet.report.sections.variants import VARIANTS_FILE, variant_sections
 
 _MAX_SHOWN_TRIALS = 15
 """Number of the best trials in the first table, which fits on a screen."""
-_MAX_LINE_LENGTH = 20
-"""Maximum number of letters in a line of a label below an axis."""
-_RANK_GROUPS = (
-    ("worse half", 0.5, 1.0, GlyphStyle("worse half", "#B8B8B8", width=0.8)),
-    ("better half", 0.1, 0.5, replace(SOLID_STYLE, label="better half", alpha=0.45, width=1.0)),
-    ("best tenth", 0.0, 0.1, replace(SOLID_STYLE, label="best tenth", width=1.2)),
-    ("best", 0.0, 1e-9, GlyphStyle("best", VERMILLION, width=2.4, z_order=4)),
-)
-"""Groups of trials by rank: name, lower and upper limit as fractions of all trials, and style."""
+_MAX_SLICES = 6
+"""Number of keys with a slice, which fit on a screen; the most important ones are drawn."""
+_MAX_LABEL_LENGTH = 16
+"""Maximum number of letters of a value beside an axis."""
+_SLICE_STYLES = {
+    "trial": GlyphStyle("trial", "#8C8C8C", kind="points", size=4.0),
+    "best tenth": GlyphStyle("best tenth", SOLID_STYLE.color, kind="points", size=5.0, z_order=4),
+    "best": GlyphStyle("best", VERMILLION, kind="points", marker="^", size=8.0, z_order=5),
+}
+"""Styles of the trials by rank; a trial is drawn in the best group that it belongs to."""
 
 
-def parallel_coordinates(content: SweepFile) -> Figure:
-    """Draw the finished trials in parallel coordinates: one axis per key, and one for the value."""
-    rows = [trial for trial, _ in content.completed]
-    values = np.array([value for _, value in content.completed])
-    rank = np.argsort(np.argsort(values if content.minimized else -values))
-    keys = content.keys
-    positions, ticks = zip(
-        *(_axis_positions(rows, key, key in content.log) for key in keys), strict=True
-    )
-    value_range = np.ptp(values) or 1.0
-    heights = np.column_stack([*positions, (values - values.min()) / value_range])
-    axis_marks = [*ticks, [(0.0, f"{values.min():.4g}"), (1.0, f"{values.max():.4g}")]]
-    columns = np.arange(len(axis_marks), dtype=float)
-    panel: dict[str, Curve] = {"axes": (columns, np.zeros(len(axis_marks)))}
-    for label, lower, upper, _ in _RANK_GROUPS:
-        group_heights = heights[(rank >= lower * len(rows)) & (rank < upper * len(rows))]
-        panel[label] = join_with_gaps((columns, trial) for trial in group_heights)
-    axis_titles = [*map(_wrap_key, keys), _wrap_key(objective_text(content))]
-    end_labels = [[text for height, text in marks if height in (0.0, 1.0)] for marks in axis_marks]
-    return Figure(
-        "parallel_coordinates",
-        "Trials over their keys",
-        "Every line is a finished trial: its values, and at the right what is sought. Beneath"
-        " each axis has its limits as labels. The best trial is the thick line.",
-        {"axes": GlyphStyle("", "#999999", width=0.8, kind="vline", z_order=1)}
-        | {label: style for label, _, _, style in _RANK_GROUPS},
-        [
+def slice_figure(content: SweepFile) -> Figure:
+    """Draw a slice for each key: the value of the key of every trial over its objective.
+
+    The objective is on the horizontal axis of all panels, so that values beside the vertical axes
+    are not rotated.
+    """
+    trials = [trial for trial, _ in content.completed]
+    objective = np.array([value for _, value in content.completed])
+    rank = np.argsort(np.argsort(objective if content.minimized else -objective))
+    groups = {
+        "best": rank == 0,
+        "best tenth": (rank > 0) & (rank < 0.1 * len(rank)),
+        "trial": rank >= max(1.0, 0.1 * len(rank)),
+    }
+    titles = shorten_keys(content.keys)
+    keys = sorted(content.keys, key=lambda key: -content.importance.get(key, 0.0))[:_MAX_SLICES]
+    panels = []
+    curves: list[dict[str, Curve]] = []
+    for key in keys:
+        values = [trial.values[key] for trial in trials]
+        positions, tick_names = _slice_positions(values, is_logarithmic=key in content.log)
+        margin = 0.5 if len(tick_names) == np.ptp(positions) + 1 else 0.1 * np.ptp(positions)
+        panels.append(
             Panel(
-                height=400,
-                x_names=tick_labels(
-                    f"{name}\n{' to '.join(labels)}"
-                    for name, labels in zip(axis_titles, end_labels, strict=True)
-                ),
-                y_names={"0": ""},
-                x_limits=(-0.1, len(axis_marks) - 0.6),
+                title=titles[key],
+                height=60 + 22 * max(len(tick_names), 3),
+                y_names=tick_names,
+                y_limits=(positions.min() - margin, positions.max() + margin) if tick_names else (),
             )
-        ],
-        [
-            Case(
-                "",
-                [panel],
-                texts=[
-                    (0, column + 0.02, height, text)
-                    for column, marks in enumerate(axis_marks)
-                    for height, text in marks
-                ],
-            )
-        ],
+        )
+        curves.append(
+            {
+                name: (objective[is_member], positions[is_member])
+                for name, is_member in groups.items()
+            }
+        )
+    panels[-1] = replace(panels[-1], x_label=objective_text(content))
+    omitted = len(content.keys) - len(keys)
+    return Figure(
+        "slices",
+        "Trials by key",
+        f"Each point is a finished trial: the value of a key over the {objective_text(content)}."
+        + (f" The {len(keys)} most important of {len(content.keys)} keys." if omitted else ""),
+        _SLICE_STYLES,
+        panels,
+        [Case("", curves)],
     )
+
+
+def _slice_positions(
+    values: Sequence[Any], *, is_logarithmic: bool
+) -> tuple[np.ndarray, dict[str, str]]:
+    """Return the vertical positions of values [trials], and the names of the ticks by position.
+
+    Numbers are their own positions and have no names, or are logarithms whose ends and middle have
+    names. Few distinct numbers, and all other values, are numbered in order.
+    """
+    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        distinct_numbers = sorted(set(values))
+        # few numbers are categories: a linear scale would put 0, 0.001 and 0.01 onto each other
+        if len(distinct_numbers) <= _MAX_SLICES:
+            positions = [float(distinct_numbers.index(value)) for value in values]
+            return np.array(positions), tick_labels(f"{value:.4g}" for value in distinct_numbers)
+        if not is_logarithmic:
+            return np.array(values, dtype=float), {}
+        logarithms = np.log10(np.array(values, dtype=float))
+        ticks = np.linspace(logarithms.min(), logarithms.max(), 3)
+        return logarithms, {f"{tick:.6g}": f"{10.0**tick:.2g}" for tick in ticks}
+    texts = [json.dumps(value) for value in values]
+    categories = sorted(set(texts), key=lambda text: (len(text), text))
+    names = [
+        text if len(text) <= _MAX_LABEL_LENGTH else f"{text[: _MAX_LABEL_LENGTH - 1]}…"
+        for text in categories
+    ]
+    return np.array([float(categories.index(text)) for text in texts]), tick_labels(names)
+
+
+def shorten_keys(keys: Sequence[str]) -> dict[str, str]:
+    """Return for each key its last parts, as many as distinguish it from the other keys."""
+    short_names = {}
+    for key in keys:
+        parts = key.split(".")
+        suffixes = (".".join(parts[-count:]) for count in range(1, len(parts) + 1))
+        short_names[key] = next(
+            suffix
+            for suffix in suffixes
+            if suffix == key
+            or not any(other != key and f".{other}".endswith(f".{suffix}") for other in keys)
+        )
+    return short_names
 
 
 def _progress_figure(content: SweepFile) -> Figure:
@@ -101,8 +142,8 @@ def _progress_figure(content: SweepFile) -> Figure:
     running_best = np.minimum if content.minimized else np.maximum
     return Figure(
         "course",
-        "Course of the sweep",
-        "The value of each finished trial, and the best one by then.",
+        "Progress of the sweep",
+        "The objective of each finished trial, and the best one so far.",
         {
             "trial": GlyphStyle("trial", "#8C8C8C", kind="points", size=3.5),
             "best": replace(SOLID_STYLE, label="best so far"),
@@ -126,57 +167,26 @@ def _importance_figure(content: SweepFile) -> Figure:
     """Draw the share of each key in the variance of the values."""
     importances = dict(sorted(content.importance.items(), key=lambda pair: -pair[1]))
     outlines = bar_outlines(range(len(importances)), importances.values())[::-1]
+    titles = shorten_keys(content.keys)
     return Figure(
         "importance",
-        "What each key matters",
-        "How much of the variance of the values each key explains (functional analysis of variance"
-        " over a forest fitted to the trials). With few trials these shares are rough.",
+        "Importance of the keys",
+        "Share of the variance of the objective that each key explains (functional analysis of"
+        " variance of a random forest fitted to the trials). With few trials the shares are"
+        " uncertain.",
         {"share": GlyphStyle("share", SOLID_STYLE.color, kind="fill")},
         [
             Panel(
                 "",
-                "share in the variance of the values [-]",
+                "share of the variance of the objective [-]",
                 height=70 + 31 * len(importances),
-                y_names=tick_labels(importances),
+                y_names=tick_labels(titles[key] for key in importances),
                 x_limits=(0, 1),
                 y_limits=(len(importances) - 0.5, -0.5),
             )
         ],
         [Case("", [{"share": outlines}])],
     )
-
-
-def _axis_positions(
-    rows: Sequence[SweepTrial], key: str, log: bool
-) -> tuple[np.ndarray, list[tuple[float, str]]]:
-    """Return the positions of the trials on the axis of a key [trials], and its tick labels."""
-    key_values = [row.values[key] for row in rows]
-    numbers = [
-        value
-        for value in key_values
-        if isinstance(value, int | float) and not isinstance(value, bool)
-    ]
-    if len(numbers) == len(key_values):
-        numeric_values = np.log(numbers) if log else np.array(numbers, dtype=float)
-        value_range = np.ptp(numeric_values) or 1.0
-        end_marks = [(0.0, f"{min(numbers):.4g}"), (1.0, f"{max(numbers):.4g}")]
-        heights = (numeric_values - numeric_values.min()) / value_range
-        return heights, end_marks[: len(set(numbers))]
-    texts = [json.dumps(value) for value in key_values]
-    categories = sorted(set(texts))
-    step = 1.0 / max(len(categories) - 1, 1)
-    marks = [(index * step, text) for index, text in enumerate(categories)]
-    return np.array([categories.index(text) * step for text in texts]), marks
-
-
-def _wrap_key(key: str) -> str:
-    """Return a long key with line breaks between its parts."""
-    lines = [""]
-    for part in re.findall(r"[^. ]+[. ]?", key):
-        if lines[-1] and len(lines[-1]) + len(part) > _MAX_LINE_LENGTH:
-            lines.append("")
-        lines[-1] += part
-    return "\n".join(line.strip() for line in lines)
 
 
 def sections(run: RunFiles) -> list[Section]:
@@ -186,14 +196,14 @@ def sections(run: RunFiles) -> list[Section]:
     content = run.read_required_record(SweepFile, "sweep.json")
     figures = []
     if content.best is not None:
-        figures = [parallel_coordinates(content), _progress_figure(content)]
+        figures = [slice_figure(content), _progress_figure(content)]
         if content.importance:
             figures.append(_importance_figure(content))
     figures = write_figures(run.path / "figures", figures)
     introduction = [
-        f"Each trial is a run of its own below trials/; sought is the"
-        f" {'least' if content.minimized else 'greatest'} {objective_text(content)}.",
-        "best.yaml holds the config of the best trial with all its keys.",
+        f"Objective: the {'smallest' if content.minimized else 'largest'}"
+        f" {objective_text(content)}. Each trial is a run in trials/; best.yaml is the complete"
+        " config of the best trial.",
     ]
     by_number = sorted(content.trials, key=lambda trial: trial.number)
     best_trials = trials_table(content)
@@ -201,7 +211,7 @@ def sections(run: RunFiles) -> list[Section]:
         Section(
             "",
             [
-                *figures[:1],
+                *(replace(figure, is_drawing=True, static_images=()) for figure in figures[:1]),
                 best_trials.select_columns(0, 1 + len(content.keys)),
                 Text(introduction, is_secondary=True),
             ],
@@ -219,10 +229,7 @@ def trials_table(content: SweepFile) -> Table:
 
 
 def _build_trials_table(content: SweepFile, rows: Sequence[SweepTrial]) -> Table:
-    def value(row: SweepTrial, key: str) -> str:
-        key_value = row.values[key]
-        return f"{key_value:.4g}" if isinstance(key_value, float) else json.dumps(key_value)
-
+    titles = shorten_keys(content.keys)
     return build_table(
         rows,
         [
@@ -232,12 +239,20 @@ def _build_trials_table(content: SweepFile, rows: Sequence[SweepTrial]) -> Table
                 lambda row: "" if row.value is None else format_number(row.value, 5),
                 str,
             ),
-            *((key, lambda row, key=key: value(row, key), str) for key in content.keys),
+            *(
+                (titles[key], lambda row, key=key: format_value(row.values[key]), str)
+                for key in content.keys
+            ),
             ("run [s]", lambda row: row.seconds, 1),
             ("state", lambda row: Cell(row.state, row.fault, mark="text")),
         ],
         is_selected=lambda row: row.number == content.best,
     )
+
+
+def format_value(value: Any) -> str:
+    """Return the value of a key as text, with four significant digits."""
+    return f"{value:.4g}" if isinstance(value, float) else json.dumps(value)
 
 
 def objective_text(content: SweepFile) -> str:

@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from residnet.core.config import dump_config
 from residnet.core.errors import ResidnetError, UsageError
+from residnet.core.format import format_count
 from residnet.core.progress import Progress, log_message, on_progress, report_progress
 from residnet.core.run_records import ProvenanceFile
 from residnet.report.records import SweepFile, SweepTrial, TrialState
-from residnet.report.sections.sweep import trials_table
+from residnet.report.sections.sweep import format_value, trials_table
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import SummaryMetric, TaskOutcome
 from residnet.tasks.sweep.config import GridSearch, TpeSearch, VariantSearch
@@ -342,16 +343,17 @@ def _write_results(config: SweepConfig, study: optuna.Study, folder: RunFolder) 
         folder.path / BEST_CONFIG_FILE,
         dump_config(config.build_trial(texts, f"{config.name}.best")[0]),
     )
+    key_values = best_row.values.items()
     verdict = [
         f"Trial {best_row.number} of {len(rows)} is the best:"
         f" {config.objective.description.removesuffix(' [-]')} {best_value:.5g}, with"
-        f" {', '.join(f'{key} = {text}' for key, text in texts.items())}.",
+        f" {', '.join(f'{key} = {format_value(value)}' for key, value in key_values)}.",
         f"Its run is {_trial_folder_path(Path(), best_row.number)} in the sweep's folder, and"
         f" the config"
         f" {BEST_CONFIG_FILE} there repeats it.",
     ]
     if by_state["ended early"]:
-        verdict.append(f"{len(by_state['ended early'])} trials were ended early.")
+        verdict.append(f"Ended early: {format_count(len(by_state['ended early']), 'trial')}.")
     if failed_rows := by_state["failed"]:
         verdict.append(f"{len(failed_rows)} trials failed; the first: {failed_rows[0].fault}.")
     if n_finished > 1:
