@@ -300,6 +300,55 @@ def measure_footprint(source: Path) -> dict[str, Any]:
     }
 
 
+_TIMING_PROGRAM: Final = """#include <stdio.h>
+#include <time.h>
+int {function}();
+{arrays}
+int main(void) {{
+  long count = 16;
+  for (;;) {{
+    struct timespec start, end;
+    clock_gettime(CLOCK_MONOTONIC, &start);
+    for (long i = 0; i < count; i++) {function}({names});
+    clock_gettime(CLOCK_MONOTONIC, &end);
+    double seconds = (end.tv_sec - start.tv_sec) + 1e-9 * (end.tv_nsec - start.tv_nsec);
+    if (seconds > 0.02 || count > 100000000L) {{ printf("%.9g\\n", seconds / count); return 0; }}
+    count *= 2;
+  }}
+}}
+"""
+"""Program that repeats a step at zero state and inputs for at least 20 ms."""
+
+
+def measure_step_time(source: Path, function: str, sizes: Sequence[int]) -> float | None:
+    """Return the seconds of one call of a C function on this machine; None without POSIX clocks.
+
+    Args:
+        source: the C file.
+        function: name of the function.
+        sizes: number of entries of each array that the function takes, in order.
+    """
+    names = [f"a{number}" for number in range(len(sizes))]
+    arrays = [
+        f"static double {name}[{max(size, 1)}];" for name, size in zip(names, sizes, strict=True)
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        main = Path(folder) / "timing.c"
+        main.write_text(
+            _TIMING_PROGRAM.format(
+                function=function, arrays="\n".join(arrays), names=", ".join(names)
+            )
+        )
+        program = Path(folder) / "timing"
+        # the header of the clock is POSIX, not C99
+        command = [find_compiler(), "-std=gnu99", "-O2", "-w", str(main), str(source)]
+        compiled = subprocess.run([*command, "-o", str(program), "-lm"], capture_output=True)
+        if compiled.returncode:
+            return None
+        completed = subprocess.run([str(program)], capture_output=True, text=True)
+    return float(completed.stdout) if completed.returncode == 0 else None
+
+
 _MAX_SPILLED_SCALARS: Final = 32
 """Maximum number of scalar variables that the estimate places on the stack; the other scalars are
 assumed to be in registers.
@@ -370,7 +419,7 @@ def report_footprint(file_name: str, size: Mapping[str, Any]) -> list[str]:
     log_message(
         f"  {file_name}: {stack:,} bytes of stack ({size['stack_from']}), {code:,} bytes of code"
         f" and constants ({size['code_from']}), {size['memory_bytes']:,} bytes of memory between"
-        f" steps on {size['machine']}"
+        f" steps{_describe_step_time(size)} on {size['machine']}"
     )
     warnings = []
     if stack > STACK_LIMIT:
@@ -386,6 +435,12 @@ def report_footprint(file_name: str, size: Mapping[str, Any]) -> list[str]:
     for warning in warnings:
         log_message(f"  warning: {warning}")
     return warnings
+
+
+def _describe_step_time(size: Mapping[str, Any]) -> str:
+    """Return the time of one step in words; empty if it was not measured."""
+    seconds = size.get("step_seconds")
+    return "" if seconds is None else f", {1e6 * seconds:.2g} us per step"
 
 
 _STEP_COMMENTS = {
@@ -571,6 +626,14 @@ class CompiledModel(LoadedExport):
             )
         )  # fmt: skip
 
+    @property
+    def step_sizes(self) -> list[int]:
+        """Number of entries of each array that the function `step` takes, in order."""
+        skipped_flags = self.exported.flags[:1]
+        return [n_entries for _, n_entries in self.exported.arguments] + [
+            n_entries for name, n_entries in self.output_sizes.items() if name not in skipped_flags
+        ]
+
     def step(self, *step_arguments: NumberArray) -> tuple[Any, ...]:
         flags = self.exported.flags
         outputs = {
@@ -621,6 +684,7 @@ class CExporter(Exporter):
             "dtype": "float32; float64 with the macro _DOUBLE",
             "safety": "The file is source code: compile only what you trust.",
         }
+        step_sizes: list[int] = []
         with tempfile.TemporaryDirectory() as name:
             temporary_path = Path(name) / file.name
 
@@ -641,8 +705,10 @@ class CExporter(Exporter):
                     compile_shared_library(
                         [temporary_path], library, double_flags if precision == "double" else []
                     )
+                    compiled = CompiledModel(library, exported, checked_dtype, prefix)
+                    step_sizes[:] = compiled.step_sizes
                     parity[precision] = exported.check_parity(
-                        CompiledModel(library, exported, checked_dtype, prefix),
+                        compiled,
                         f"the C file in {precision} precision",
                         checked_dtype,
                     )
@@ -653,6 +719,7 @@ class CExporter(Exporter):
                 card |= {"dtype": get_dtype_name(dtype)}
             size = measure_footprint(temporary_path)
             size["memory_bytes"] = measure_memory(exported)
+            size["step_seconds"] = measure_step_time(temporary_path, f"{prefix}_step", step_sizes)
             size["warnings"] = report_footprint(file.name, size)
             card |= {"size": size, "parity": parity}
             write_card(file, card)
