@@ -29,6 +29,9 @@ from residnet.report.blocks import (
     flag_cell,
 )
 from residnet.report.figure import (
+    BLUE,
+    GREY,
+    VERMILLION,
     ZERO_LINE_STYLE,
     Case,
     Curve,
@@ -116,6 +119,8 @@ def axis_words(test: StepTestConfig | ConditionsConfig) -> AxisWords:
     return _HEADING_WORDS if test.depth is None else _DEPTH_WORDS
 
 
+_LEARNED_KINDS = ("policy", "network")
+"""Kinds of controllers with a trained network."""
 _KIND_LABELS = {
     "policy": "learned",
     "network": "learned, no law inside",
@@ -138,6 +143,11 @@ def _iterate_autopilot_figures(
     nominal_kinds = {row.model: row.kind for row in metrics.rows if row.protocol == "nominal"}
     yield _response_figure(
         run.read_required_parquet(RESPONSES_FILE), nominal_kinds, settings.test, run.title
+    )
+    yield _flights_figure(
+        run.read_required_parquet(RESPONSES_FILE),
+        _order_controllers(metrics.rows, nominal_kinds),
+        settings.test,
     )
     axis_labels = axis_words(settings.test)
     yield _distribution_figure(
@@ -223,6 +233,81 @@ def _response_figure(
             Panel(f"{axis_labels.rudder}\n[deg]", "time [s]", height=150),
         ],
         [Case("", list(traces.values()))],
+    )
+
+
+_MAX_FLIGHTS = 8
+"""Number of controllers whose flights fit on the first screen."""
+
+
+def _order_controllers(rows: Sequence[HeadingRow], kinds: Mapping[str, str]) -> dict[str, str]:
+    """Return the kinds of the controllers, policies first, then by the mean cost or settling."""
+    sort_values: dict[str, float] = {}
+    for row in rows:
+        if row.protocol == "conditions":
+            sort_values[row.model] = row.mean_cost
+        elif row.protocol == "nominal":
+            sort_values.setdefault(row.model, row.max_settling)
+    ordered = sorted(
+        kinds, key=lambda name: (kinds[name] not in _LEARNED_KINDS, sort_values.get(name, math.inf))
+    )
+    return {name: kinds[name] for name in ordered[:_MAX_FLIGHTS]}
+
+
+def _flights_figure(series: pd.DataFrame, kinds: Mapping[str, str], test: StepTestConfig) -> Figure:
+    """Draw the step response of each controller in a panel of its own, with the corners shaded.
+
+    Args:
+        series: responses of the nominal vessel and of the corners of the spread.
+        kinds: kind of each controller that is drawn, in order.
+        test: test of the run, with the step.
+    """
+    axis_labels = axis_words(test)
+    change, settling_band = test.step_and_tolerance
+    value = axis_labels.columns[0]
+    band_limits = axis_labels.scale * (change + settling_band * np.array([-1.0, 1.0]))
+    panels = []
+    curves: list[dict[str, Curve]] = []
+    for name, kind in kinds.items():
+        pivoted: Any = axis_labels.scale * series[series["controller"] == name].pivot_table(
+            index="t", columns=["effect", "time"], values=value
+        )
+        values = pivoted.to_numpy()
+        style_name = "learned" if kind in _LEARNED_KINDS else "classical"
+        panels.append(Panel(title=name, height=90))
+        curves.append(
+            {
+                "corners": band_outline(pivoted.index, values.min(axis=1), values.max(axis=1)),
+                "settled": (np.zeros(2), band_limits),
+                style_name: (pivoted.index.to_numpy(), pivoted[(1.0, 1.0)].to_numpy()),
+            }
+        )
+    upper_limit = 1.05 * max(
+        float(np.nanmax(np.abs(curve["corners"][1]), initial=band_limits[1])) for curve in curves
+    )
+    upper_limit = min(upper_limit, 2.0 * float(band_limits[1]))
+    panels = [
+        replace(panel, y_limits=(-0.05 * upper_limit, upper_limit), x_label="time [s]")
+        if number >= len(panels) - 2
+        else replace(panel, y_limits=(-0.05 * upper_limit, upper_limit))
+        for number, panel in enumerate(panels)
+    ]
+    return Figure(
+        "flights",
+        "Step response by controller",
+        f"{axis_labels.value.capitalize()} [{axis_labels.unit}] in a step of"
+        f" {axis_labels.scale * change:.3g} {axis_labels.unit}: the nominal vessel, shaded the"
+        " corners of the spread; dotted the band of settling.",
+        {
+            "learned": GlyphStyle("learned policy", VERMILLION, width=1.6, z_order=4),
+            "classical": GlyphStyle("classical law", BLUE, width=1.6, z_order=4),
+            "corners": GlyphStyle("corners", GREY, kind="fill", alpha=0.3, z_order=1),
+            "settled": replace(ZERO_LINE_STYLE, label="band", dash="dotted"),
+        },
+        panels,
+        [Case("", curves, has_static_image=False)],
+        columns=2,
+        is_drawing=True,
     )
 
 
@@ -368,13 +453,13 @@ def sections(run: RunFiles) -> list[Section]:
     settling_comparison = settling_table(metrics.rows, metrics.floor, axis_labels)
     conditions = settings.conditions
     costs = None if conditions is None else cost_table(metrics.rows, axis_labels)
-    previews = [figure.preview() for figure in read_figures(run.path / "figures", "responses")]
+    flights = read_figures(run.path / "figures", "flights")
     # settling of the nominal vessel and of the spread, or the cost of a change
     opening_table = (
         settling_comparison.select_columns(0, 3) if costs is None else costs.select_columns(1, 4)
     )
     sections_written = [
-        Section("", [*previews, opening_table]),
+        Section("", [*flights, opening_table]),
         Section(
             "Controllers compared",
             [
@@ -389,7 +474,7 @@ def sections(run: RunFiles) -> list[Section]:
                 Text(_effort_text(settings.test), is_secondary=True),
             ],
         ),
-        *figures_section(run.path / "figures"),
+        *figures_section(run.path / "figures", "(?!flights$).*"),
     ]
     if costs is not None and conditions is not None:
         blocks: list[Block] = [costs, Text(_conditions_text(conditions), is_secondary=True)]
@@ -550,17 +635,22 @@ def best_classical_row(rows: Sequence[HeadingRow]) -> HeadingRow:
     return min(classical_rows or condition_rows, key=lambda row: row.mean_cost)
 
 
-def cost_sentences(rows: Sequence[HeadingRow]) -> list[str]:
+def cost_sentences(rows: Sequence[HeadingRow], vessel_text: str = "") -> list[str]:
     """Return a sentence for each learned policy on its cost and that of the best classical law.
 
     It is empty without operating conditions.
+
+    Args:
+        rows: rows of metrics.json.
+        vessel_text: the simulated vessel, for which the claims hold; empty if it is not named.
     """
+    conditions_text = f"Under the stated conditions{f' on {vessel_text}' if vessel_text else ''}"
     rows_by_model = {row.model: row for row in rows if row.protocol == "conditions"}
     if not rows_by_model:
         return []
     best_row = best_classical_row(rows)
     sentences = [
-        f"Under the stated conditions the tuned law '{name}' costs {row.mean_cost:.3f} s a"
+        f"{conditions_text} the tuned law '{name}' costs {row.mean_cost:.3f} s a"
         f" change; the best classical law, '{best_row.model}', costs"
         f" {best_row.mean_cost:.3f} s."
         for name, row in rows_by_model.items()
@@ -579,7 +669,7 @@ def cost_sentences(rows: Sequence[HeadingRow]) -> list[str]:
             else f"; with its network switched off it costs {switched_off.mean_cost:.3f} s"
         )
         sentences.append(
-            f"Under the stated conditions '{name}' costs {cost:.3f} s a change,"
+            f"{conditions_text} '{name}' costs {cost:.3f} s a change,"
             f" {100 * abs(cost / best_cost - 1):.1f} % {'below' if cost < best_cost else 'above'}"
             f" '{best_row.model}', the best classical law, with {best_cost:.3f} s{network_text}."
         )

@@ -454,7 +454,9 @@ def _summarize(
     settling_by_model = {
         (row.model, row.protocol): row.settling.max for row in rows if row.settling is not None
     }
-    sentences = cost_sentences(rows)
+    is_linear = isinstance(load_vessel(config.vessel), NomotoVesselConfig)
+    vessel_text = "the linear vessel model" if is_linear else "the nonlinear vessel model"
+    sentences = cost_sentences(rows, vessel_text)
     summary_metrics = dict[str, SummaryMetric]()
     reference_change, _ = config.test.step_and_tolerance
     axis_labels = axis_words(config.test)
