@@ -494,7 +494,7 @@ def describe_main_horizon(evidence: VerdictEvidence, main: ProtocolHorizon) -> l
 
 def _describe_errors(model: str, row: HorizonRow) -> str:
     """Return a clause with the pose errors of a model, each with its prediction interval."""
-    texts = []
+    texts: list[str] = []
     errors = row.models[model]
     for error_name, error in errors.by_name.items():
         unit, factor = display_unit(POSE_ERROR_UNITS[error_name])
