@@ -275,7 +275,7 @@ def test_a_simulation_by_function_and_mapping_is_one() -> None:
     found = result.read_file("indices.json")["rows"][0]["indices"]
     assert found["first_overshoot"] == pytest.approx(overshoot, rel=1e-12)
     assert result.read_file("summary.json")["figures"]["logs"]["value"] == 2
-    assert result.verdict[0].startswith("All 2 manoeuvres ended as they should")
+    assert result.verdict[0].startswith("All 2 manoeuvres were completed")
     assert "logs/zigzag_01.parquet" in result.file_names
     folder = result.folder
     assert folder.exists()

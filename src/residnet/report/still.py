@@ -29,6 +29,10 @@ _MAX_INLINE_WIDTH = 5.0
 """Width in inches to which a drawing grows on a large screen."""
 _MAP_HEIGHT = 4.2
 """Height of a row of maps in inches."""
+_MAX_LABELLED_RATIO = 30.0
+"""Ratio of the limits of a logarithmic axis up to which ticks between powers of ten have labels:
+more would overlap in a panel of two centimetres.
+"""
 _DASHES: dict[str, Any] = {
     "solid": "-",
     "dashed": "--",
@@ -205,13 +209,19 @@ def _format_axis(
     tick_names: Mapping[str, str],
 ) -> None:
     """Set the scale, the named ticks and the limits of one axis of a panel."""
-    from matplotlib.ticker import LogFormatter
+    from matplotlib.ticker import FuncFormatter, LogLocator
 
     if is_logarithmic:
         getattr(axes, f"set_{direction}scale")("log")
         axis = axes.xaxis if direction == "x" else axes.yaxis
-        axis.set_major_formatter(LogFormatter())
-        axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.6)))
+
+        def format_minor_tick(value: float, _: int) -> str:
+            lower, upper = sorted(axis.get_view_interval())
+            return f"{value:g}" if upper < _MAX_LABELLED_RATIO * lower else ""
+
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+        axis.set_minor_formatter(FuncFormatter(format_minor_tick))
     if tick_names:
         # long names overlap side by side
         tick_style = (

@@ -144,7 +144,7 @@ def _trials_table(content: IndicesFile) -> Table:
     def outcome(row: FlightIndices) -> Cell | str:
         if row.fault:
             return flag_cell(row.fault, True)
-        return index_title(main_index(row)) or "ended as it should"
+        return index_title(main_index(row)) or "completed"
 
     def value(row: FlightIndices) -> str:
         name = main_index(row)
@@ -229,7 +229,7 @@ def _limit_cell(
     is_met = all(entry.kept for entry in limited_entries)
     share_met = limited_entries[0].kept_share
     note = (
-        ("kept" if is_met else "exceeded")
+        ("met" if is_met else "exceeded")
         if share_met is None
         else f"kept by {100 * share_met:.0f} %"
     )

@@ -437,7 +437,7 @@ def evolution_figures(run: RunFiles) -> Iterator[Figure]:
                 " samples that breed and on those that validate. A ring marks the generation whose"
                 " equation was kept, the least validation error. A curve that still falls at its"
                 " end asks for more generations.",
-                style_family(_SPLITS) | {"kept": replace(_RING_STYLE, label="kept")},
+                style_family(_SPLITS) | {"kept": replace(_RING_STYLE, label="selected")},
                 panels,
                 [Case("", panel_curves)],
                 columns=len(panels),

@@ -309,7 +309,13 @@ def _build_horizon_table(run: RunFiles) -> Table | None:
                 )
             ),
             ("free runs", lambda horizon: f"{horizon.row.windows} ({horizon.protocol})", str),
-            ("level", lambda horizon: LEVEL_TEXTS[rate_horizon(evidence, horizon.row)]),
+            (
+                "level",
+                # symbol and word on one line
+                lambda horizon: LEVEL_TEXTS[rate_horizon(evidence, horizon.row)].replace(
+                    " ", "\u00a0", 1
+                ),
+            ),
         ],
         is_selected=lambda horizon: horizon.row.seconds == main_seconds,
     )

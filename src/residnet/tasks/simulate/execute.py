@@ -91,14 +91,13 @@ def execute(config: SimulateConfig, folder: RunFolder) -> TaskOutcome:
     n_flights = len(flights_by_folder)
     faulty_rows = [row for row in rows if row.fault]
     completion_text = (
-        f"{len(faulty_rows)} of {n_flights} manoeuvres did NOT end as they should"
+        f"{len(faulty_rows)} of {n_flights} manoeuvres were NOT completed"
         if faulty_rows
-        else f"All {n_flights} manoeuvres ended as they should"
+        else f"All {n_flights} manoeuvres were completed"
     )
     verdict = [
-        f"{completion_text}; they were flown by"
-        f" {' and '.join(craft.name for craft, _ in flights_by_craft)}, and"
-        " their logs are in the folder logs."
+        f"{completion_text} by {' and '.join(craft.name for craft, _ in flights_by_craft)}; the"
+        " logs are in the folder logs."
     ]
     verdict += [f"{row.craft}, {row.log}: {row.fault}." for row in faulty_rows[:5]]
     fault_messages = [
@@ -111,9 +110,8 @@ def execute(config: SimulateConfig, folder: RunFolder) -> TaskOutcome:
         log_message(line)
     failures = [line for line, is_listed in fault_messages if is_listed]
     failure_message = failures and (
-        f"{failures[-1]} ({len(failures)} of {n_flights} flights did not end as they should;"
-        f" give"
-        " more duration, drive or steer)"
+        f"{failures[-1]} ({len(failures)} of {n_flights} flights were not completed;"
+        " give more duration, drive or steer)"
     )
     return TaskOutcome(
         verdict,
