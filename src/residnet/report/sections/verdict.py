@@ -250,6 +250,7 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         "Noise floor: the error of the integrated measured velocities."
         if any(line.model is None for line in table)
         else "",
+        "Sound: all physical checks passed and no free run diverged." if faults_by_model else "",
         *(f"✗ {model_name(line)}: {reason}." for line in table if (reason := fault_text(line))),
     ]
     error_table = build_table(
