@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from pictures import omit_drawings
 from pydantic import ValidationError
 
+from residnet.autopilot import export
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.autopilot.tasks.autopilot.config import AutopilotConfig, minimum_turn_time
 from residnet.autopilot.tasks.design import draft_autopilot_config
@@ -102,7 +104,11 @@ def test_gain_and_time_are_enough(tmp_path: Path) -> None:
             draft_autopilot_config([given], tmp_path / f"{out}.yaml", rudder=rudder)
 
 
-def test_the_classical_law_is_exported_without_training(tmp_path: Path) -> None:
+def test_the_classical_law_is_exported_without_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    omit_drawings(monkeypatch)
+    monkeypatch.setattr(export, "PARITY_STEPS", 60)
     lines: list[str] = []
     file = draft_autopilot_config(["0.31,7.4"], tmp_path / "law.yaml", classical=True)
     overrides = ["conditions.evolution.generations=3", "conditions.flights=50", "test.plants=5"]

@@ -241,8 +241,10 @@ def test_what_is_read_from_a_flight() -> None:
     flights = made([[3.0, 1.0, -1.0, 1.0, -1.0]])
     assert float(flights.control_effort()[0]) == pytest.approx(4 * 0.04 * 0.5)
     row = build_sea_row("pd", "classical", flights, 0.5)
-    assert row["heading_rms"]["mean"] == pytest.approx(1.0)
-    assert row["rudder_rms"]["mean"] == pytest.approx(0.2)
+    assert row.heading_rms is not None
+    assert row.heading_rms.mean == pytest.approx(1.0)
+    assert row.rudder_rms is not None
+    assert row.rudder_rms.mean == pytest.approx(0.2)
 
 
 def test_the_floor_of_a_slow_rudder_comes_to_rest_in_the_least_time() -> None:
