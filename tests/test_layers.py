@@ -49,6 +49,7 @@ ALLOWED = {("__main__", "cli"), ("studies", "autopilot")}
 RANK = {package: rank for rank, packages in enumerate(LAYERS) for package in packages}
 RANK |= dict.fromkeys(WINGS, len(LAYERS))
 FILES = sorted(ROOT.rglob("*.py"))
+SUPPORT = str(Path(__file__).parent / "support")
 
 
 RUN_COMMANDS = """
@@ -56,8 +57,12 @@ import json, sys
 import residnet
 from residnet.__main__ import main
 from residnet.export import vessel
+commands, wings, support = json.loads(sys.argv[1])
+sys.path.append(support)
+import pytest
+from pictures import omit_drawings
+omit_drawings(pytest.MonkeyPatch())
 vessel.PARITY_STEPS = 60
-commands, wings = json.loads(sys.argv[1])
 for command in commands:
     sys.argv = ["residnet", *command]
     try:
@@ -183,7 +188,7 @@ def test_core_commands_load_no_wing(tmp_path: Path) -> None:
         ["export", "run", "--model", "ridge", "--format", "c", "--anyway"],
     ]
     finished = subprocess.run(
-        [sys.executable, "-c", RUN_COMMANDS, json.dumps([commands, sorted(WINGS)])],
+        [sys.executable, "-c", RUN_COMMANDS, json.dumps([commands, sorted(WINGS), SUPPORT])],
         cwd=tmp_path,
         capture_output=True,
         text=True,
