@@ -28,7 +28,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, final
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +39,9 @@ from torch import nn
 from residnet.core.errors import ExportError, WithheldError
 from residnet.core.version import __version__
 from residnet.evaluation.assessment import Assessment
+
+if TYPE_CHECKING:
+    from residnet.dynamics.store import ModelSpec
 
 NumberArray = npt.NDArray[Any]
 SINGLE_TOLERANCE = 1e-5
@@ -222,6 +225,10 @@ class Exporter(ABC):
     about: ClassVar[str]
     default_name_from_run: ClassVar[bool] = False
     is_for_microcontrollers: ClassVar[bool] = False
+
+    def supports(self, spec: ModelSpec) -> bool:
+        """Return whether the format can hold a model; otherwise another one is proposed."""
+        return True
 
     @abstractmethod
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:

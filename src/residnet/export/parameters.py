@@ -3,13 +3,17 @@
 It is written as JSON and for Gazebo, VRX, MSS and PythonVehicleSimulator. C is Fossen's
 skew-symmetric form of M (Fossen 2011, section 6.3). Terms of the baseline beyond this form are
 projected onto the damping over the training range, and the unexplained share is stated.
+
+Accelerations determine masses only if the inputs are forces. For a model of propeller and rudder
+commands, the ratios of forces to masses are identifiable: the coefficients of the accelerations
+are written, and the masses and forces that they do not determine are listed.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, final
@@ -23,6 +27,7 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config_yaml import parse_yaml
 from residnet.core.errors import UsageError
 from residnet.core.names import ACCELERATION_NAMES, FORCE_CHANNELS, VELOCITY_NAMES
+from residnet.core.progress import log_message
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exportable, Exporter, render_template
@@ -67,26 +72,63 @@ def compute_coriolis_force(mass: Matrix, nu: Matrix) -> Matrix:
     )
 
 
+def has_terms(spec: ModelSpec) -> bool:
+    """Return whether the baseline of a model is a sum of terms of velocities and inputs."""
+    return spec.baseline.kind in _KINDS_WITH_TERMS
+
+
+def tabulate_accelerations(
+    theta: Matrix, terms: Sequence[str], axis_names: Sequence[str]
+) -> dict[str, dict[str, float]]:
+    """Return the nonzero coefficients of the accelerations by axis and term.
+
+    Args:
+        theta: coefficients [n, J] of nu_dot = theta phi.
+        terms: names of the J terms phi.
+        axis_names: names of the n accelerations.
+    """
+    return {
+        axis: {term: float(value) for term, value in zip(terms, row, strict=True) if value != 0.0}
+        for axis, row in zip(axis_names, theta, strict=True)
+    }
+
+
+def list_unidentifiable(
+    theta: Matrix, terms: Sequence[str], axis_names: Sequence[str]
+) -> list[str]:
+    """Return what the accelerations do not determine, one sentence each; empty if they do.
+
+    The coefficients of tau_x, tau_y and tau_n are the inverse of the mass matrix.
+
+    Args:
+        theta: coefficients [n, J] of nu_dot = theta phi.
+        terms: names of the J terms phi.
+        axis_names: names of the n accelerations.
+    """
+    if tuple(axis_names) != ACCELERATION_NAMES:
+        return [f"M, D and D_n: the model has the accelerations {', '.join(axis_names)} alone"]
+    missing_forces = [name for name in FORCE_CHANNELS if name not in terms]
+    if not missing_forces:
+        force_columns = [terms.index(name) for name in FORCE_CHANNELS]
+        if np.linalg.matrix_rank(theta[:, force_columns]) == 3:
+            return []
+        return ["M, D and D_n: the coefficients of tau_x, tau_y and tau_n are linearly dependent"]
+    names = ", ".join(missing_forces)
+    missing = f"{names} {'is' if len(missing_forces) == 1 else 'are'} no input of the model"
+    return [
+        f"M, D and D_n: {missing}, and accelerations determine masses only if forces are known",
+        "forces of propellers, rudders and damping: each coefficient is a force divided by masses",
+    ]
+
+
 def identify_coefficients(spec: ModelSpec, model: HybridDynamics) -> VesselCoefficients:
-    """Return the coefficients of a model's baseline.
+    """Return the coefficients of a model's baseline, whose terms include three forces.
 
     Raises:
         UsageError: if the baseline is not a sum of terms of velocities and forces.
     """
-    theta, terms = _baseline_terms(spec, model)
-    force_columns = [terms.index(name) if name in terms else -1 for name in FORCE_CHANNELS]
-    force_columns_theta = theta[:, force_columns] if min(force_columns) >= 0 else np.zeros((3, 3))
-    if np.linalg.matrix_rank(force_columns_theta) < 3:
-        missing = [
-            name
-            for name, term_index in zip(FORCE_CHANNELS, force_columns, strict=True)
-            if term_index < 0
-        ]
-        raise UsageError(
-            f"model {spec.name}: its accelerations do not tell all masses"
-            f" ({', '.join(missing) or 'the forces act alike'} is not among the baseline's terms);"
-            " fit a baseline of kind believed, or one of regressors with tau_x, tau_y and tau_n"
-        )
+    theta, terms, _ = _baseline_terms(spec, model)
+    force_columns_theta = theta[:, [terms.index(name) for name in FORCE_CHANNELS]]
     # nu_dot = M^-1 (tau - ...): the coefficients of the forces are the inverse of the mass matrix
     mass: Matrix = np.linalg.inv(force_columns_theta).astype(np.float64)
     lower = np.array(spec.low[:3])
@@ -121,17 +163,20 @@ def identify_coefficients(spec: ModelSpec, model: HybridDynamics) -> VesselCoeff
     )
 
 
-def _baseline_terms(spec: ModelSpec, model: HybridDynamics) -> tuple[Matrix, list[str]]:
-    """Return the coefficients [3, J] of the accelerations and their terms."""
+def _baseline_terms(
+    spec: ModelSpec, model: HybridDynamics
+) -> tuple[Matrix, list[str], tuple[str, ...]]:
+    """Return the coefficients [n, J] of the accelerations, their terms and their names."""
     baseline = model.baseline
     if isinstance(baseline, RegressorBaseline):
         theta = (baseline.theta * baseline.term_mask).detach().double().numpy()
-        return theta, list(baseline.library.terms)
+        return theta, list(baseline.library.terms), tuple(baseline.output_names)
     if isinstance(baseline, FixedBaseline) and baseline.library.n_terms:
-        return baseline.theta.double().numpy(), list(baseline.library.terms)
+        terms = list(baseline.library.terms)
+        return baseline.theta.double().numpy(), terms, ACCELERATION_NAMES
     raise UsageError(
         f"model {spec.name}: its baseline '{spec.baseline.kind}' is no sum of terms of velocities"
-        " and forces; the parameters of a baseline of kind regressors or believed can be exported"
+        " and forces; choose a model with a baseline of kind regressors or believed (--model)"
     )
 
 
@@ -207,6 +252,8 @@ def render_simulator_files(
     }
 
 
+_KINDS_WITH_TERMS = ("regressors", "believed")
+"""Kinds of baselines that are sums of terms."""
 _RIGID_BODY_UNITS = {"mass": "kg", "inertia": "kg m^2 about z"}
 
 
@@ -220,9 +267,13 @@ class ParametersExporter(Exporter):
         "A baseline's masses and damping for Gazebo, VRX, MSS and PythonVehicleSimulator."
     )
 
+    def supports(self, spec: ModelSpec) -> bool:
+        return has_terms(spec)
+
     def export(self, exported: Exportable, file: Path) -> Mapping[str, Any]:
         """Write the coefficients as JSON and one file for each simulator.
 
+        Simulators need masses: their files are written only if the inputs of the model are forces.
         Rigid-body masses cannot be identified from accelerations; they are read from a file of the
         same name with the suffix `.masses.yaml`.
         """
@@ -230,7 +281,34 @@ class ParametersExporter(Exporter):
             raise UsageError(f"{exported.label}: only vessel models have masses and damping")
         exported.require_finite_numbers()
         spec = exported.spec
-        vessel_coefficients = identify_coefficients(spec, exported.to_precision(torch.float64))
+        model = exported.to_precision(torch.float64)
+        theta, terms, axis_names = _baseline_terms(spec, model)
+        unidentifiable = list_unidentifiable(theta, terms, axis_names)
+        accelerations = tabulate_accelerations(theta, terms, axis_names)
+        head_left_out = None if spec.head is None else spec.head.kind
+        if unidentifiable:
+            card = {
+                "schema": "residnet.parameters/1",
+                "model": spec.name,
+                "form": "acceleration = sum of coefficient times term; terms in SI units and rad,"
+                " accelerations in m/s^2 and rad/s^2",
+                "accelerations": accelerations,
+                "training_range": {
+                    channel: [low, high]
+                    # velocities and inputs come first; computed channels have no range
+                    for channel, low, high in zip(
+                        model.signals.names, spec.low, spec.high, strict=False
+                    )
+                },
+                "not_identifiable": unidentifiable,
+                "head_left_out": head_left_out,
+                **exported.provenance(),
+            }
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps(card, indent=1) + "\n")
+            log_message(f"  model {spec.name}: not identifiable: {'; '.join(unidentifiable)}")
+            return card
+        vessel_coefficients = identify_coefficients(spec, model)
         name = to_c_identifier(spec.name)
         file_stem = file.name.removesuffix(self.suffix)
         rigid_body = _read_rigid_body(file.with_name(f"{file_stem}.masses.yaml"))
@@ -244,7 +322,9 @@ class ParametersExporter(Exporter):
             "D_n": vessel_coefficients.quadratic.tolist(),
             "share_left_out": vessel_coefficients.left_out,
             "terms_left_out": vessel_coefficients.terms_left_out,
-            "head_left_out": None if spec.head is None else spec.head.kind,
+            "accelerations": accelerations,
+            "not_identifiable": [],
+            "head_left_out": head_left_out,
             **exported.provenance(),
         }
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -73,7 +73,10 @@ def _report_sources(logs: Sequence[PreparedLog]) -> None:
             ", ".join(log.log.meta[key]) for log in logs if key in log.log.meta
         ]
         for names in dict.fromkeys(derived_channel_texts):
-            log_message(f"  {names} of {derived_channel_texts.count(names)} logs {source_text}")
+            # a split may divide a log: these are parts of logs
+            count = derived_channel_texts.count(names)
+            parts_text = "1 part" if count == 1 else f"{count} parts"
+            log_message(f"  {names} of {parts_text} of the logs {source_text}")
     for log in logs:
         spike_counts = log.log.meta.get("spikes", {})
         if spike_counts:

@@ -360,12 +360,11 @@ def printed_resolution(values: np.ndarray) -> np.ndarray | None:
             continue
         resolution, counts, are_integers = count_digits(finite, n_digits)
         if are_integers:
-            # a fixed number of decimals gives the digits of small values a coarser last one
-            is_finer_below = resolution.max() > 5.0 * resolution.min()
-            has_printed_digits = bool(
-                (np.round(counts[resolution == resolution.min()]) % 10.0 != 0.0).any()
-            )
-            if not (is_finer_below and has_printed_digits):
+            # with a fixed number of decimals the last digit of all values below the largest
+            # magnitude is zero; few values may end in zero by chance
+            is_finer = resolution < 0.2 * resolution.max()
+            last_digits = np.round(counts[is_finer]) % 10.0
+            if not is_finer.any() or float((last_digits != 0.0).mean()) < 0.5:
                 return None
             return resolution_of(np.where(values == 0.0, np.abs(finite).min(), values), n_digits)
     return None

@@ -69,7 +69,12 @@ def report_missing_motion(log: LogStatistics, make_finding: Check) -> Iterator[F
                 else derivation_text
             )
             if not dof.fixed_states:
-                yield make_finding(f"no {', '.join(missing_names)}: they {derivation_text}")
+                is_single = len(missing_names) == 1
+                if is_single:
+                    derivation_text = derivation_text.replace("follow", "follows", 1)
+                    derivation_text = derivation_text.replace("are int", "is int", 1)
+                pronoun = "it" if is_single else "they"
+                yield make_finding(f"no {', '.join(missing_names)}: {pronoun} {derivation_text}")
             else:
                 yield make_finding(f"no {', '.join(missing_names)}: {dof.description}")
     if "p" in log and not dof.has_roll:

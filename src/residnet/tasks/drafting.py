@@ -585,7 +585,8 @@ class _DraftLogs:
                 f" velocities, and"
                 " errors of position and heading are those of integrated velocities."
             )
-        log_message(f"{len(self.logs)} logs were read, {len(self.exclusion_reasons)} left out")
+        logs_text = "1 log was" if len(self.logs) == 1 else f"{len(self.logs)} logs were"
+        log_message(f"{logs_text} read, {len(self.exclusion_reasons)} left out")
         return lines
 
 

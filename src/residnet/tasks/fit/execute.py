@@ -56,7 +56,9 @@ from residnet.tasks.fit.outcome import (
 from residnet.training.records import CurrentsFile
 
 if TYPE_CHECKING:
+    from residnet.dynamics.hybrid import HybridDynamics
     from residnet.dynamics.scaling import ScaleEffects
+    from residnet.dynamics.store import ModelSpec
     from residnet.physics.similarity import FroudeScaling
     from residnet.tasks.fit.config import FitConfig
     from residnet.tasks.fit.service import MonitoredLog, NextTrials, RefitResult
@@ -213,6 +215,8 @@ def export_model(config: FitConfig, request: ExportRequest) -> Path:
             f"{run.path}: no model '{name}'{suggest_name(name, [*aliases, *available_models])}"
         )
     spec, model = load_model(run.models / model_name)
+    if name in aliases and not get_exporter(request.file_format).supports(spec):
+        model_name, (spec, model) = find_supported_model(request, model_name)
     rows = [row for row in metrics.rows if row.model == model_name and row.manoeuvre == "all"]
     found = collect_evidence(RunFiles(run.path), model_name)
     # a model without free runs on the reported split has no verdict
@@ -228,6 +232,37 @@ def export_model(config: FitConfig, request: ExportRequest) -> Path:
         text = describe_single_model(run, model_name, metrics.selected, ensemble_bytes)
         log_message(f"  {text}")
     return file
+
+
+def find_supported_model(
+    request: ExportRequest, reported: str
+) -> tuple[str, tuple[ModelSpec, HybridDynamics]]:
+    """Return name, spec and module of the best model of a run that a format can hold.
+
+    Models without a learned part come first, then the selected model, then the order of the run.
+
+    Args:
+        request: the export request.
+        reported: name of the model reported first, which the format cannot hold.
+
+    Raises:
+        UsageError: if the format can hold no model of the run.
+    """
+    run = request.run
+    export_format = get_exporter(request.file_format)
+    selected = run.read_metrics().selected
+    loaded = {name: load_model(run.models / name) for name in model_names(run.models)}
+    candidates = [name for name, (spec, _) in loaded.items() if export_format.supports(spec)]
+    if not candidates:
+        raise UsageError(
+            f"{run.path}: the format {request.file_format} can hold no model of this run"
+            f" ({', '.join(loaded)}); choose another --format"
+        )
+    best = min(candidates, key=lambda name: (loaded[name][0].head is not None, name != selected))
+    log_message(
+        f"  the format {request.file_format} cannot hold {reported}; the model is {best} (--model)"
+    )
+    return best, loaded[best]
 
 
 def describe_single_model(run: RunFolder, ensemble: str, single: str, ensemble_bytes: int) -> str:
