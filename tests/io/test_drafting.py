@@ -25,6 +25,7 @@ from residnet.core.log import Log
 from residnet.io.drafting.questions import DraftNotes, Question
 from residnet.io.drafting.tables import draft_tables
 from residnet.io.header_vocabulary import (
+    match_depth_channel,
     match_input_channel,
     match_state_channel,
     parse_header_unit,
@@ -109,8 +110,8 @@ CALLED: dict[str | None, str] = {
     "wind_speed": "wind_velo_true [m/s]|TWS|wind speed x",
     None: "Kurs über Grund [°]|course over ground|alloc_age|lateral acceleration"
     "|Battery_V|cooling fan [%]|engine temperature [°C]|engine load|oil pressure main engine"
-    "|twist.linear.z",
-    "speed": "speed over ground [kn]|speed through water",
+    "|twist.linear.z|v_z|ang_vel_x|angular_velocity_y|mocap_z",
+    "speed": "speed over ground [kn]|speed through water|nopeus",
     "v": "speed to starboard [kn]|Vy [m/s]|SpeedTrans_kn|pose.twist.linear.y",
     "cmd_delta": "rudder_cmd|Ruderlage soll|Rudersollwinkel",
     "n_port": "engine rpm port|left_rpm|Motor L (%)",
@@ -122,11 +123,12 @@ CALLED: dict[str | None, str] = {
     "thrust_stbd": "thruster right",
     "cmd_thrust_port": "/thrusters/left/cmd/data",
     "wind_dir": "TWD",
-    "x": "x_m|north_m|local_x|Nordposition [m]|pos_n|Nordwert [m]",
+    "x": "X_CG|xcog|mocap_x|x_m|north_m|local_x|Nordposition [m]|pos_n|Nordwert [m]",
     "y": "Posición Y|Ostposition [m]|Ost-Koordinate|Rechtswert|Ostwert [m]|Ostkoordinate",
     "r": "Taux de virage|yaw rate r|旋回角速度|IMU.GyrZ|SCALED_IMU.zgyro|r_dps"
-    "|yaw_rate_degps|r_radps|r_rps",
-    "delta": "steering angle",
+    "|yaw_rate_degps|r_radps|r_rps|gyro_z_rads|ang_vel_z|girrate",
+    "delta": "steering angle|styreutslag",
+    "cmd_port": "u_left",
     "n": "Istdrehzahl [U/min]|Motordrehzahl [1/min]|erpm",
     "servo_3": "servo3_raw",
     "n_stbd": "Motor R (%)|right_fan [%]",
@@ -144,6 +146,14 @@ def test_what_a_name_is_about(channel: str | None) -> None:
     about = {name: parse_name(name) for name in CALLED[channel].split("|")}
     found = {name: match_state_channel(w) or match_input_channel(w) for name, w in about.items()}
     assert found == dict.fromkeys(about, channel)
+
+
+@pytest.mark.parametrize(
+    ("name", "channel"),
+    [("v_z", "w"), ("wx", "p"), ("ang_vel_y", "q"), ("mocap_z", "z"), ("Z_CG [m]", "z")],
+)
+def test_names_of_vertical_motion(name: str, channel: str) -> None:
+    assert match_depth_channel(parse_name(name)) == channel
 
 
 @pytest.mark.parametrize(

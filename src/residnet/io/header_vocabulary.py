@@ -300,6 +300,10 @@ def parse_name(name: str) -> ParsedName:
     """Parse a column name into concepts."""
     tokens = [part for token in normalize_name(name).split() for part in _split_side(token)]
     text = " ".join(tokens)
+    if "ang" in tokens and re.search(r"\bang vel", text):
+        # `ang` alone abbreviates angle
+        tokens = ["angular" if word == "ang" else word for word in tokens]
+        text = " ".join(tokens)
     if len(tokens) > 1 and re.search(r"[\s_][VAW]$", _IN_BRACKETS.sub(" ", name).strip()):
         # a last V, A or W is the unit volt, ampere or watt
         tokens = tokens[:-1]
@@ -399,9 +403,11 @@ _TWIST_PATTERN = (
     r"\b(?:(?:twist|velocity) linear|linear velocity|v|vel|velo|velocity|speed|lin|linear)"
     r" ?{}(?: (?:m s|mps|ms))?$"
 )
+_RATE_UNITS = "(?:dps|degps|degs|radps|rads|rps|deg s|rad s)"
+"""Units of angular velocities at the end of a name."""
 _AXIS_RULES = (
-    _ChannelRule("u", "", "", _TWIST_PATTERN.format("x")),
-    _ChannelRule("v", "", "", _TWIST_PATTERN.format("y")),
+    _ChannelRule("u", "", "angular", _TWIST_PATTERN.format("x")),
+    _ChannelRule("v", "", "angular", _TWIST_PATTERN.format("y")),
 )
 # concepts that exclude all channels of motion
 _NON_MOTION_CONCEPTS = (
@@ -412,15 +418,23 @@ _NON_MOTION_CONCEPTS = (
 # of shaft speed
 _DRIVE_CONCEPTS = ("engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque")
 _EARTH_AXIS_CONCEPTS = "north east angular voltage"
+_POSITION_SOURCES = (
+    "(?:mocap|vicon|optitrack|qualisys|qtm|uwb|rtk|gps|gnss|nav|odom|ekf|utm|enu|ned|world|map|local|"
+    "global)"
+)
+"""Names of instruments and frames before an axis of a position."""
 _STATE_RULES = (
     _ChannelRule("latitude", "latitude"),
     _ChannelRule("longitude", "longitude", "surge speed"),
+    # the sibling of a velocity along x and y is no sway, and u of one side is a control signal
+    _ChannelRule(None, "", "angular", _TWIST_PATTERN.format("z")),
+    _ChannelRule(None, "port|starboard", "", "^u "),
     _ChannelRule("p", "roll rate|angular"),
     _ChannelRule("phi", "roll"),
     _ChannelRule("r", "turn_rate"),
     _ChannelRule("r", "heading|turn rate"),
     _ChannelRule("r", "", "", "^r( mid)?$"),
-    _ChannelRule("r", "angular", "", r" [zr](?: (?:dps|degps|radps|rps|deg s|rad s))?$"),
+    _ChannelRule("r", "angular", "", rf" [zr](?: {_RATE_UNITS})?$"),
     # an angular rate without an axis is that of the heading
     _ChannelRule("r", "angular rate", "x y pitch"),
     *_AXIS_RULES,
@@ -433,14 +447,14 @@ _STATE_RULES = (
         for about, text in (
             (direction, ""),
             (f"{axis} position", ""),
-            (axis, r"^[xy](?: ?0)?(?: m)?$"),
+            # of the centre of gravity, midship or the model, as model basins write it
+            (axis, r"^[xy](?: ?0)?(?: ?(?:cg|cog)| (?:ms|midship|model))?(?: m)?$"),
+            (axis, rf"^{_POSITION_SOURCES} [xy](?: m)?$"),
         )
     ),
     _ChannelRule("v", "sway", _EARTH_AXIS_CONCEPTS),
     _ChannelRule("u", "surge|longitude", _EARTH_AXIS_CONCEPTS),
     _ChannelRule("v", "speed port|starboard", _EARTH_AXIS_CONCEPTS),
-    # the sibling of a velocity along x and y is no speed
-    _ChannelRule(None, "", "", _TWIST_PATTERN.format("z")),
     _ChannelRule("speed", "speed", _EARTH_AXIS_CONCEPTS),
 )
 """Rules for channels of motion in order of precedence."""
@@ -448,9 +462,14 @@ _VERTICAL_TWIST_PATTERN = _TWIST_PATTERN.format("z")
 _DEPTH_RULES = (
     # the siblings of position_x, linear_x and angular_z
     _ChannelRule("z", "position", "x y speed", r"\bz(?: m)?$"),
+    _ChannelRule("z", "", "", rf"^(?:{_POSITION_SOURCES} )?z(?: ?0)?(?: ?(?:cg|cog))?(?: m)?$"),
     _ChannelRule("w", "", "angular", _VERTICAL_TWIST_PATTERN),
-    _ChannelRule("q", "angular", "", r" y(?: (?:dps|degps|radps|rps|deg s|rad s))?$"),
-    _ChannelRule("p", "angular", "", r" x(?: (?:dps|degps|radps|rps|deg s|rad s))?$"),
+    *(
+        _ChannelRule(rate, "", "", rf"^(?:w|omega) ?{axis}(?: {_RATE_UNITS})?$")
+        for rate, axis in (("p", "x"), ("q", "y"))
+    ),
+    _ChannelRule("q", "angular", "", rf" y(?: {_RATE_UNITS})?$"),
+    _ChannelRule("p", "angular", "", rf" x(?: {_RATE_UNITS})?$"),
     _ChannelRule("q", "pitch rate|speed|angular", "propeller heave"),
     _ChannelRule("theta", "pitch", "propeller heave"),
     _ChannelRule("w", "heave|depth rate|speed|angular"),
@@ -534,6 +553,7 @@ _SIDE_LETTER_PATTERN = re.compile(r"(?<=\w) ([lr])(?= |$)")
 
 
 _INPUT_RULES = (
+    _ChannelRule("cmd{side}", "port|starboard", "", r"^u \w+$"),
     _ChannelRule(None, "torque"),
     _ChannelRule("{cmd_}azimuth{side}", "azimuth"),
     _ChannelRule("{cmd_}delta_s{side}", "planes"),

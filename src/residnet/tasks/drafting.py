@@ -23,7 +23,7 @@ from residnet.core.names import BOW_WIND_CHANNELS, WIND_INPUTS
 from residnet.core.ownership import require_replaceable
 from residnet.core.progress import log_message
 from residnet.io.drafting.channels import CHANNELS_KEY
-from residnet.io.drafting.problems import group_problems
+from residnet.io.drafting.problems import group_problems, label_files
 from residnet.io.drafting.questions import (
     TEXT_COLUMNS,
     UNMAPPED_COLUMNS,
@@ -569,8 +569,9 @@ class _DraftLogs:
             "Drafted by `residnet new` from the logs alone. Lines with 'guess' say what the logs do"
             " not tell, and why this value was taken: read them before the results are trusted."
         ]
+        labels = label_files(self.exclusion_reasons)
         lines += [
-            f"left out: {path.name}: {reason}" for path, reason in self.exclusion_reasons.items()
+            f"left out: {labels[path]}: {reason}" for path, reason in self.exclusion_reasons.items()
         ]
         if derived_channels := next(iter(self.complete_logs.values())).meta.get("smoothed"):
             lines.append(

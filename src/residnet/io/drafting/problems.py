@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
@@ -33,6 +35,23 @@ def raise_unreadable(errors: Mapping[Path, ResidnetError]) -> NoReturn:
         ResidnetError: always.
     """
     raise next(iter(errors.values())) if len(errors) == 1 else UnreadableLogsError(errors)
+
+
+@contextmanager
+def name_files_in_errors(paths: Sequence[Path]) -> Iterator[None]:
+    """Let the message of a `DataError` begin with the path of a file that it is about.
+
+    Args:
+        paths: the files of which some or all have the problem, at least one.
+    """
+    try:
+        yield
+    except DataError as error:
+        message = str(error)
+        if any(str(path) in message for path in paths):
+            raise
+        others = describe_other_files_with_problem([path.name for path in paths[1:]])
+        raise DataError(f"{paths[0]}: {message}{others}") from None
 
 
 def without_channel_map(error: ResidnetError) -> ResidnetError:
@@ -69,6 +88,16 @@ def strip_file_name(paths: Iterable[Path], message: str) -> str:
     return message
 
 
+def label_files(paths: Iterable[Path]) -> dict[Path, str]:
+    """Return the names of files, with their folders where several files have the same name."""
+    all_paths = list(paths)
+    counts = Counter(path.name for path in all_paths)
+    return {
+        path: path.name if counts[path.name] == 1 else f"{path.parent.name}/{path.name}"
+        for path in all_paths
+    }
+
+
 def group_problems(messages: Mapping[Path, str], *, has_full_paths: bool = True) -> list[str]:
     """Return one line for each problem, with the number of files that have it.
 
@@ -86,17 +115,18 @@ def group_problems(messages: Mapping[Path, str], *, has_full_paths: bool = True)
         )
         paths_by_problem.setdefault(pattern, []).append(path)
     lines = []
+    labels = label_files(messages)
     for paths in paths_by_problem.values():
         first_message = strip_file_name(messages, messages[paths[0]])
-        others = describe_other_files_with_problem(paths[1:])
-        file = paths[0] if has_full_paths else paths[0].name
+        others = describe_other_files_with_problem([labels[path] for path in paths[1:]])
+        file = paths[0] if has_full_paths else labels[paths[0]]
         lines.append(f"{file}: {first_message}{others}")
     return lines
 
 
-def describe_other_files_with_problem(paths: Sequence[Path]) -> str:
+def describe_other_files_with_problem(file_names: Sequence[str]) -> str:
     """Return a remark on further files with the same problem; empty if there are none."""
-    if not paths:
+    if not file_names:
         return ""
-    names = truncate(", ".join(path.name for path in paths), _MAX_FILE_NAMES)
-    return f" (and {len(paths)} other file{'s' * (len(paths) > 1)}: {names})"
+    names = truncate(", ".join(file_names), _MAX_FILE_NAMES)
+    return f" (and {len(file_names)} other file{'s' * (len(file_names) > 1)}: {names})"

@@ -44,6 +44,7 @@ from residnet.io.drafting.channels import (
 )
 from residnet.io.drafting.problems import (
     UnreadableLogsError,
+    name_files_in_errors,
     raise_unreadable,
     without_channel_map,
 )
@@ -1044,7 +1045,8 @@ def read_drafted(
         # a trip has the name of its file with the most channels of the motion
         paths = [*trip_files[next(iter(result.reader["parts"]))]]
     elif log_kind == "table":
-        result.reader, result.errors = draft_tables(paths, draft_notes)
+        with name_files_in_errors(paths):
+            result.reader, result.errors = draft_tables(paths, draft_notes)
     elif is_channel_reader(log_kind):
         # a registered reader that returns channels in SI units needs no channel map
         result.reader = {"kind": log_kind}

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from residnet.core.errors import DataError, ResidnetError, UsageError
-from residnet.core.layout import DegreesOfFreedom
 from residnet.core.names import CHANNEL_UNITS, get_si_unit, truncate
 from residnet.core.units import is_unit, si_unit, to_si
 from residnet.io.drafting.channels import (
@@ -34,6 +33,11 @@ from residnet.io.drafting.problems import (
     strip_file_name,
 )
 from residnet.io.drafting.questions import TEXT_COLUMNS, UNMAPPED_COLUMNS, DraftNotes
+from residnet.io.drafting.vertical import (
+    VERTICAL_CHANNELS,
+    draft_vertical_motion,
+    project_on_horizontal,
+)
 from residnet.io.header_vocabulary import (
     DATE_PART_NAMES,
     GERMANIC_PATTERN,
@@ -42,8 +46,6 @@ from residnet.io.header_vocabulary import (
     VESSEL_COLUMN_NAMES,
     ParsedName,
     find_mismatched_unit,
-    infer_unit,
-    match_depth_channel,
     match_input_channel,
     match_state_channel,
     normalize_name,
@@ -53,13 +55,11 @@ from residnet.io.header_vocabulary import (
 from residnet.io.readers.angles import AngleForm, LetterO, hemisphere_signs, parse_degrees
 from residnet.io.readers.base import require_file
 from residnet.io.readers.clock_repair import find_unique_rows, repair_clock
+from residnet.io.readers.manoeuvre_kinds import match_manoeuvre_name
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
     QUATERNION,
     SINE_SUFFIX,
-    normalize_quaternion,
-    quaternion_tilt,
-    quaternion_yaw,
 )
 from residnet.io.readers.tables import (
     TABLE_KINDS,
@@ -178,34 +178,37 @@ def draft_tables(
     cells = [
         str(text) for texts in main_preview.text_columns.values() for text in texts.unique()[:20]
     ]
+    tables = [preview.numeric_columns for preview in previews]
     channels = draft_channel_map(
         column_by_channel,
-        logs,
+        project_on_horizontal(simple_columns, tables, logs),
         draft_notes,
         [*main_preview.column_names, *cells],
         is_up_positive=is_vertical_axis_up(
             simple_columns,
             column_by_channel,
-            [preview.numeric_columns for preview in previews],
+            tables,
         ),
     )
     channels |= draft_vertical_motion(
         simple_columns,
-        [preview.numeric_columns for preview in previews],
+        tables,
         logs,
         channels,
         draft_notes,
     )
     column_by_channel |= {
-        name: entry["column"] for name, entry in channels.items() if name in _VERTICAL_CHANNELS
+        name: entry["column"] for name, entry in channels.items() if name in VERTICAL_CHANNELS
     }
     for channel, entry in channels.items():
         if _is_recorded_on_change(channel, logs):
             entry["hold"] = True
             text = "recorded when it changes: zero-order hold between the values"
             draft_notes.add_guess((*CHANNELS_KEY, channel), text)
-        settings = column_settings.get(entry["column"], {})
-        entry |= {"column": main_preview.original_name(entry["column"]), **settings}
+        entry |= {
+            "column": main_preview.original_name(entry["column"]),
+            **column_settings.get(entry["column"], {}),
+        }
     reader_settings = {
         # sheets are a list in YAML
         key: list(value) if isinstance(value, tuple) else value
@@ -340,100 +343,6 @@ def _refuse_unparsed_positions(preview: TablePreview, column_by_channel: Mapping
         )
 
 
-_VERTICAL_CHANNELS = ("z", "w", "q", "p")
-"""Channels whose columns complete those of a planar motion to six degrees of freedom."""
-
-
-def draft_vertical_motion(
-    columns: Sequence[str],
-    tables: Sequence[Mapping[str, np.ndarray]],
-    logs: Sequence[RawTable],
-    channels: Mapping[str, Mapping[str, Any]],
-    draft_notes: DraftNotes,
-) -> dict[str, dict[str, Any]]:
-    """Draft the vertical motion of an underwater vessel whose attitude is a quaternion.
-
-    The columns are the siblings of those of the planar motion, such as `position_z` of
-    `position_x`. They are used if the depth follows from velocities and attitude.
-
-    Args:
-        columns: names of the columns of numbers.
-        tables: column -> values of each table.
-        logs: the mapped columns of these tables.
-        channels: channel -> entry of the planar motion.
-        draft_notes: receives guesses and notes.
-
-    Returns:
-        Channel -> entry of depth, heave velocity, pitch rate and roll rate; empty for a surface
-        vessel.
-    """
-    matches = {match_depth_channel(parse_name(column)): column for column in reversed(columns)}
-    candidates = {
-        name: matches[name]
-        for name in _VERTICAL_CHANNELS
-        if name in matches and name not in channels
-    }
-    if (
-        "z" not in candidates
-        or not {*QUATERNION} <= channels.keys()
-        or len(tables) != len(logs)
-        or any(set(candidates.values()) - table.keys() for table in tables)
-    ):
-        return {}
-    is_east_north_up = channels["qw"].get("frame") == "enu"
-    vertical_sign = -1 if is_east_north_up else 1
-    rates: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in ("w", "q", "p")}
-    is_submerged = False
-    for table, log in zip(tables, logs, strict=True):
-        if not {*QUATERNION, "u", "v"} <= log.columns.keys():
-            return {}
-        parts = normalize_quaternion(*(log.columns[name] for name in QUATERNION))
-        roll, pitch = quaternion_tilt(*parts)
-        pitch = vertical_sign * pitch
-        values = {name: table[column] for name, column in candidates.items()}
-        if any(column.size != log.t.size for column in values.values()) or log.t.size < 10:
-            continue
-        u = log.columns["u"]
-        v = vertical_sign * log.columns["v"]
-        depth = vertical_sign * values["z"]
-        depth_rate = np.gradient(depth, log.t)
-        heave = depth_rate + u * np.sin(pitch) - v * np.cos(pitch) * np.sin(roll)
-        rates["w"].append((values.get("w", heave), heave / (np.cos(pitch) * np.cos(roll))))
-        rates["q"].append((values.get("q", heave), np.gradient(pitch, log.t)))
-        rates["p"].append((values.get("p", heave), np.gradient(np.unwrap(roll), log.t)))
-        yaw = np.unwrap(quaternion_yaw(*parts))
-        motion = {"x": log.columns.get("x", u), "y": log.columns.get("y", v), "psi": yaw}
-        motion |= {"u": u, "v": v, "z": depth, "phi": roll, "theta": pitch}
-        if "w" in values:
-            motion["w"] = values["w"] * np.sign(np.nansum(values["w"] * heave))
-        is_submerged |= DegreesOfFreedom.from_channels(motion).is_six_dof
-    if not is_submerged:
-        draft_notes.add_note(
-            CHANNELS_KEY,
-            f"{', '.join(candidates.values())}: known and not used, a surface vessel is assumed"
-            " because the depth does not follow from the motion",
-        )
-        return {}
-    entries: dict[str, dict[str, Any]] = {}
-    for name, column in candidates.items():
-        values_of_logs = np.concatenate([table[column] for table in tables])
-        scaling = infer_unit(name, column, values_of_logs)
-        sign = vertical_sign
-        if name != "z":
-            measured = np.concatenate([pair[0] for pair in rates[name]])
-            expected = np.concatenate([pair[1] for pair in rates[name]])
-            is_finite = np.isfinite(measured) & np.isfinite(expected)
-            sign = 1 if float(measured[is_finite] @ expected[is_finite]) >= 0.0 else -1
-        entries[name] = {"column": column, **scaling.settings, **({"sign": -1} if sign < 0 else {})}
-        draft_notes.add_guess(
-            (*CHANNELS_KEY, name),
-            f"'{column}' completes the six degrees of freedom"
-            + ("; positive up in the file" if name == "z" and sign < 0 else "")
-            + (f"; {scaling.reason}" if scaling.reason else ""),
-        )
-    return entries
-
-
 def _suggest_table_fix(
     preview: TablePreview, clock: TableClock, numeric_columns: Sequence[str]
 ) -> str:
@@ -467,8 +376,13 @@ def _suggest_table_fix(
 
 
 def draft_manoeuvre_setting(files: Sequence[Path], draft_notes: DraftNotes) -> dict[str, str]:
-    """Return the setting `manoeuvre: folder` for files in several folders, else no setting."""
-    if len({path.resolve().parent for path in files}) < 2:
+    """Return the setting `manoeuvre: folder` for files in folders by manoeuvre, else no setting.
+
+    Folders of one file each are trips, unless their names are those of manoeuvres.
+    """
+    folders = {path.resolve().parent for path in files}
+    has_manoeuvre_names = any(match_manoeuvre_name(folder.name) for folder in folders)
+    if len(folders) < 2 or (len(folders) == len(files) and not has_manoeuvre_names):
         return {}
     draft_notes.add_guess(
         (*READER_KEY, "manoeuvre"), "the type of manoeuvre is taken from the name of the folder"
