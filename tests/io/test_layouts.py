@@ -15,10 +15,16 @@ from residnet.core.units import to_si
 from residnet.io.drafting.problems import (
     UnreadableLogsError,
     group_problems,
+    name_files_in_errors,
     without_channel_map,
 )
 from residnet.io.drafting.questions import DraftNotes
-from residnet.io.drafting.tables import draft_tables, find_wrench_columns, match_channels
+from residnet.io.drafting.tables import (
+    draft_manoeuvre_setting,
+    draft_tables,
+    find_wrench_columns,
+    match_channels,
+)
 from residnet.io.header_vocabulary import match_input_channel, match_state_channel, parse_name
 from residnet.io.readers.clock_repair import repair_clock
 from residnet.io.readers.manoeuvre_kinds import infer_manoeuvre, match_manoeuvre_name
@@ -256,3 +262,31 @@ def test_nozzles_and_currents_of_motors_are_no_rudders() -> None:
 )
 def test_columns_of_a_wrench(columns: list[str], expected: dict[str, str]) -> None:
     assert find_wrench_columns(columns) == expected
+
+
+def test_folders_of_one_file_each_are_no_manoeuvres(tmp_path: Path) -> None:
+    def setting(*names: str) -> dict[str, str]:
+        return draft_manoeuvre_setting([tmp_path / name for name in names], DraftNotes())
+
+    assert setting("day_1/gps.csv", "day_2/gps.csv") == {}
+    assert setting("zigzag/a.csv", "circle/b.csv") == {"manoeuvre": "folder"}
+    assert setting("calm/a.csv", "calm/b.csv", "waves/c.csv") == {"manoeuvre": "folder"}
+
+
+def test_errors_of_many_files_name_them(tmp_path: Path) -> None:
+    paths = [tmp_path / name / "gps.csv" for name in ("day_1", "day_2")]
+    assert group_problems(dict.fromkeys(paths, "has no clock"), has_full_paths=False) == [
+        "day_1/gps.csv: has no clock (and 1 other file: day_2/gps.csv)"
+    ]
+    with (
+        pytest.raises(
+            DataError, match=r"day_1/gps\.csv: no fix \(and 1 other file: day_2/gps\.csv\)"
+        ),
+        name_files_in_errors(paths),
+    ):
+        raise DataError("no fix")
+    with (
+        pytest.raises(DataError, match=r"^[^ ]*day_2/gps\.csv: no fix$"),
+        name_files_in_errors(paths),
+    ):
+        raise DataError(f"{paths[1]}: no fix")

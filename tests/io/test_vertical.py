@@ -33,7 +33,7 @@ def test_velocities_of_a_tilted_vessel_are_projected(tilt: float, *, has_heave: 
         assert projected is log
         return
     yaw = attitude.as_euler("ZYX")[:, 0]
-    expected = Rotation.from_euler("Z", -yaw).apply(attitude.apply(body))
+    expected = Rotation.from_euler("Z", -yaw[:, None]).apply(attitude.apply(body))
     for column, name in enumerate(("u", "v")):
         # without heave velocity, the depth is differentiated
         error = np.abs(projected.columns[name] - expected[:, column])[5:-5].max()

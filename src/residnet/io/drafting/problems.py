@@ -50,7 +50,8 @@ def name_files_in_errors(paths: Sequence[Path]) -> Iterator[None]:
         message = str(error)
         if any(str(path) in message for path in paths):
             raise
-        others = describe_other_files_with_problem([path.name for path in paths[1:]])
+        labels = label_files(paths)
+        others = describe_other_files_with_problem([labels[path] for path in paths[1:]])
         raise DataError(f"{paths[0]}: {message}{others}") from None
 
 
