@@ -110,6 +110,22 @@ def test_logs_have_one_recipe_whoever_asks(trials: Path, data: residnet.Dataset)
     assert heard[-1].done == heard[-1].total == 10
 
 
+def test_inputs_that_move_as_others_are_unexcited(logs: list[residnet.Log]) -> None:
+    alike = [
+        log.replace(
+            channels={
+                **log.channels,
+                "n_stbd": log["n_port"],
+                "delta": 0.02 * (log["n_port"] - log["n_stbd"]),
+            }
+        )
+        for log in logs
+    ]
+    signals = residnet.prepare(alike).signals
+    assert signals.inputs == ("n_port", "delta")
+    assert signals.unexcited == ("n_stbd",)
+
+
 @pytest.mark.long
 def test_fifteen_lines(trials: Path) -> None:
     """The example fits, runs freely and draws, as a stranger would start it."""
@@ -344,11 +360,17 @@ WRONG = [
     ("run(3)", "expected the path of a YAML file"),
     ("run({'task': 'fit'}, overrides=['seed=1'])", "overrides are for a file"),
     ("fit(data, progress=3)", "progress: expected a function"),
+    ("fit([throttled(log) for log in logs])", "turns by up to .* and no input steers it; map"),
 ]
 
 
 def coasting(log: residnet.Log) -> residnet.Log:
     return log.replace(channels={k: v for k, v in log.channels.items() if not k.startswith("n_")})
+
+
+def throttled(log: residnet.Log) -> residnet.Log:
+    throttle = 0.01 * (log["n_port"] + log["n_stbd"])
+    return log.replace(channels={**coasting(log).channels, "throttle": throttle})
 
 
 @pytest.mark.parametrize(("call", "message"), WRONG)
@@ -363,6 +385,7 @@ def test_what_a_stranger_does_wrong_is_answered_in_one_plain_line(
     (trials / "empty").mkdir(exist_ok=True)
     names = {name: getattr(residnet, name) for name in residnet.__all__}
     names |= {"np": np, "pd": pd, "coasting": coasting, "x": np.zeros(6), "w": np.zeros(2)}
+    names |= {"throttled": throttled}
     names |= {"folder": trials, "logs": logs, "data": data, "models": models}
     with pytest.raises(ResidnetError, match=message) as caught:
         eval(call, {**names, "ridge": models["ridge"]})

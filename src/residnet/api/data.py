@@ -43,8 +43,8 @@ from residnet.preprocessing.prepare import PrepareConfig, PreparedLog
 from residnet.preprocessing.prepare import prepare_log as prepare_log
 from residnet.quality import inspect_log as examine
 from residnet.quality import inspect_log_set
-from residnet.tasks.drafting import ConfigDraft, draft_fit_config
-from residnet.tasks.input_selection import choose_inputs
+from residnet.tasks.drafting import ConfigDraft, describe_missing_steering, draft_fit_config
+from residnet.tasks.input_selection import choose_inputs, find_unexcited_inputs
 from residnet.tasks.naval_draft import NavalParticulars
 
 if TYPE_CHECKING:
@@ -451,7 +451,11 @@ def prepare(
             for name, members in splits.items()
         }
         all_logs = [log for members in complete_logs.values() for log in members]
-        input_names = _find_inputs(all_logs) if inputs is None else inputs
+        unexcited: Sequence[str] = ()
+        if inputs is None:
+            input_names, unexcited = _derive_inputs(all_logs, dof)
+        else:
+            input_names = inputs
         common_inputs = [
             name for name in input_names if all(name in log.channels for log in all_logs)
         ]
@@ -477,6 +481,7 @@ def prepare(
             "inputs": input_names if isinstance(input_names, str) else list(input_names),
             "exogenous": preparation_recipe.wind_channels,
             "velocities": dof.velocities,
+            "unexcited": unexcited,
         }
         sections = (
             (SignalsConfig, signals),
@@ -525,20 +530,35 @@ def _find_velocities(splits: Mapping[str, Sequence[Log]], velocities: Any) -> De
     )
 
 
-def _find_inputs(logs: Sequence[Log]) -> Sequence[str]:
-    """Return the inputs of a model from names and values of the channels.
+def _derive_inputs(
+    logs: Sequence[Log], dof: DegreesOfFreedom
+) -> tuple[Sequence[str], Sequence[str]]:
+    """Return the inputs and the unexcited inputs of a model, as `draft_config` chooses them.
+
+    Args:
+        logs: logs with complete motion.
+        dof: degrees of freedom of the model.
 
     Raises:
-        UsageError: if there are none.
+        UsageError: if no channel is an input, or the vessel turns and no input steers it.
     """
+    channels_text = f"the first log has {', '.join(logs[0].channels)}"
     input_names = choose_inputs(logs, DraftNotes())
     if not input_names:
         raise UsageError(
-            "prepare: inputs: no channel of the logs is a rudder, a propeller or another command;"
-            " pass the inputs of the vessel; the first log has"
-            f" {', '.join(logs[0].channels)} (an empty list: a model without commands)"
+            "prepare: inputs: no channel of the logs is a rudder, a propeller or another"
+            f" command; pass the inputs of the vessel; {channels_text} (an empty list: a model"
+            " without commands)"
         )
-    return input_names
+    if problem := describe_missing_steering(input_names, dof, logs):
+        raise UsageError(
+            f"prepare: inputs: {problem}; map the column that does to a channel (read_logs:"
+            f" reader), or pass inputs={list(input_names)} to fit without it; {channels_text}"
+        )
+    unexcited = find_unexcited_inputs(logs, input_names)
+    for text in unexcited.values():
+        log_message(f"inputs: {text}")
+    return input_names, list(unexcited)
 
 
 def _assign_to_sections(

@@ -389,35 +389,48 @@ def _has_current(settings: FitConfig, logs: Sequence[Log], draft_notes: DraftNot
     return True
 
 
-def _explain_missing_steering(
-    inputs: Sequence[str], dof: DegreesOfFreedom, logs: Sequence[Log], draft_notes: DraftNotes
+def describe_missing_steering(
+    inputs: Sequence[str], dof: DegreesOfFreedom, logs: Sequence[Log]
 ) -> str:
-    """Return why a draft without steering cannot be run.
+    """Return why inputs do not suffice; empty if one steers or the vessel goes straight.
 
     Args:
         inputs: inputs of the model.
         dof: degrees of freedom of the model.
         logs: logs with complete motion.
-        draft_notes: notes on the columns without a channel.
-
-    Returns:
-        The reason and what to do; empty if an input steers or the vessel goes straight.
     """
     if inputs and missing_control(inputs, dof) != "steers":
         return ""
     turns = [
         float(np.ptp(log["psi"][np.isfinite(log["psi"])])) for log in logs if "psi" in log.channels
     ]
-    if max(turns, default=0.0) < _MIN_TURN:
+    turn = max(turns, default=0.0)
+    if turn < _MIN_TURN:
+        return ""
+    return f"the vessel turns by up to {np.degrees(turn):.0f} deg, and no input steers it"
+
+
+def _explain_missing_steering(
+    inputs: Sequence[str], dof: DegreesOfFreedom, logs: Sequence[Log], draft_notes: DraftNotes
+) -> str:
+    """Return why a draft without steering cannot be run, and what to do; else an empty text.
+
+    Args:
+        inputs: inputs of the model.
+        dof: degrees of freedom of the model.
+        logs: logs with complete motion.
+        draft_notes: notes on the columns without a channel.
+    """
+    problem = describe_missing_steering(inputs, dof, logs)
+    if not problem:
         return ""
     unmatched = "; ".join(
         text for _, text in draft_notes.notes if text.startswith(_UNMATCHED_COLUMN_NOTES)
     )
     columns_text = f" ({unmatched})" if unmatched else ""
     return (
-        f"the vessel turns by up to {np.degrees(max(turns)):.0f} deg, and no input steers it; name"
-        f" the column that does under data.reader.channels and signals.inputs{columns_text}, or"
-        " give logs with it"
+        f"{problem}; name the column that does under data.reader.channels and"
+        f" signals.inputs{columns_text}, or give logs with it"
     )
 
 
