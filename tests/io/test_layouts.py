@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.io import savemat
 
@@ -28,7 +29,7 @@ from residnet.io.drafting.tables import (
 from residnet.io.header_vocabulary import match_input_channel, match_state_channel, parse_name
 from residnet.io.readers.clock_repair import repair_clock
 from residnet.io.readers.manoeuvre_kinds import infer_manoeuvre, match_manoeuvre_name
-from residnet.io.readers.tables import CsvConfig
+from residnet.io.readers.tables import CsvConfig, read_excel_sheet
 
 
 def round_to_digits(t: np.ndarray, digits: int) -> np.ndarray:
@@ -290,3 +291,14 @@ def test_errors_of_many_files_name_them(tmp_path: Path) -> None:
         name_files_in_errors(paths),
     ):
         raise DataError(f"{paths[1]}: no fix")
+
+
+def test_numbers_stored_as_text_in_a_sheet(tmp_path: Path) -> None:
+    t = 0.1 * np.arange(50)
+    texts = [f"{value:.3f}".replace(".", ",") for value in t]
+    table = pd.DataFrame({"t (s)": texts, "Ruder (°)": texts, "note": ["a"] * t.size})
+    table.to_excel(path := tmp_path / "log.xlsx", index=False)
+    sheet = read_excel_sheet(path, None)
+    np.testing.assert_allclose(sheet["t (s)"], t, atol=1e-9)
+    assert sheet["Ruder (°)"].dtype == np.float64
+    assert sheet["note"].tolist() == ["a"] * t.size
