@@ -719,7 +719,7 @@ def _add_yaw_of_quaternion(
     if "z" in channels:
         # about the axis to port of a body in `enu`, a positive pitch lowers the bow
         roll, pitch = quaternion_tilt(*quaternion)
-        channels.setdefault("phi", roll)
+        channels.setdefault("phi", unwrap_angle(roll))
         channels.setdefault("theta", -pitch if is_enu else pitch)
 
 
