@@ -302,3 +302,25 @@ def test_numbers_stored_as_text_in_a_sheet(tmp_path: Path) -> None:
     np.testing.assert_allclose(sheet["t (s)"], t, atol=1e-9)
     assert sheet["Ruder (°)"].dtype == np.float64
     assert sheet["note"].tolist() == ["a"] * t.size
+
+
+def test_names_of_a_sheet_in_groups_above_units(tmp_path: Path) -> None:
+    rows: list[list[object]] = [
+        ["Time", "Position", None, "Heading", "Velocity", None],
+        [None, "X", "Y", None, "u", "v"],
+        ["s", "m", "m", "deg", "m/s", "m/s"],
+        *([0.1 * k, 1.0 * k, 2.0 * k, 3.0, 1.0, 0.5] for k in range(20)),
+    ]
+    pd.DataFrame(rows).to_excel(path := tmp_path / "log.xlsx", index=False, header=False)
+    sheet = read_excel_sheet(path, None)
+    names = ["Time", "Position X", "Position Y", "Heading", "Velocity u", "Velocity v"]
+    assert sheet.columns.tolist() == names
+    assert sheet.attrs["unit_rows"] == [["s", "m", "m", "deg", "m/s", "m/s"]]
+    assert len(sheet) == 20
+    channels = match_channels([*sheet.columns], DraftNotes())
+    assert {name: channels[name] for name in ("x", "y", "u", "v")} == {
+        "x": "Position X",
+        "y": "Position Y",
+        "u": "Velocity u",
+        "v": "Velocity v",
+    }

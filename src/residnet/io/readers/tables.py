@@ -24,7 +24,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.frames import rotate, unwrap_angle
 from residnet.core.log import Log, Remark, make_remark
 from residnet.core.names import suggest_name, truncate
-from residnet.core.units import canonical_unit, to_si
+from residnet.core.units import canonical_unit, is_unit, to_si
 from residnet.io.readers.angles import hemisphere_signs, parse_degrees
 from residnet.io.readers.base import (
     ConfiguredReader,
@@ -814,13 +814,43 @@ def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> 
     header_row, first_value_row = find_header(head_rows) or (0, 1)
     # the names in the first rows made all columns object columns
     table = cells.iloc[first_value_row:].infer_objects()
-    table.columns = pd.Index(make_names_unique(head_rows[header_row] if head_rows else []))
+    unit_rows = head_rows[header_row + 1 : first_value_row]
+    names = head_rows[header_row] if head_rows else []
+    if header_row > 0 and _is_unit_row(names):
+        unit_rows = head_rows[header_row:first_value_row]
+        names = _join_grouped_names(head_rows[:header_row])
+    table.columns = pd.Index(make_names_unique(names))
     table = _convert_decimal_commas(table.dropna(how="all"))
     table.attrs |= {
         "n_lines_above": first_value_row,
-        "unit_rows": head_rows[header_row + 1 : first_value_row],
+        "unit_rows": unit_rows,
     }
     return table
+
+
+def _is_unit_row(row: Sequence[str]) -> bool:
+    """Return whether all filled cells of a row are units, some of them in brackets."""
+    return all(is_unit(cell.strip("[]()")) for cell in row if cell)
+
+
+def _join_grouped_names(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return column names from the rows above the units.
+
+    The last row has the names. Where it is incomplete, the row before it names groups of columns in
+    merged cells, of which the first one is filled: `Position` above `X`, `Y`.
+
+    Args:
+        rows: cells of the rows above the units, at least one row.
+    """
+    lower_names = list(rows[-1])
+    if all(lower_names) or len(rows) < 2:
+        return lower_names
+    names = []
+    group = ""
+    for group_cell, name in zip(rows[-2], lower_names, strict=True):
+        group = group_cell or (group if name else "")
+        names.append(f"{group} {name}".strip())
+    return names
 
 
 _DECIMAL_COMMA = re.compile(r"\s*[-+]?\d+(,\d+)?([eE][-+]?\d+)?\s*")
