@@ -52,11 +52,11 @@ from residnet.io.drafting.questions import UNMAPPED_FIELDS, DraftNotes, Key
 from residnet.io.drafting.tables import (
     draft_manoeuvre_setting,
     draft_tables,
-    draft_vertical_motion,
     match_channels,
     preview_table,
     rename_pulsed_drives,
 )
+from residnet.io.drafting.vertical import draft_vertical_motion, project_on_horizontal
 from residnet.io.header_vocabulary import (
     MOTION_CHANNELS,
     PLANE_PATTERN,
@@ -331,11 +331,14 @@ def _find_named_table(
         RawTable(table.t, {name: table.columns[field] for name, field in names.items()})
         for table in tables
     ]
-    is_up_positive = is_vertical_axis_up(simple_fields, names, [table.columns for table in tables])
-    entries = draft_channel_map(names, logs, draft_notes, is_up_positive=is_up_positive)
-    entries |= draft_vertical_motion(
-        simple_fields, [table.columns for table in tables], logs, entries, draft_notes
+    columns = [table.columns for table in tables]
+    entries = draft_channel_map(
+        names,
+        project_on_horizontal(simple_fields, columns, logs),
+        draft_notes,
+        is_up_positive=is_vertical_axis_up(simple_fields, names, columns),
     )
+    entries |= draft_vertical_motion(simple_fields, columns, logs, entries, draft_notes)
     used_columns = {entry["column"] for entry in entries.values()} | {*names.values()}
     unused_fields = [name for name in fields if name not in used_columns]
     if unused_fields:
