@@ -48,6 +48,7 @@ from residnet.tasks.fit.outcome import (
     EXTERNAL_SPLIT,
     build_fit_outcome,
     divergence_limit,
+    list_test_files,
     mark_logs_of_fit,
     read_external_logs,
     write_evaluation,
@@ -156,7 +157,7 @@ def evaluate_on_logs(
         )
     RunFolder(folder_path).require_usable(resolved, resume=resume, overwrite=overwrite)
     input_paths, raw_logs, prepared = read_external_logs(config, logs)
-    raw_logs = mark_logs_of_fit(raw_logs, run)
+    raw_logs = mark_logs_of_fit(raw_logs, run, list_test_files(config.data))
     for log in prepared:
         check_window_fits(log, config)
     provenance = Provenance(run.resolved_config, (), config.seed, input_paths, time.time())

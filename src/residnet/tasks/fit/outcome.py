@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from residnet.core.errors import ConfigError
 from residnet.core.files import read_json
 from residnet.core.log import Log, make_remark
 from residnet.core.names import CHANNEL_UNITS, POSE_ERROR_UNITS, si_unit
@@ -20,6 +21,7 @@ from residnet.identification.identified import SplitEvaluation
 from residnet.identification.prepared import compute_velocity_limits
 from residnet.io.drafting.reading import find_log_files
 from residnet.io.readers.base import CanonicalConfig
+from residnet.io.sources import MeasuredLogs
 from residnet.io.split import assign_log_names
 from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.preprocessing.masks import SpikeMask
@@ -217,15 +219,38 @@ def read_external_logs(
     )
 
 
-def mark_logs_of_fit(logs: Sequence[Log], run: RunFolder) -> list[Log]:
+def list_test_files(data: MeasuredLogs | SimulatedTrials) -> set[Path]:
+    """Return the files that belong to the test split alone, with which no model was fitted."""
+    if not isinstance(data, MeasuredLogs):
+        return set()
+    try:
+        files = {
+            split: {path.resolve() for path in paths}
+            for split, paths in data.split.resolve_paths().items()
+        }
+    except ConfigError:
+        # the files of the fit were moved
+        return set()
+    other_files = {path for split, paths in files.items() if split != "test" for path in paths}
+    return files.get("test", set()) - other_files
+
+
+def mark_logs_of_fit(
+    logs: Sequence[Log], run: RunFolder, test_files: Collection[Path] = ()
+) -> list[Log]:
     """Add a finding to the logs that are among the data of a fit, by their SHA-256.
 
     Args:
         logs: logs that the models of the fit are evaluated on.
         run: folder of the fit.
+        test_files: files of the fit with which no model was fitted.
     """
     inputs = read_json(run.provenance).get("inputs") if run.provenance.is_file() else None
-    checksums = {*inputs.values()} if isinstance(inputs, dict) else set()
+    checksums = {
+        checksum
+        for file, checksum in (inputs if isinstance(inputs, dict) else {}).items()
+        if Path(file).resolve() not in test_files
+    }
     text = (
         "this log, or a part of it, is among the data of the fit (same SHA-256): its errors do not"
         " show how well the model predicts new data; evaluate on other logs"
