@@ -118,6 +118,12 @@ def test_sets_of_a_ship_on_propeller_and_rudder() -> None:
     assert {"wind_u", "wind_v wind_mag", "wind_u wind_v"} <= set(wind)
     abkowitz = terms(TANKER, sets=["abkowitz"])
     assert {"u^3", "v v v", "v v delta", "r delta delta", "v r", "u r"} <= set(abkowitz)
+    # model tests at constant revolutions: the thrust is part of the constant
+    without_drive = terms(("u", "v", "r", "delta"), sets=["abkowitz"])
+    assert set(without_drive) == {term for term in abkowitz if "n" not in term.split()} - {
+        "n|n|",
+        "|n| u",
+    }
 
 
 def test_sets_of_a_vessel_on_forces_and_roles_that_are_given() -> None:
@@ -175,7 +181,8 @@ def test_what_is_said_twice_stands_once() -> None:
         (NAMES, {"terms": ["u", "tau_y"]}, "no channel 'tau_y'"),
         (CATAMARAN, {"sets": ["wind"]}, "add wind_speed and wind_dir to signals.exogenous"),
         (CATAMARAN[:5], {"sets": ["fossen"]}, "set 'fossen': .*'n_port'"),
-        (SHIP[:4], {"sets": ["abkowitz"]}, "one for steering"),
+        (SHIP[:4], {"sets": ["abkowitz"]}, "a channel for steering; add it to `steer`"),
+        (("u", "v", "r", "delta"), {"sets": ["fossen"]}, "thrust and one for steering"),
         (CATAMARAN, {"sets": ["astern"]}, "needs a propeller"),
         (TANKER, {"sets": ["fossen"], "drive": ["rpm"]}, "no channel 'rpm'"),
         (TANKER, {"sets": ["fosen"]}, "fossen"),

@@ -69,11 +69,12 @@ class ChannelRoles(NamedTuple):
         dynamic_states = dof.active_states if dof.is_six_dof else dof.dynamic_states
         return cls(dynamic_states, drives, steers, unassigned, "wind_u" in names)
 
-    def require_assigned(self, subject: str) -> ChannelRoles:
+    def require_assigned(self, subject: str, *, needs_drive: bool = True) -> ChannelRoles:
         """Check that every input has a role, and return the roles.
 
         Args:
             subject: name of the set in the error message.
+            needs_drive: whether a channel must have the role of propulsion.
 
         Raises:
             ConfigError: if an input has no role, or no channel has the role of propulsion or
@@ -84,11 +85,10 @@ class ChannelRoles(NamedTuple):
                 f"set '{subject}': the role of channel '{self.unassigned[0]}' is unknown; add it to"
                 " `drive` or `steer`"
             )
-        if not self.drives or not self.steers:
-            raise ConfigError(
-                f"set '{subject}' needs a channel for thrust and one for steering; add them to"
-                " `drive` and `steer`"
-            )
+        if not self.steers or (needs_drive and not self.drives):
+            wanted = "thrust and one for steering" if needs_drive else "steering"
+            instruction = "them to `drive` and `steer`" if needs_drive else "it to `steer`"
+            raise ConfigError(f"set '{subject}' needs a channel for {wanted}; add {instruction}")
         return self
 
 
@@ -202,9 +202,11 @@ def submerged_terms(roles: ChannelRoles) -> list[str]:
 def _abkowitz_terms(roles: ChannelRoles) -> list[str]:
     """Return the terms of a third-order Taylor series about straight-ahead motion (Abkowitz).
 
-    On a symmetric hull even products act in surge, odd ones in sway and yaw.
+    On a symmetric hull even products act in surge, odd ones in sway and yaw. Logs of model tests at
+    constant revolutions need no channel of thrust, which is part of the constant.
     """
-    lateral_channels = ["v", "r", *roles.require_assigned("abkowitz").steers]
+    steers = roles.require_assigned("abkowitz", needs_drive=False).steers
+    lateral_channels = ["v", "r", *steers]
     even_terms = [
         " ".join(combination) for combination in combinations_with_replacement(lateral_channels, 2)
     ]
