@@ -1,6 +1,7 @@
 """Coverage of the 95 % intervals of derivatives of the KVLCC2 from simulated tests.
 
     python scripts/bench/kvlcc2_derivatives.py [--first 0] [--count 20] [--order 1] [--table FILE]
+        [--prior-weight fixed] [--refit-prior 1.0] [--horizon 20]
 
 The ship is the MMG model with the coefficients of Yasukawa and Yoshimura (2015), Tables 3 and 4, of
 7 m length. Each draw adds noise to its simulated zigzags and turning circles and identifies all
@@ -117,8 +118,14 @@ def build_published() -> tuple[ModelSpec, HybridDynamics]:
     return spec, model
 
 
-def make_settings() -> FitSettings:
-    """Return the settings of the fit: an MMG model with usual priors."""
+def make_settings(prior_weight: str, refit_prior: float, horizon: float) -> FitSettings:
+    """Return the settings of the fit: an MMG model with usual priors.
+
+    Args:
+        prior_weight: `prior_weight` of the MMG model.
+        refit_prior: weight of the least-squares solution in the refit.
+        horizon: length of the free runs of the refit in s.
+    """
     content = {
         "prepare": {
             "grid": {"step": "0.2 s", "held": ["n"]},
@@ -129,8 +136,8 @@ def make_settings() -> FitSettings:
         "integrator": "heun",
         "bands": None,
         "baseline": {"kind": "regressors", "sets": ["linear"]},
-        "baselines": {"mmg": {**TANKER, "prior_weight": "evidence"}},
-        "refit": {"mmg": {"horizon": "20 s", "every": "20 s", "prior": 1.0}},
+        "baselines": {"mmg": {**TANKER, "prior_weight": prior_weight}},
+        "refit": {"mmg": {"horizon": horizon, "every": horizon, "prior": refit_prior}},
         "evaluation": {
             "protocols": {"T20": {"kind": "windows", "length": "20 s"}},
             "selection": "T20",
@@ -142,11 +149,20 @@ def make_settings() -> FitSettings:
 
 def main() -> None:
     """Print the coverage of each derivative."""
-    arguments = bench.options(__doc__, first=0, count=20, order=1, table=None)
+    arguments = bench.options(
+        __doc__,
+        first=0,
+        count=20,
+        order=1,
+        table=None,
+        prior_weight="fixed",
+        refit_prior=1.0,
+        horizon=20.0,
+    )
     spec, model = build_published()
     begin = time.perf_counter()
     logs = simulate_tests()
-    settings = make_settings()
+    settings = make_settings(arguments.prior_weight, arguments.refit_prior, arguments.horizon)
     entries: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
     for draw in range(arguments.first, arguments.first + arguments.count):
         generator = np.random.default_rng([2, draw])
