@@ -36,7 +36,8 @@ PRIORS = {
 ERROR_STDS = dict(
     zip(PRIORS, (1.0, 1.0, 0.03, 0.01, 0.03, 0.2, 0.03, 0.1), strict=True),
 )
-N_DRAWS = 12
+N_DRAWS = 24
+"""Draws of each boat; the standard error of a coverage of 95 % is then below 2 %."""
 STEPS = {"dinghy": 0.2, "catamaran": 0.4, "tanker": 0.5}
 """Time between nodes in s, which resolves the yaw response of each boat."""
 
