@@ -125,9 +125,9 @@ def test_a_vessel_that_behaves_passes(vessel: tuple[ModelSpec, HybridDynamics]) 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"u": (0.02, 0, 0)}, "du′/du +0.02 1/s, positive at 100% of it"),
-        ({"r": (0, -0.2, 0.1)}, "dr′/dr +0.1 1/s"),
-        ({"v": (0, 0.1, 0.05)}, "dv′/dv +0.1 1/s"),
+        ({"u": (0.02, 0, 0)}, "d(u_dot)/du +0.02 1/s, positive at 100% of it"),
+        ({"r": (0, -0.2, 0.1)}, "d(r_dot)/dr +0.1 1/s"),
+        ({"v": (0, 0.1, 0.05)}, "d(v_dot)/dv +0.1 1/s"),
     ],
 )
 def test_damping_of_the_wrong_sign_and_running_away(change: Terms, said: str) -> None:

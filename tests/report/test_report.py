@@ -107,9 +107,9 @@ def test_the_first_screen_answers_how_far_off_and_which_model(page: str) -> None
 
 def test_parameters_heads_data_and_provenance(page: str) -> None:
     read = Page(page)
-    terms = read.table("term", "u′: u")
-    assert terms["u′: u"] == ["−0.914", "0.076", "12", "1/s"]
-    assert terms["r′: v|v|"] == ["0.50", "0.10", "5.0", "rad/m²"]
+    terms = read.table("term", "du/dt: u")
+    assert terms["du/dt: u"] == ["−0.914", "0.076", "12", "1/s"]
+    assert terms["dr/dt: v|v|"] == ["0.50", "0.10", "5.0", "rad/m²"]
     heads = read.table("head", "plsr (selected)")
     assert heads["plsr (selected)"][1:3] == ["23 basis functions; order 7 (latent variables)", "72"]
     assert heads["mlp"][1:4] == ["layers of 16, 8", "1\u2009347", "u, n"]
@@ -353,7 +353,7 @@ def test_goodness_of_fit_is_as_the_file_says(run: Path) -> None:
     found = goodness_section(RunFiles(run))
     assert found is not None
     parts = [one for one in found.present_blocks if isinstance(one, Section)]
-    units = {"surge u′": "m/s²", "sway v′": "m/s²", "yaw r′": "deg/s²"}
+    units = {"surge du/dt": "m/s²", "sway dv/dt": "m/s²", "yaw dr/dt": "deg/s²"}
     assert [one.title for one in parts] == [f"{k} [{u}], test data" for k, u in units.items()]
     fits, residuals, sentences = parts[2].present_blocks
     assert isinstance(fits, Table)

@@ -346,14 +346,14 @@ def check_damping(
     # a high quantile: the typical damping at the speeds of the logs
     typical_sizes = np.quantile(np.abs(damping_slopes), 0.9, axis=0)
     wrong_signs = [
-        f"d{name}′/d{name} {median_slopes[i]:+.2g} 1/s, positive at"
+        f"d({name}_dot)/d{name} {median_slopes[i]:+.2g} 1/s, positive at"
         f" {(damping_slopes[:, i] > 0).mean():.0%} of it"
         for i, name in enumerate(dof.velocities)
         if median_slopes[i] > _NEGLIGIBLE_SLOPE_SHARE * typical_sizes[i]
     ]
     fault = f"its damping has the wrong sign in most of the data ({'; '.join(wrong_signs)})"
     medians_text = ", ".join(
-        f"d{name}′/d{name} {median_slopes[i]:+.3g}" for i, name in enumerate(dof.velocities)
+        f"d({name}_dot)/d{name} {median_slopes[i]:+.3g}" for i, name in enumerate(dof.velocities)
     )
     text = f"medians over the training data: {medians_text} 1/s"
     return _to_sanity_finding(spec, DAMPING, True, text, fault if wrong_signs else "")
@@ -638,7 +638,7 @@ def check_symmetry(
     max_percentage = max(percentages_by_name[name][0] for name in checked_velocities)
     is_symmetric = max_percentage <= 100 * _MAX_ASYMMETRY
     details = ", ".join(
-        "{}′ {:.1f} % (largest {:.1f} %)".format(name, *percentages_by_name[name])
+        "{}_dot {:.1f} % (largest {:.1f} %)".format(name, *percentages_by_name[name])
         for name in dof.velocities
     )
     details += (

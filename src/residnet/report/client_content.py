@@ -16,7 +16,7 @@ from residnet.core.format import DASH, display_unit, format_interval, format_num
 from residnet.core.run_records import SummaryFile
 from residnet.core.version import __version__
 from residnet.evaluation.derivatives import DerivativeRow, DerivativesFile
-from residnet.evaluation.records import BookletFile, BookletIndex, BookletRow
+from residnet.evaluation.records import BookletFile, BookletIndex, BookletRow, MetricsRow
 from residnet.physics.similarity import is_rudder
 from residnet.report.run_reader import RunFiles
 from residnet.report.run_settings import ModelSettings
@@ -160,10 +160,10 @@ def _summary_section(run: RunFiles, booklet: BookletFile | None) -> ReportSectio
         f"A manoeuvring model was identified from {n_logs} test records ({', '.join(kinds)}) and"
         " validated by free runs, in which the model receives the measured inputs only."
     ]
-    row = run.find_row(run.selected, run.report_split, run.main_protocol)
+    row = run.find_row(run.main_model, run.report_split, run.main_protocol)
     reference = run.find_row("constant_velocity", run.report_split, run.main_protocol)
     if row is not None:
-        position = row.final_pose_errors.get("position")
+        position = _find_position_error(run, row)
         text = f"On held-out records the mean normalised error of the model is {row.mean_nrmse:.3f}"
         if reference is not None:
             text += f" (constant velocity: {reference.mean_nrmse:.3f})"
@@ -186,6 +186,13 @@ def _summary_section(run: RunFiles, booklet: BookletFile | None) -> ReportSectio
                 )
             )
     return section
+
+
+def _find_position_error(run: RunFiles, row: MetricsRow) -> float | None:
+    """Return the position error of a model at the main horizon in m; None if it is unknown."""
+    if run.main_horizon is not None and row.model in run.main_horizon.models:
+        return run.main_horizon.models[row.model].position
+    return row.final_pose_errors.get("position")
 
 
 def _imo_rows(booklet: BookletFile) -> Iterator[tuple[str, ...]]:
@@ -372,7 +379,6 @@ def _validation_section(
         row = run.find_row(model, split, protocol)
         if row is None:
             continue
-        pose = row.final_pose_errors
         rows.append(
             (
                 run.model_label(model),
@@ -382,7 +388,7 @@ def _validation_section(
                 format_number(
                     None if row.rmse.get("r") is None else math.degrees(row.rmse["r"]), 3
                 ),
-                format_number(pose.get("position"), 3),
+                format_number(_find_position_error(run, row), 3),
             )
         )
     section.blocks.append(

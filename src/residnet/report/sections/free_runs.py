@@ -60,18 +60,17 @@ def distinct_manoeuvres(run: RunFiles, split: str, protocol: str) -> list[str]:
 def errors_section(run: RunFiles) -> Section:
     """Return the section on free runs: for each protocol all models, then kind by kind."""
     splits_text = (
-        f"The splits {' and '.join(run.report_splits)} stand side by side."
+        f"The splits {' and '.join(run.report_splits)} are listed side by side."
         if len(run.report_splits) > 1
         else f"The data are those of the split {run.report_split}."
     )
-    small_print = "the 95 % interval of NRMSE"
+    small_print = "the 95 % confidence interval of the mean NRMSE"
     if run.baseline is not None:
         small_print = f"the change against the baseline on the same data, and {small_print}"
     introduction = (
-        "The tables give the root mean square error of each free run, averaged over the runs."
-        f" {splits_text} Small print gives {small_print}. A run that diverged counts with the"
-        f" error of held"
-        " velocities, and its number stands beside the score."
+        "Root mean square error of each free run, mean over the runs."
+        f" {splits_text} Small print: {small_print}. A diverged run counts with the error of"
+        " constant velocity; the number of diverged runs is next to the NRMSE."
     )
     blocks: list[Block] = [Text(introduction)]
     for protocol in run.protocols:
@@ -261,10 +260,10 @@ def limits_section(run: RunFiles) -> Section | None:
     if not protocol_sections:
         return None
     notes = (
-        "Intervals are percentiles of a block bootstrap. For few blocks they are widened as"
-        " Student's t is. Change and difference are those of the mean NRMSE; negative is better. A"
-        " bold interval excludes 0. Bands are thirds of the windows; bands of fewer than three"
-        " windows are left out."
+        "Confidence intervals are percentiles of a block bootstrap, widened for few blocks as"
+        " Student's t distribution is. Change and difference are those of the mean NRMSE; negative"
+        " values mean smaller errors. Bold intervals exclude 0. Classes are thirds of the windows;"
+        " classes of fewer than three windows are omitted."
     )
     title = "Accuracy and its limits"
     return Section(title, [*protocol_sections, Text(notes, is_secondary=True)])
@@ -339,7 +338,7 @@ def _error_breakdown_table(
             ("change", ratio_cell),
             ("difference", difference_text, str),
             (
-                "paired 95 % interval",
+                "paired 95 % confidence interval",
                 lambda line: format_paired_interval(line.difference and line.difference.ci95),
             ),
         ]
@@ -464,17 +463,15 @@ def bands_section(run: RunFiles) -> Section | None:
     band = next(iter(next(iter(run.bands.values())).values()))
     level = f"{100 * band.level:.0f} %"
     introduction = [
-        f"A band is to hold {level} of the errors of a free run on logs that nobody has seen. It"
-        " grows with the horizon, and is wider where the predicted run is livelier or the models"
-        " disagree. It was calibrated over logs that its model was not fitted on: training logs,"
-        " predicted by models that leave them out, and validation logs that no fit has seen.",
-        f"The tables say what the bands held of the {run.report_split} data. Whole: share of the"
-        f" runs that"
-        f" a band holds from beginning to end, each channel for itself, where it is widened to hold"
-        f" {level} of them. Score: mean width, and {2 / (1 - band.level):.0f} times what lies"
-        " outside, in units of the error of the constant-velocity model; less is better. Beside"
-        " it stands a band of one"
-        " width at all horizons.",
+        f"A band contains {level} of the errors of free runs on new logs. Its width grows with the"
+        " horizon, with the variation of the predicted run, and with the differences between the"
+        " models. It is calibrated on logs that the model was not fitted to: training logs in"
+        " leave-one-log-out cross-validation, and validation logs.",
+        f"The tables have the coverage on the {run.report_split} data. Whole: share of runs that"
+        f" are within the band from beginning to end, for the band of each channel widened to"
+        f" contain {level} of them. Score: interval score, the mean width plus"
+        f" {2 / (1 - band.level):.0f} times the excess, in units of the error of constant velocity;"
+        " smaller is better. One width: the score of a band of constant width.",
     ]
     blocks: list[Block] = [Text(introduction)]
     if warnings := band_cautions(run, run.main_model):

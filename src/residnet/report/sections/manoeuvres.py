@@ -231,7 +231,7 @@ def _limit_cell(
     note = (
         ("met" if is_met else "exceeded")
         if share_met is None
-        else f"kept by {100 * share_met:.0f} %"
+        else f"met in {100 * share_met:.0f} % of the draws"
     )
     limit_text = _format_index(content, name, limited_entries[0].limit)[0]
     return Cell(limit_text, note, "" if is_met else "bad")

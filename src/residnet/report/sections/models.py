@@ -59,8 +59,8 @@ def _baseline_section(run: RunFiles) -> Section | None:
     """Return the coefficient tables, with the first baseline expanded; None if there are none."""
     blocks: list[Block] = [
         Text(
-            "u′, v′, r′ are the accelerations du/dt, dv/dt, dr/dt. Each is the sum of its terms. A"
-            " value below twice its standard error (grey) cannot be told from 0.",
+            "Each acceleration (du/dt, dv/dt, dr/dt) is the sum of its terms. A value below twice"
+            " its standard error (grey) is not significantly different from 0.",
             is_secondary=True,
         )
     ]
@@ -84,17 +84,19 @@ def _baseline_section(run: RunFiles) -> Section | None:
 
 def _refit_text(model: str, notes: FitNotes) -> str:
     fixed_terms, unidentifiable_terms = (
-        ", ".join(f"{term} in {axis.replace('_dot', '')}′" for axis, term in parameters)
+        ", ".join(f"{term} in d{axis.replace('_dot', '')}/dt" for axis, term in parameters)
         for parameters in (notes.energy_generating_terms, notes.undetermined_parameters)
     )
     text = (
         f"{model}: values and standard errors are those after the refit through rollouts. The"
-        " ratios of value to error keep the error of the least-squares fit before it."
+        " ratios of value to error use the error of the least-squares fit before it."
     )
     if fixed_terms:
-        text += f" Left out, for their sign would feed energy: {fixed_terms}."
+        text += f" Omitted, because their sign would add energy: {fixed_terms}."
     if unidentifiable_terms:
-        text += f" The data leave open, and they stay near 0: {unidentifiable_terms}."
+        text += (
+            f" Not identifiable from these data, held near 0 by the prior: {unidentifiable_terms}."
+        )
     return text
 
 
@@ -117,7 +119,7 @@ def _coefficient_table(notes: FitNotes) -> Table:
     return build_table(
         notes.coefficients,
         [
-            ("term", lambda row: f"{row.axis.replace('_dot', '')}′: {row.term}"),
+            ("term", lambda row: f"d{row.axis.replace('_dot', '')}/dt: {row.term}"),
             ("value", value, str),
             ("standard error", lambda row: format_number(row.standard_error, 2), str),
             ("value / error", ratio),
@@ -222,8 +224,8 @@ def _head_section(run: RunFiles) -> Section | None:
         is_selected=lambda model: model == run.selected,
     )
     introduction = (
-        "A head adds to the accelerations of a baseline what that leaves. Further baselines and"
-        " ensembles stand alone."
+        "A head adds its residual to the accelerations of a baseline. Further baselines and"
+        " ensembles have no baseline."
     )
     return Section(
         "Residual heads and further models", [Text(introduction, is_secondary=True), table]
@@ -539,7 +541,7 @@ def goodness_section(run: RunFiles) -> Section | None:
             unit = f"{unit}²" if unit.endswith("/s") else f"{unit}/s"
             axis_sections.append(
                 Section(
-                    f"{title} {name}′ [{unit}], {split} data",
+                    f"{title} d{name}/dt [{unit}], {split} data",
                     [
                         *_goodness_tables(axis_rows, factor),
                         Text(" ".join(_goodness_sentences(axis_rows))),

@@ -45,8 +45,8 @@ def variant_sections(files: RunFiles) -> list[Section]:
         f"Free-run NRMSE of model {comparison.model} on {comparison.split} data, mean over the"
         f" windows and {format_count(rows[0].seeds, 'seed')}.",
         f"Difference: from {comparison.reference} over the same windows, seeds averaged first;"
-        " negative is better, and a bold interval excludes 0. Its 95 % interval comes from"
-        " blocks of windows.",
+        " negative is better, and a bold interval excludes 0. The 95 % confidence intervals come"
+        " from blocks of windows.",
     ]
     table = tabulate_variants(rows, comparison.reference)
     return [Section("", [table, *figure_blocks, Text(explanation, is_secondary=True)])]
@@ -100,10 +100,10 @@ def plot_differences(rows: Sequence[VariantRow], reference: str) -> Figure:
         "variants",
         "Variants of the recipe",
         f"Free-run error of each variant minus that of {reference}, mean over windows and seeds."
-        " The bars are 95 % intervals over logs.",
+        " The bars are 95 % confidence intervals over logs.",
         {
             "zero": GlyphStyle("", "#666666", width=0.8, kind="vline", z_order=1),
-            "interval": GlyphStyle("95 % interval", width=1.2),
+            "interval": GlyphStyle("95 % confidence interval", width=1.2),
             "difference": GlyphStyle("difference", BLUE, kind="points", size=4.5, z_order=4),
         },
         panels,
@@ -140,7 +140,7 @@ def tabulate_variants(rows: Sequence[VariantRow], reference: str) -> Table:
             lambda row: format_signed(row.difference) if row.difference_ci95 else "",
             str,
         ),
-        ("95 % interval", lambda row: format_paired_interval(row.difference_ci95, "")),
+        ("95 % confidence interval", lambda row: format_paired_interval(row.difference_ci95, "")),
     ]
     return build_table(
         by_variant.values(),
