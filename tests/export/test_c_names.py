@@ -187,6 +187,9 @@ def test_stack_and_size_are_reported_before_the_file_is_written(
     code = card["code_bytes"]
     for word in (f"{stack:,} bytes of stack", f"{code:,} bytes of code", "-fstack-usage", "size"):
         assert word in heard[0][0]
+    # a step of a small model takes between a nanosecond and a millisecond
+    assert 1e-9 < card["step_seconds"] < 1e-3
+    assert " us per step" in heard[0][0]
     assert not heard[0][1]
     assert card["warnings"] == []
     # warmup calls measured and step, when there is a memory; here step alone is the deepest
