@@ -65,6 +65,8 @@ def execute(config: SweepConfig, folder: RunFolder) -> TaskOutcome:
         journal.write_bytes(content[: content.rfind(b"\n") + 1])
     study = open_optuna_study(config, folder.path)
     queue = TrialQueue(config, study)
+    # the first trial may take long
+    queue.report_finished()
     trial_by_future = dict[Future[TrialResult], Any]()
     n_lost = Counter[int]()
     restart_queue = list[Any]()
@@ -188,6 +190,14 @@ class TrialQueue:
             return TPESampler(n_startup_trials=search.startup, seed=seed, constant_liar=True)
         return RandomSampler(seed=seed)
 
+    def report_finished(self) -> None:
+        """Report the number of finished trials."""
+        n_finished = sum(
+            stored_trial.state.is_finished()
+            for stored_trial in self.study.get_trials(deepcopy=False)
+        )
+        report_progress("trials of the sweep", n_finished, self.config.n_trials)
+
     def record_result(self, trial: optuna.Trial, result: TrialResult) -> None:
         """Record the result of a trial in the journal and report it."""
         from optuna.trial import TrialState
@@ -199,11 +209,7 @@ class TrialQueue:
         if result.value is None:
             state = TrialState.PRUNED if result.is_pruned else TrialState.FAIL
         self.study.tell(trial.number, result.value, state=state)
-        n_finished = sum(
-            stored_trial.state.is_finished()
-            for stored_trial in self.study.get_trials(deepcopy=False)
-        )
-        report_progress("trials of the sweep", n_finished, self.config.n_trials)
+        self.report_finished()
         outcome_text = "ended early" if result.is_pruned else f"failed: {result.error_message}"
         if result.value is not None:
             outcome_text = f"{result.value:.5g} (the best so far {self.study.best_value:.5g})"
