@@ -48,14 +48,14 @@ def show_progress(*, quiet: bool = False, sink: LineSink | None = None) -> Itera
         progress_display = _progress_bars() if sys.stderr.isatty() else _PlainProgress()
     with progress_display as display_callback:
 
-        def forward(progress: Progress) -> None:
+        def show_and_log(progress: Progress) -> None:
             is_complete = progress.done is not None and progress.done == progress.total
             if sink is not None and (progress.message or is_complete):
                 sink(progress.message or f"{progress.stage}: done")
             if display_callback is not None:
                 display_callback(progress)
 
-        with on_progress(forward):
+        with on_progress(show_and_log):
             yield
 
 
@@ -197,7 +197,7 @@ class ProgressLogFile:
         """Write to the log file in a folder from now on; an existing log file is continued."""
         self._file = folder / "log.txt"
         if self._is_enabled:
-            self._claim(self._file)
+            self._record_in_manifest(self._file)
         self._append("")
 
     @contextmanager
@@ -209,13 +209,13 @@ class ProgressLogFile:
             if self._file is None and self._is_enabled:
                 # an unwritable log file must not hide the original error
                 with suppress(ResidnetError):
-                    self._claim(self._fallback_path)
+                    self._record_in_manifest(self._fallback_path)
                     self._file = self._fallback_path
             self._append("".join(traceback.format_exception(error)))
             raise
 
     @staticmethod
-    def _claim(file: Path) -> None:
+    def _record_in_manifest(file: Path) -> None:
         """Record the log file in the manifest before its first line.
 
         Raises:
@@ -312,8 +312,8 @@ LogOptions = Annotated[
 ]
 
 
-def _trust(context: typer.Context, trust: bool) -> bool:
-    """Allow parts outside of the allow-lists until the command ends, if requested."""
+def _allow_untrusted_parts(context: typer.Context, trust: bool) -> bool:
+    """Allow parts that are not stored as data until the command ends, if requested."""
     if trust:
         from residnet.core.trust import trusting
 
@@ -321,11 +321,11 @@ def _trust(context: typer.Context, trust: bool) -> bool:
     return trust
 
 
-Trust = Annotated[
+TrustOption = Annotated[
     bool,
     typer.Option(
         "--trust",
-        callback=_trust,
+        callback=_allow_untrusted_parts,
         help="Make and load parts that are not stored as data, such as other classes of"
         " scikit-learn. They can run code: only for configs and runs whose source you trust.",
     ),
@@ -356,7 +356,7 @@ def run(
             help="Models that are fitted in parallel; the number of cores if not given.",
         ),
     ] = None,
-    trust: Trust = False,
+    trust: TrustOption = False,
     quiet: QuietOption = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print summary.json and the run's folder, for machines.")
@@ -482,7 +482,7 @@ def demo(
 def check(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help=_CONFIG_HELP)],
     overrides: OverridesOption = None,
-    trust: Trust = False,
+    trust: TrustOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Validate a config and its files, models and packages, without running it."""
@@ -513,7 +513,7 @@ def inspect(
         Path | None,
         typer.Option("--out", metavar="FILE", help="Also write the findings to a file as JSON."),
     ] = None,
-    trust: Trust = False,
+    trust: TrustOption = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the findings as JSON, for machines.")
     ] = False,
@@ -564,7 +564,7 @@ def evaluate(
             "--out", metavar="DIR", help="Folder of the results; RUN/external-<time> if not given."
         ),
     ] = None,
-    trust: Trust = False,
+    trust: TrustOption = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted evaluation in its folder.")
     ] = False,
@@ -610,7 +610,7 @@ def monitor(
             help="Apply the identified changes to a copy of the model, in a new run folder.",
         ),
     ] = None,
-    trust: Trust = False,
+    trust: TrustOption = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the results as JSON, for machines.")
     ] = False,
@@ -671,7 +671,7 @@ def plan_trial(
         Path | None,
         typer.Option("--out", metavar="DIR", help="Folder for next_trials.yaml and tracks."),
     ] = None,
-    trust: Trust = False,
+    trust: TrustOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Plan the next trials, with the expected reduction of the prediction intervals."""
@@ -722,7 +722,7 @@ def export(
             help="Export even if the model is worse than the baseline; its card says so.",
         ),
     ] = False,
-    trust: Trust = False,
+    trust: TrustOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Export a model of a finished run for controllers, after a parity check."""
@@ -758,7 +758,7 @@ def ardupilot(
         ),
     ] = None,
     port: Annotated[int, typer.Option("--port", help="UDP port that ArduPilot sends to.")] = 9002,
-    trust: Trust = False,
+    trust: TrustOption = False,
 ) -> None:
     """Simulate a vessel or a learned model for ArduPilot (sim_vehicle.py --model JSON)."""
     from residnet.simulators.ardupilot import ArduPilotBackend, assign_servos
@@ -817,7 +817,7 @@ def derivatives(
             help="Format of --out: json, csv, matlab, vessel, mss or sdf; else by its suffix.",
         ),
     ] = None,
-    trust: Trust = False,
+    trust: TrustOption = False,
 ) -> None:
     """Print hydrodynamic derivatives with standard errors, in SI, prime and bis systems.
 
@@ -899,7 +899,7 @@ def scale(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
     ] = False,
-    trust: Trust = False,
+    trust: TrustOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Scale the models and logs of a finished fit to full scale, by Froude's law of similarity.

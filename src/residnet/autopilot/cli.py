@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from residnet.cli import QuietOption, Trust, print_result, show_progress
+from residnet.cli import QuietOption, TrustOption, print_result, show_progress
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -42,7 +42,7 @@ def autopilot(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace earlier files and an earlier run.")
     ] = False,
-    trust: Trust = False,
+    trust: TrustOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Train a heading autopilot for your vessel under the conditions that its logs show."""
