@@ -106,7 +106,7 @@ def test_a_fit_to_csv_is_evaluated_and_exported(
     refused: tuple[tuple[list[Any], str], ...] = (
         (["export", out, "--model", "rigde"], "did you mean 'ridge'"),
         (["evaluate", out, "--logs", tmp_path / "nothing"], "nothing"),
-        (["evaluate", out], "Name files or folders of logs behind the run"),
+        (["evaluate", out], "no logs given; name files or folders"),
         (["report", tmp_path], ""),
     )
     for words, told in refused:
