@@ -41,6 +41,17 @@ ARMS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "encoder": ("constant_velocity", {"encoder": "measurements"}, {}),
     "lstm": ("constant_velocity", {"encoder": "measurements", "cell": "lstm"}, {}),
     "encoder_twice": ("constant_velocity", {"encoder": "measurements"}, {"steps": 30}),
+    "encoder_free": (
+        "constant_velocity",
+        {"encoder": "measurements", "restoring": False, "margin": 10.0},
+        {},
+    ),
+    "encoder_huber": ("constant_velocity", {"encoder": "measurements"}, {"robust": 0.0}),
+    "encoder_fast": (
+        "constant_velocity",
+        {"encoder": "measurements"},
+        {"gradient_clip": 100.0},
+    ),
 }
 """Baseline, changed keys of the head and of its training for each arm of the ablation."""
 PLAIN: dict[str, dict[str, Any]] = {

@@ -7,6 +7,7 @@ symmetry halves the range of states that a network has to learn.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar, final
 
 import torch
@@ -69,16 +70,7 @@ class MirroredHead(RenamedStateModule, ResidualHead):
 
         The training range is then mirror-symmetric.
         """
-        mirrored = samples.z.index_select(1, self.mirror_index) * self.mirror_sign
-        symmetric_samples = Samples(
-            torch.cat((samples.z, mirrored)),
-            torch.cat((samples.target, samples.target * self.axis_sign)),
-            torch.cat((samples.group, samples.group)),
-            torch.cat((samples.t, samples.t)),
-            samples.kinds,
-            samples.names,
-        )
-        self.inner_head.calibrate(symmetric_samples)
+        self.inner_head.calibrate(add_mirror_images(samples))
 
     def residual_scale(self) -> Tensor:
         return self.inner_head.residual_scale()
@@ -119,3 +111,20 @@ class MirroredHead(RenamedStateModule, ResidualHead):
         """Return the bounds of the memory [n_state], those of the inner head twice."""
         lower, upper = self.inner_head.memory_bounds()
         return lower.repeat(2), upper.repeat(2)
+
+
+def add_mirror_images(samples: Samples) -> Samples:
+    """Return samples followed by their mirror images.
+
+    Raises:
+        ConfigError: if the image of a channel is unknown.
+    """
+    index, signs = require_mirror_image(samples.names)
+    axis_signs = samples.target.new_tensor(get_axis_parities(samples.names))
+    return replace(
+        samples,
+        z=torch.cat((samples.z, samples.z[:, index] * samples.z.new_tensor(signs))),
+        target=torch.cat((samples.target, samples.target * axis_signs)),
+        group=torch.cat((samples.group, samples.group)),
+        t=torch.cat((samples.t, samples.t)),
+    )

@@ -18,6 +18,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.time_steps import Integrator
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import TRAINING_STEPS, FreeRun, Rollout
+from residnet.heads.mirror import add_mirror_images
 from residnet.heads.recurrent import GRUEnsembleHead
 from residnet.physics.signals import Signals
 from residnet.physics.symmetry import get_axis_parities, mirror_channels
@@ -402,7 +403,9 @@ def make_training(
     Raises:
         DataError: if no log is long enough for a stage.
     """
-    model.head.calibrate(samples)
+    # mirrored windows leave the range of the samples, outside of which inputs are clamped and
+    # velocities are pulled back
+    model.head.calibrate(add_mirror_images(samples) if config.mirror else samples)
     dtype = torch.float64 if config.is_double_precision else torch.float32
     if isinstance(model.head, GRUEnsembleHead):
         coarse, stride = _with_coarse_step(model, model.head)
