@@ -82,6 +82,7 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
         self.output_weight = uniform_parameter(hidden_size, self.n_dof)
         self.skip_weight = uniform_parameter(n_inputs, self.n_dof)
         self.bias_out = nn.Parameter(torch.zeros(config.members, 1, self.n_dof))
+        self.training_gain: Tensor | None = None
         with torch.no_grad():
             # small initial outputs: training starts near the baseline
             for weight in (self.output_weight, self.skip_weight):
@@ -131,10 +132,29 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
             next_memory[..., : self.hidden_size],
             self.output_weight,
         )
+        if self.training_gain is not None:
+            network_output = network_output * self.training_gain.to(network_output)
         rho: Tensor = self.scale(network_output.reshape(-1, self.n_dof))
         if self.restoring_acceleration is not None:
             rho = rho + self.restoring_acceleration(z)
         return rho, next_memory.reshape(-1, self.n_state)
+
+    def set_training_gain(self, gain: Tensor | None) -> None:
+        """Multiply the outputs by a gain [n] during training; None removes it.
+
+        The weights of the outputs change inversely, so that the head is the same function. A step
+        of Adam has about the same size for every weight; with a gain it changes the outputs by
+        more.
+        """
+        ratio = torch.ones(self.n_dof, dtype=torch.float64)
+        if self.training_gain is not None:
+            ratio = ratio * self.training_gain.double()
+        if gain is not None:
+            ratio = ratio / gain.double()
+        with torch.no_grad():
+            for weight in (self.output_weight, self.skip_weight, self.bias_out):
+                weight.mul_(ratio.to(weight))
+        self.training_gain = gain
 
     def update_memory(
         self, input_gates: Tensor, memory: Tensor, hidden_weight: Tensor, bias_hidden: Tensor

@@ -405,10 +405,13 @@ def make_training(
     """
     # mirrored windows leave the range of the samples, outside of which inputs are clamped and
     # velocities are pulled back
-    model.head.calibrate(add_mirror_images(samples) if config.mirror else samples)
+    calibration_samples = add_mirror_images(samples) if config.mirror else samples
+    model.head.calibrate(calibration_samples)
     dtype = torch.float64 if config.is_double_precision else torch.float32
     if isinstance(model.head, GRUEnsembleHead):
         coarse, stride = _with_coarse_step(model, model.head)
+        if _has_no_baseline(model):
+            model.head.set_training_gain(_compute_training_gain(model.head, calibration_samples))
         angle_columns = [model.signals.direction_column] if model.signals.has_wind else []
         store = store.coarsen(stride, angle_columns)
 
@@ -433,6 +436,8 @@ def make_training(
 def finish_training(model: HybridDynamics) -> None:
     """Return a model to the state before `make_training`, with the trained weights."""
     model.head.set_step(model.dt)
+    if isinstance(model.head, GRUEnsembleHead):
+        model.head.set_training_gain(None)
     model.to(torch.float32)
     model.has_position = True
     model.eval().requires_grad_(False)
@@ -475,11 +480,28 @@ def train(
 def _with_coarse_step(model: HybridDynamics, head: GRUEnsembleHead) -> tuple[HybridDynamics, int]:
     """Return the model at the step of the head's gates, and the ratio of the two steps."""
     stride = max(round(head.training_step / model.dt), 1)
-    # a baseline at a step of this length needs a second-order scheme; a residual is constant
-    has_no_baseline = (
-        isinstance(model.baseline, FixedBaseline) and not model.baseline.library.n_terms
-    )
-    # an explicit Euler scheme amplifies the roll oscillation
+    # a baseline at a step of this length needs a second-order scheme; a residual is constant.
+    # An explicit Euler scheme amplifies the roll oscillation
     first_order: Integrator = "semi_implicit_euler" if model.has_roll else "euler"
-    scheme: Integrator = first_order if has_no_baseline else "heun"
+    scheme: Integrator = first_order if _has_no_baseline(model) else "heun"
     return HybridDynamics(model.signals, model.baseline, head, stride * model.dt, scheme), stride
+
+
+def _has_no_baseline(model: HybridDynamics) -> bool:
+    return isinstance(model.baseline, FixedBaseline) and not model.baseline.library.n_terms
+
+
+_INCREMENT_STD = 0.5
+"""Change of a velocity in a training step for an output of 1, in standard deviations."""
+
+
+def _compute_training_gain(head: GRUEnsembleHead, samples: Samples) -> Tensor:
+    """Return the gain [n] of the outputs of networks that have no baseline.
+
+    Without a baseline the networks also learn how velocities decay. The accelerations of a slow
+    velocity are so small relative to it that this takes large weights in units of their standard
+    deviation, which few steps of the optimiser do not reach.
+    """
+    velocity_std = samples.running_moments()[0].std()[: head.n_dof]
+    increment = head.training_step * head.residual_scale()
+    return (_INCREMENT_STD * velocity_std / increment.clamp(min=1e-12)).clamp(min=1.0)
