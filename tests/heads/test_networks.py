@@ -212,6 +212,26 @@ def test_an_lstm_step_is_that_of_pytorch() -> None:
         torch.testing.assert_close(next_memory[rows], expected)
 
 
+def test_a_training_gain_changes_weights_and_not_outputs() -> None:
+    head = networks(members=2)
+    z = torch.randn(6, 5, dtype=torch.float64)
+    s = torch.rand(6, 5, dtype=torch.float64)
+    weights = [head.output_weight, head.skip_weight, head.bias_out]
+    with torch.no_grad():
+        head.bias_out.add_(0.1)
+        expected = head(z, s)[0]
+        initial_weights = [weight.clone() for weight in weights]
+        for gain in ([2.0, 5.0, 1.0], [4.0, 1.0, 8.0]):
+            head.set_training_gain(torch.tensor(gain))
+            torch.testing.assert_close(head(z, s)[0], expected)
+            torch.testing.assert_close(
+                head.output_weight * torch.tensor(gain, dtype=torch.float64), initial_weights[0]
+            )
+        head.set_training_gain(None)
+        torch.testing.assert_close(head(z, s)[0], expected)
+        torch.testing.assert_close(weights, initial_weights)
+
+
 @pytest.mark.parametrize("cell", ["gru", "lstm"])
 def test_the_encoder_reads_measured_states_and_the_decoder_predicted_ones(cell: str) -> None:
     signals = SignalsConfig(inputs=("n", "delta")).build()

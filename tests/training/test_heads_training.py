@@ -17,6 +17,7 @@ from kinds import of_kind
 from made_system import LINEAR, SCALES, STEP, free_run_error, inputs, model_of, trials
 from torch import Tensor, nn
 
+from residnet.baselines.given_config import ZeroBaselineConfig
 from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
@@ -26,12 +27,22 @@ from residnet.engine.rollout import Rollout
 from residnet.heads.lstm_config import LstmConfig
 from residnet.heads.mlp import MlpHead
 from residnet.heads.mlp_config import MlpConfig
+from residnet.heads.recurrent import GRUEnsembleHead
+from residnet.heads.recurrent_config import GRUEnsembleConfig
 from residnet.preprocessing.data_module import WindowBatch, WindowsDataModule
 from residnet.preprocessing.prepare import PreparedLog
 from residnet.preprocessing.samples import make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.training.config import MachineConfig, TrainingConfig
-from residnet.training.heads import HeadTraining, Validate, one_step_loss, rollout_loss, train
+from residnet.training.heads import (
+    HeadTraining,
+    Validate,
+    finish_training,
+    make_training,
+    one_step_loss,
+    rollout_loss,
+    train,
+)
 from residnet.training.score import ExampleRun, Score
 
 
@@ -496,6 +507,34 @@ SETTINGS: dict[str, Any] = {
 def validated(model: HybridDynamics) -> Score:
     """A score that needs no free run."""
     return Score(0, float(sum(p.square().sum() for p in model.head.parameters())))
+
+
+@pytest.mark.parametrize("has_baseline", [True, False])
+def test_networks_are_calibrated_on_both_sides_and_with_a_gain(has_baseline: bool) -> None:
+    head_config = GRUEnsembleConfig(members=2, hidden_size=4, step=5 * STEP, margin=0.0)
+    model, residual, _ = prepared(trials(), head_config)
+    head = of_kind(model.head, GRUEnsembleHead)
+    if not has_baseline:
+        zero = ZeroBaselineConfig().build(model.signals.names)
+        model = HybridDynamics(model.signals, zero, head, model.dt, model.integrator)
+    settings = {"multi_step": [{"horizon": 0.5, "epochs": 1, "batch": 4}], "mirror": True}
+    config = TrainingConfig.model_validate(settings)
+    store = WindowStore.from_logs(trials(), torch.float32)
+    make_training(model, residual, store, config, SCALES, validated, 0)
+    # v, r and tau_n change their signs in the mirror
+    sideways = [1, 2, 4]
+    torch.testing.assert_close(head.features.low[sideways], -head.features.high[sideways])
+    assert bool((head.features.mean[sideways].abs() < 1e-12).all())
+    gain = head.training_gain
+    if has_baseline:
+        assert gain is None
+    else:
+        assert gain is not None
+        # an output of 1 changes each velocity by half a standard deviation in a step
+        increment = gain * head.residual_scale() * head.training_step
+        torch.testing.assert_close(increment, 0.5 * head.features.std[:3])
+    finish_training(model)
+    assert head.training_gain is None
 
 
 def losses_of(
