@@ -232,6 +232,24 @@ def test_a_training_gain_changes_weights_and_not_outputs() -> None:
         torch.testing.assert_close(weights, initial_weights)
 
 
+def test_gradients_are_clipped_for_each_network() -> None:
+    head = networks(members=3)
+    rho, _ = head(torch.randn(6, 5, dtype=torch.float64), torch.rand(6, 5, dtype=torch.float64))
+    weights = torch.tensor([1e-3, 1.0, 1e3], dtype=torch.float64).repeat_interleave(2)
+    (rho.square().sum(1) * weights).sum().backward()
+    expected = []
+    for k in range(3):
+        gradients = [p.grad[k].flatten() for p in head.parameters() if p.grad is not None]
+        gradient = torch.cat(gradients)
+        # the loss is the mean over the networks, so that a norm of 0.9 is 0.3 here
+        expected.append(gradient * min(0.3 / float(gradient.norm()), 1.0))
+    head.clip_member_gradients(0.9)
+    for k in range(3):
+        gradients = [p.grad[k].flatten() for p in head.parameters() if p.grad is not None]
+        torch.testing.assert_close(torch.cat(gradients), expected[k])
+    assert float(expected[0].norm()) < 0.3
+
+
 @pytest.mark.parametrize("cell", ["gru", "lstm"])
 def test_the_encoder_reads_measured_states_and_the_decoder_predicted_ones(cell: str) -> None:
     signals = SignalsConfig(inputs=("n", "delta")).build()

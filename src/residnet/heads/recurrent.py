@@ -156,6 +156,19 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
                 weight.mul_(ratio.to(weight))
         self.training_gain = gain
 
+    def clip_member_gradients(self, max_norm: float) -> None:
+        """Limit the norm of the gradient of each network, so that none slows down the others.
+
+        Args:
+            max_norm: largest norm of the gradient of a network's own loss; the loss of the ensemble
+                is the mean over its networks.
+        """
+        gradients = [p.grad for p in self.parameters() if p.grad is not None]
+        norms = torch.stack([grad.flatten(1).square().sum(1) for grad in gradients]).sum(0).sqrt()
+        factors = (max_norm / self.batch_ensemble_size / norms.clamp(min=1e-30)).clamp(max=1.0)
+        for grad in gradients:
+            grad.mul_(factors.view(-1, *[1] * (grad.ndim - 1)))
+
     def update_memory(
         self, input_gates: Tensor, memory: Tensor, hidden_weight: Tensor, bias_hidden: Tensor
     ) -> Tensor:

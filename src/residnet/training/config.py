@@ -193,7 +193,7 @@ class TrainingConfig(MachineConfig):
             of the metrics' scales.
         robust: error, in units of the scales, above which the loss of a window is linear instead
             of quadratic; 0 for the mean square error.
-        gradient_clip: largest norm of the gradient.
+        gradient_clip: largest norm of the gradient; for an ensemble, of that of each network.
         weight_decay: weight decay of AdamW, applied to matrices only.
         mirror: whether every second window is mirrored, with port and starboard exchanged.
         patience: number of successive validations without a better free run, in the last stage,

@@ -258,6 +258,21 @@ class HeadTraining(EpochTraining):
         for group in self.trainer.optimizers[0].param_groups:
             group["lr"] = self.settings.rate(self.epoch)
 
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip the gradient of each network of an ensemble separately."""
+        head = self.model.head
+        if isinstance(head, GRUEnsembleHead) and gradient_clip_val is None:
+            head.clip_member_gradients(self.settings.gradient_clip)
+        else:
+            super().configure_gradient_clipping(
+                optimizer, gradient_clip_val, gradient_clip_algorithm
+            )
+
     def training_step(self, windows: tuple[WindowBatch, ...], batch_index: int) -> Tensor:
         """Return the loss of a batch: random windows, then windows at the start of a segment."""
         stage, _ = self.settings.stage(self.epoch)
