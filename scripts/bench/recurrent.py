@@ -41,17 +41,8 @@ ARMS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "encoder": ("constant_velocity", {"encoder": "measurements"}, {}),
     "lstm": ("constant_velocity", {"encoder": "measurements", "cell": "lstm"}, {}),
     "encoder_twice": ("constant_velocity", {"encoder": "measurements"}, {"steps": 30}),
-    "encoder_free": (
-        "constant_velocity",
-        {"encoder": "measurements", "restoring": False, "margin": 10.0},
-        {},
-    ),
-    "encoder_huber": ("constant_velocity", {"encoder": "measurements"}, {"robust": 0.0}),
-    "encoder_fast": (
-        "constant_velocity",
-        {"encoder": "measurements"},
-        {"gradient_clip": 100.0},
-    ),
+    "encoder_margin": ("constant_velocity", {"encoder": "measurements", "margin": 0.5}, {}),
+    "hull_margin": ("hull", {"margin": 0.5}, {}),
 }
 """Baseline, changed keys of the head and of its training for each arm of the ablation."""
 PLAIN: dict[str, dict[str, Any]] = {
@@ -88,6 +79,8 @@ MEANS = (
     ("hull", "encoder"), ("hull", "lstm"), ("hull", "encoder_twice"),
     ("hull", "hull_network", "innovations"), ("hull", "hull_network", "encoder"),
     ("hull", "hull_network", "lstm"), ("hull", "hull_network", "encoder_twice"),
+    ("hull", "encoder_margin"), ("hull", "hull_margin"), ("hull", "hull_margin", "encoder_margin"),
+    ("hull", "hull_network", "encoder_margin"),
     ("hull", "hull_encoder", "encoder"), ("hull", "hull_network", "innovations", "encoder"),
 )  # fmt: skip
 """Means of trajectories that are compared; the first is the reference."""

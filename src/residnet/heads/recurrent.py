@@ -59,7 +59,9 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
         self.features = Features(config.select_features(names), names, config.margin)
         self.scale = ResidualScale(self.n_dof)
         self.restoring_acceleration: SoftVelocityLimit | None = (
-            SoftVelocityLimit(n_channels=self.n_dof, n_dof=self.n_dof) if config.restoring else None
+            SoftVelocityLimit(config.margin, n_channels=self.n_dof, n_dof=self.n_dof)
+            if config.restoring
+            else None
         )
         n_innovations = 0 if self.has_encoder else self.n_dof
         self.n_inputs = n_inputs = self.features.n_features + n_innovations

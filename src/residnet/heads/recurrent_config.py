@@ -37,7 +37,7 @@ class GRUEnsembleConfig(NetworkConfig):
         hidden_size: number of hidden units of each network.
         step: time step of the gates.
         restoring: whether a restoring acceleration acts on velocities outside their training range,
-            so that networks without a baseline cannot diverge.
+            widened by `margin`, so that networks without a baseline cannot diverge.
     """
 
     kind: Literal["recurrent"] = "recurrent"
