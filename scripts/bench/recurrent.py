@@ -202,7 +202,14 @@ def summarize(records: list[dict[str, Any]]) -> str:
     reference = " + ".join(MEANS[0])
     lines = []
     for past in sorted({record["past"] for record in records}):
-        chosen = [record["errors"] for record in records if record["past"] == past]
+        chosen = [
+            record["errors"]
+            for record in records
+            if record["past"] == past and reference in record["errors"]
+        ]
+        if not chosen:
+            lines.append(f"past {past:g} s: no draw has {reference}")
+            continue
         mean_error = np.mean([errors[reference] for errors in chosen])
         lines.append(f"past {past:g} s, {len(chosen)} draws, {reference}: {mean_error:.3f}")
         for name in dict.fromkeys(name for errors in chosen for name in errors):
@@ -215,6 +222,8 @@ def summarize(records: list[dict[str, Any]]) -> str:
             )
     by_draw: dict[Any, dict[float, float]] = {}
     for record in records:
+        if reference not in record["errors"]:
+            continue
         draw = (record["name"], record["draw"])
         by_draw.setdefault(draw, {})[record["past"]] = record["errors"][reference]
     pasts = sorted({record["past"] for record in records})
