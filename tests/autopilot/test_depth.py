@@ -111,19 +111,21 @@ def test_gradients_of_the_cost_reach_law_line_of_sight_and_network(vessel: Steer
         assert float(part.grad.abs().max()) > 0
 
 
-def test_planes_that_are_reversed_and_a_vessel_that_nothing_rights_are_refused(
-    tmp_path: Path,
-) -> None:
+def test_planes_that_are_reversed_are_refused() -> None:
+    torpedo = SteeredPlant(load_vessel("remus_100").build(), axis=DEPTH._replace(side=1.0))
+    with pytest.raises(FitError, match="check the sign"):
+        torpedo.estimate_nomoto(15 * DEG, 8.0, 0.1)
+
+
+# 20 s until the pitch has not settled; reversed planes are refused in half of the time
+@pytest.mark.long
+def test_a_vessel_that_nothing_rights_is_refused(tmp_path: Path) -> None:
     content = yaml.safe_load(Path("configs/vessels/remus_100.yaml").read_text())
     content["rigid_body"]["z_G"]["value"] = 0.0
     neutral = write_yaml(tmp_path / "neutral.yaml", content)
-    for name, axis, seconds, said in (
-        ("remus_100", DEPTH._replace(side=1.0), 8.0, "check the sign"),
-        (str(neutral), DEPTH, 20.0, "without a restoring moment"),
-    ):
-        torpedo = SteeredPlant(load_vessel(name).build(), axis=axis)
-        with pytest.raises(FitError, match=said):
-            torpedo.estimate_nomoto(15 * DEG, seconds, 0.1)
+    torpedo = SteeredPlant(load_vessel(str(neutral)).build(), axis=DEPTH)
+    with pytest.raises(FitError, match="without a restoring moment"):
+        torpedo.estimate_nomoto(15 * DEG, 20.0, 0.1)
 
 
 def test_vessels_without_planes_and_mixed_axes_are_refused() -> None:

@@ -191,7 +191,8 @@ def test_attitude_depth_and_place_follow_the_velocities(scheme: Integrator, head
 @pytest.mark.parametrize(
     "scheme",
     [
-        pytest.param(scheme, marks=[pytest.mark.long] if scheme == "rk4" else [])
+        # the two schemes of one stage are fast
+        pytest.param(scheme, marks=[pytest.mark.long] if scheme in ("rk4", "heun") else [])
         for scheme in get_args(Integrator)
     ],
 )

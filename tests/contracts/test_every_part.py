@@ -387,7 +387,11 @@ def test_export_format(name: str) -> None:
 LAYOUTS = {"drawn": None, "roll": ROLLING_SIGNALS, "six": SUBMERGED_SIGNALS}
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
+# the layout with roll also has states beyond the plane, and is compiled in half of the time
+@pytest.mark.parametrize(
+    "layout",
+    [pytest.param(name, marks=[pytest.mark.long] if name == "six" else []) for name in LAYOUTS],
+)
 @pytest.mark.parametrize("name", formats("torchscript", "c", "parameters"))
 def test_a_format_holds_what_its_layout_names(name: str, layout: str, tmp_path: Path) -> None:
     signals = LAYOUTS[layout] or _drawn(name)

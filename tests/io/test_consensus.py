@@ -96,7 +96,10 @@ def _askew(log: Log) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("kind", "change", "cause", "states"),
     [
-        ("twin", _exchanged, "exchanged", ("x", "y", "psi", "r")),
+        # a fleet of its own; faults of a boat are fast
+        pytest.param(
+            *("twin", _exchanged, "exchanged", ("x", "y", "psi", "r")), marks=pytest.mark.long
+        ),
         ("boat", _reversed, "sign", ("psi", "u", "v", "r")),
         ("boat", _askew, "heading", ("psi", "u", "v", "r")),
     ],

@@ -39,10 +39,11 @@ def test_inspect_log_of_clean_simulations_gives_notes_only(name: str) -> None:
     assert [finding.text for finding in said if finding.level != "note"] == []
 
 
-# each fault on the boat where she can show it, on one of the two ships else, and some on both
+# each fault on the boat where she can show it, on one of the two ships else; some on a second one
+# among the long tests
 BOTH = ("stuck actuator", "steering reversed", "lag of psi", "inputs late", "frozen sensor")
 CASES = [
-    (fault, name)
+    pytest.param(fault, name, marks=[pytest.mark.long] if name != able[0] else [])
     for fault in FAULTS
     for able in [[name for name in HOSTS if name in fault.ships + fault.hosts]]
     for name in (able if fault.name in BOTH else able[:1])

@@ -247,7 +247,8 @@ def _doors(files: Sequence[Path]) -> dict[str, dict[str, Any]]:
     }
 
 
-@pytest.mark.parametrize("dated", [True, False])
+# dates and German names are read by `test_a_table_is_read_as_it_was` among the fast tests
+@pytest.mark.parametrize("dated", [pytest.param(True, marks=pytest.mark.long), False])
 def test_one_map_from_every_door(dated: bool, logs: list[Log], tmp_path: Path) -> None:
     degrees = {"psi": "deg", "r": "deg/s", "delta": "deg", "n": "rpm"}
     style = GERMAN if dated else Style(units=degrees, signs=("delta",))

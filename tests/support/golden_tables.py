@@ -54,9 +54,9 @@ def table(path: Path) -> pd.DataFrame:
 
 
 def over_its_length(test: Callable[..., None]) -> Callable[..., None]:
-    """Run a test over the first 20 s of a run, and over all of it among the long ones."""
+    """Run a test over the first 10 s of a run, and over all of it among the long ones."""
     whole = pytest.param(np.inf, marks=pytest.mark.long, id="whole")
-    return pytest.mark.parametrize("seconds", [pytest.param(20.0, id="20s"), whole])(test)
+    return pytest.mark.parametrize("seconds", [pytest.param(10.0, id="10s"), whole])(test)
 
 
 Row = tuple[str, np.ndarray, np.ndarray, np.ndarray]
