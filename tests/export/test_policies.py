@@ -224,7 +224,8 @@ AGAIN = 301
 
 
 @pytest.mark.usefixtures("short_parity")
-@pytest.mark.parametrize("safe", ["amidships", "hold"])
+# the rudder that is held is the fast one
+@pytest.mark.parametrize("safe", [pytest.param("amidships", marks=pytest.mark.long), "hold"])
 def test_the_node_answers_as_the_policy(safe: Any, tmp_path: Path) -> None:
     own = observed(math.radians(10))[1]
     exported = ExportedHeading("pilot", own, fallback=safe, description={}, metrics=[])

@@ -45,7 +45,7 @@ def test_symmetric_boats_are_mirrored() -> None:
     assert [find_asymmetric_pairs(collect_samples(logs)) for logs in boats] == [[]] * N_DRAWS
 
 
-@pytest.mark.parametrize("name", INPUTS)
+@pytest.mark.parametrize("name", [pytest.param(INPUTS[0], marks=pytest.mark.long), INPUTS[1]])
 def test_a_reversed_motor_is_named(name: str) -> None:
     boats, _ = simulate_twin_boats(2, N_DRAWS)
     for logs in boats:

@@ -38,9 +38,10 @@ def trial(number: int, *channels: str) -> Log:
 @pytest.mark.parametrize(
     ("channels", "velocities"),
     [
+        # surge alone is the fast one
         (("u", "n"), ("u",)),
         pytest.param(("psi", "delta"), ("r",), marks=pytest.mark.long),
-        (("u", "psi", "n", "delta"), ("u", "r")),
+        pytest.param(("u", "psi", "n", "delta"), ("u", "r"), marks=pytest.mark.long),
     ],
 )
 def test_a_fit_is_of_what_the_logs_tell(
