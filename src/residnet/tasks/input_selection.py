@@ -96,7 +96,9 @@ def choose_inputs(logs: Sequence[Log], draft_notes: DraftNotes) -> tuple[str, ..
             # an angle or a shaft speed is more informative than a share or a pulse width
             inputs[inputs.index(duplicate)], name, duplicate = name, duplicate, name
         draft_notes.add_guess(
-            INPUTS_KEY, f"{name} moves as {duplicate} does in every log, and is left out"
+            INPUTS_KEY,
+            f"{name} moves as {duplicate} does in every log: its effect cannot be separated from"
+            f" that of {duplicate}",
         )
     if len(inputs) > _MAX_INPUTS:
         draft_notes.add_guess(
@@ -173,7 +175,7 @@ def _is_excited(name: str, values: np.ndarray, draft_notes: DraftNotes) -> bool:
         return True
     level = float(np.median(finite_values)) if finite_values.size else 0.0
     draft_notes.add_guess(
-        INPUTS_KEY, f"{name} stays at {level:.4g}: its effect cannot be told, it is left out"
+        INPUTS_KEY, f"{name} stays at {level:.4g}: its effect cannot be identified"
     )
     return False
 
