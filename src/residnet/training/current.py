@@ -335,17 +335,17 @@ class _CurrentProblem:
         The coefficients are eliminated (variable projection, Kaufman's approximation).
         """
         n_logs = len(self.logs)
-        # exact derivatives of the errors by the current of each sample [N, 3, 2]
-        current_of_sample = current[fit.group]
-        columns_of_jacobian = []
-        for direction in torch.eye(2, dtype=torch.float64):
-            derivative = torch.func.jvp(
-                lambda c: self.residuals(c, fit.theta),
-                (current_of_sample,),
-                (direction.expand_as(current_of_sample),),
-            )[1]
-            columns_of_jacobian.append(derivative)
-        jacobian = torch.stack(columns_of_jacobian, dim=2)
+        # exact derivatives of the errors by the current of each sample [N, 3, 2]: samples do not
+        # depend on each other, so that the gradient of a sum has the derivative of each. Three
+        # gradients take a fifth of the time of two forward derivatives, which PyTorch decomposes
+        current_of_sample = current[fit.group].requires_grad_()
+        with torch.enable_grad():
+            errors = self.residuals(current_of_sample, fit.theta)
+            gradients = [
+                torch.autograd.grad(errors[:, axis].sum(), current_of_sample, retain_graph=True)[0]
+                for axis in range(3)
+            ]
+        jacobian = torch.stack(gradients, dim=1)
         hessian = self.precision * torch.eye(2 * n_logs, dtype=torch.float64)
         gradient = self.precision * current
         for axis in range(3):
