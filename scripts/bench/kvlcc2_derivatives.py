@@ -1,7 +1,7 @@
 """Coverage of the 95 % intervals of derivatives of the KVLCC2 from simulated tests.
 
     python scripts/bench/kvlcc2_derivatives.py [--first 0] [--count 20] [--order 1] [--table FILE]
-        [--prior-weight fixed] [--refit-prior 1.0] [--horizon 20]
+        [--prior-weight fixed] [--refit-prior 0] [--horizon 20]
 
 The ship is the MMG model with the coefficients of Yasukawa and Yoshimura (2015), Tables 3 and 4, of
 7 m length. Each draw adds noise to its simulated zigzags and turning circles and identifies all
@@ -156,7 +156,7 @@ def main() -> None:
         order=1,
         table=None,
         prior_weight="fixed",
-        refit_prior=1.0,
+        refit_prior=0.0,
         horizon=20.0,
     )
     spec, model = build_published()

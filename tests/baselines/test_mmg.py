@@ -212,4 +212,5 @@ def test_the_evidence_widens_priors_that_the_logs_contradict_and_keeps_right_one
         )
         (solution,) = config.fit_solutions(config.build(NAMES), samples)
         factors[name] = solution.notes["prior_factor"]
-    assert factors["right"] < 1.0 < factors["wrong"]
+    assert factors["right"] == 1.0
+    assert factors["wrong"] > 1.0

@@ -126,8 +126,8 @@ class MMGConfig(MMGParticularsConfig):
             independent sample.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
         prior_weight: `fixed` takes the standard deviations of the priors as they are; `evidence`
-            multiplies them by the factor with the largest marginal likelihood, so that few logs
-            stay near the regressions and many logs leave them.
+            multiplies them by the factor of at least 1 with the largest marginal likelihood, so
+            that logs leave regressions that they contradict.
     """
 
     kind: Literal["mmg"] = "mmg"

@@ -385,7 +385,7 @@ def fit_regressors(
 
 _REGRESSION_ERROR = 0.3
 """Relative standard deviation of a semi-empirical derivative, before the evidence widens it."""
-_PRIOR_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+_PRIOR_FACTORS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Factors on this standard deviation, of which the evidence chooses one."""
 
 
