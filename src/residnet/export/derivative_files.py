@@ -189,7 +189,8 @@ def _write_mss(table: DerivativesFile, stem: str) -> str:
         name=stem,
         header=_describe_table(table),
         inputs=[
-            {"name": name, "variable": variables[name], "value": table.operating_point[name]}
+            # adding zero removes the sign of a negative zero
+            {"name": name, "variable": variables[name], "value": table.operating_point[name] + 0.0}
             for name in inputs
         ],
         speed=table.particulars["speed"],
