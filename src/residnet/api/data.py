@@ -471,12 +471,7 @@ def prepare(
             key: value for key, value in grid.items() if value is not None
         }
         if settings.get("protocols") is not None:
-            if not isinstance(settings["protocols"], Mapping):
-                given_type = describe_type(settings["protocols"])
-                raise UsageError(
-                    f"prepare: protocols: expected a mapping by name, given {given_type}"
-                )
-            evaluation_settings["selection"] = next(iter(settings["protocols"]), "")
+            evaluation_settings["selection"] = _find_first_protocol(settings["protocols"])
         signals: dict[str, Any] = {
             "inputs": input_names if isinstance(input_names, str) else list(input_names),
             "exogenous": preparation_recipe.wind_channels,
@@ -528,6 +523,18 @@ def _find_velocities(splits: Mapping[str, Sequence[Log]], velocities: Any) -> De
             for log in members
         ]
     )
+
+
+def _find_first_protocol(protocols: Any) -> str:
+    """Return the name of the first protocol, which selects the model; empty without protocols.
+
+    Raises:
+        UsageError: if the protocols are not a mapping by name.
+    """
+    if not isinstance(protocols, Mapping):
+        given_type = describe_type(protocols)
+        raise UsageError(f"prepare: protocols: expected a mapping by name, given {given_type}")
+    return next(iter(protocols), "")
 
 
 def _derive_inputs(
