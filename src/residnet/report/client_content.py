@@ -63,7 +63,7 @@ class ReportTable:
     Attributes:
         header: titles of the columns.
         rows: texts by row.
-        caption: what the table shows.
+        caption: caption of the table.
         weights: relative widths of the columns; equal if empty.
     """
 
@@ -101,7 +101,7 @@ class ReportPicture:
 
     Attributes:
         file: name of the file.
-        caption: what it shows.
+        caption: caption of the figure.
         width: share of the text width.
     """
 

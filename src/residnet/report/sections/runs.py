@@ -200,7 +200,7 @@ def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | 
 def track_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw a free run of median error up to the main horizon, for the first screen.
 
-    The panels are the track, where there is one, and the first three velocities. A steady run (a
+    The panels are the track, if the model has positions, and the first three velocities. A steady run (a
     straight line or a circle) is only drawn if all are steady.
     """
     horizon = math.inf if run.main_horizon is None else run.main_horizon.seconds

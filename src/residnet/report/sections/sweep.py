@@ -120,7 +120,7 @@ def _slice_positions(
 
 
 def shorten_keys(keys: Sequence[str]) -> dict[str, str]:
-    """Return for each key its last parts, as many as distinguish it from the other keys."""
+    """Return for each key the shortest list of its last parts that no other key has."""
     short_names = {}
     for key in keys:
         parts = key.split(".")
