@@ -200,8 +200,8 @@ def free_run_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | 
 def track_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | None:
     """Draw a free run of median error up to the main horizon, for the first screen.
 
-    The panels are the track, if the model has positions, and the first three velocities. A steady run (a
-    straight line or a circle) is only drawn if all are steady.
+    The panels are the track, if the model has positions, and the first three velocities. A steady
+    run (a straight line or a circle) is only drawn if all are steady.
     """
     horizon = math.inf if run.main_horizon is None else run.main_horizon.seconds
     ranked_windows = _rank_by_error(
