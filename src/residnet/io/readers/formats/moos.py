@@ -22,12 +22,25 @@ _MESSAGE_TYPE = "moos/Variables"
 _START_LINE = re.compile(rb"^%%\s*LOGSTART\s+(?P<start>\d+(?:\.\d+)?)")
 
 
+_MAX_POST_DELAY = 0.15
+"""Largest difference of the times of two variables that a source posts in one iteration, as a share
+of the median interval."""
+
+
+def _are_same_posts(first: np.ndarray, second: np.ndarray) -> bool:
+    """Return whether two clocks [T] in s are those of variables posted one after the other."""
+    if first.size != second.size or first.size < 2:
+        return np.array_equal(first, second)
+    interval = float(np.median(np.diff(first)))
+    return bool(np.abs(first - second).max() <= _MAX_POST_DELAY * interval)
+
+
 @final
 class MoosConfig(RecordingConfig):
     """Reader of alog files from pLogger of MOOS-IvP.
 
-    A series has the variables that one source (`uNav`) publishes at the same times, and the name of
-    the source. A variable with other times is a series with the name of the variable, or
+    A series has the variables that one source (`uNav`) publishes together, and the name of the
+    source. A variable with other times is a series with the name of the variable, or
     `source/variable` if several sources publish it. NAV_X is east, NAV_Y is north, and NAV_HEADING
     is in deg clockwise from north. Variables of text are ignored.
     """
@@ -78,8 +91,9 @@ class MoosConfig(RecordingConfig):
             stamp = np.array(clock)
             samples = np.array(values[source, name])
             same_source = series.get(source)
-            if same_source is None or np.array_equal(same_source.clock, stamp):
+            if same_source is None or _are_same_posts(same_source.clock, stamp):
                 fields = {**(same_source.fields if same_source else {}), name: samples}
+                stamp = stamp if same_source is None else same_source.clock
                 series[source] = Series(source, _MESSAGE_TYPE, fields, stamp)
             else:
                 # variables of several publishers must not replace each other
