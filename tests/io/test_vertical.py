@@ -28,7 +28,7 @@ def test_velocities_of_a_tilted_vessel_are_projected(tilt: float, *, has_heave: 
     quaternion = dict(zip(("qx", "qy", "qz", "qw"), attitude.as_quat().T, strict=True))
     log = RawTable(T, {**quaternion, "u": body[:, 0], "v": body[:, 1]})
     table = {"position_z": position[:, 2]} | ({"linear_z": body[:, 2]} if has_heave else {})
-    (projected,) = project_on_horizontal([*table], [table], [log])
+    (projected,) = project_on_horizontal([*table], [table], [log], {})
     if tilt < 0.1:
         assert projected is log
         return
@@ -46,5 +46,18 @@ def test_velocities_in_the_world_frame_are_not_projected() -> None:
     quaternion = dict(zip(("qx", "qy", "qz", "qw"), attitude.as_quat().T, strict=True))
     log = RawTable(T, {**quaternion, "u": world[:, 0], "v": world[:, 1]})
     table = {"position_z": position[:, 2], "linear_z": world[:, 2]}
-    (projected,) = project_on_horizontal([*table], [table], [log])
+    (projected,) = project_on_horizontal([*table], [table], [log], {})
     assert projected is log
+
+
+def test_velocities_are_projected_by_angles_in_degrees() -> None:
+    attitude, body, position = simulate(0.4)
+    yaw, pitch, roll = attitude.as_euler("ZYX").T
+    tilt = {"phi": np.degrees(roll), "theta": np.degrees(pitch)}
+    log = RawTable(T, {**tilt, "u": body[:, 0], "v": body[:, 1]})
+    table = {"depth_m": position[:, 2], "heave_mps": body[:, 2]}
+    names = {"phi": "roll_deg", "theta": "pitch_deg"}
+    (projected,) = project_on_horizontal([*table], [table], [log], names)
+    expected = Rotation.from_euler("Z", -yaw[:, None]).apply(attitude.apply(body))
+    np.testing.assert_allclose(projected.columns["u"], expected[:, 0], atol=1e-9)
+    np.testing.assert_allclose(projected.columns["v"], expected[:, 1], atol=1e-9)

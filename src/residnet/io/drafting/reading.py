@@ -334,7 +334,7 @@ def _find_named_table(
     columns = [table.columns for table in tables]
     entries = draft_channel_map(
         names,
-        project_on_horizontal(simple_fields, columns, logs),
+        project_on_horizontal(simple_fields, columns, logs, names),
         draft_notes,
         is_up_positive=is_vertical_axis_up(simple_fields, names, columns),
     )

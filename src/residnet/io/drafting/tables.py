@@ -181,7 +181,7 @@ def draft_tables(
     tables = [preview.numeric_columns for preview in previews]
     channels = draft_channel_map(
         column_by_channel,
-        project_on_horizontal(simple_columns, tables, logs),
+        project_on_horizontal(simple_columns, tables, logs, column_by_channel),
         draft_notes,
         [*main_preview.column_names, *cells],
         is_up_positive=is_vertical_axis_up(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.layout import DegreesOfFreedom
+from residnet.core.units import to_si
 from residnet.io.drafting.channels import CHANNELS_KEY, RawTable
 from residnet.io.drafting.questions import DraftNotes
 from residnet.io.header_vocabulary import infer_unit, match_depth_channel, parse_name
@@ -35,17 +36,19 @@ def project_on_horizontal(
     columns: Sequence[str],
     tables: Sequence[Mapping[str, np.ndarray]],
     logs: Sequence[RawTable],
+    names: Mapping[str, str],
 ) -> list[RawTable]:
     """Return logs whose u and v are horizontal, along and across the heading, for tests of frames.
 
     Velocities along the axes of a vessel that rolls and pitches are not those of its track. They
-    are projected by the quaternion, in the frame of the file: with R(q) = R_z(yaw) R(tilt), the
-    result is R(tilt) (u, v, w). Without a column of w, the heave velocity follows from the depth.
+    are projected by the attitude, in the frame of the file: with R = R_z(yaw) R(tilt), the result
+    is R(tilt) (u, v, w). Without a column of w, the heave velocity follows from the depth.
 
     Args:
         columns: names of the columns of numbers.
         tables: column -> values of each table.
         logs: the mapped columns of these tables.
+        names: channel -> column of the mapped columns.
 
     Returns:
         The logs, unchanged where the vessel is upright or the velocities are not along its axes.
@@ -53,21 +56,39 @@ def project_on_horizontal(
     candidates = _match_vertical_columns(columns)
     if "z" not in candidates or len(tables) != len(logs):
         return list(logs)
-    return [_project_log(table, log, candidates) for table, log in zip(tables, logs, strict=True)]
+    return [
+        _project_log(table, log, candidates, names) for table, log in zip(tables, logs, strict=True)
+    ]
+
+
+def _extract_tilt(log: RawTable, names: Mapping[str, str]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return roll and pitch [T] in rad from a quaternion or from angles; None without them."""
+    if {*QUATERNION} <= log.columns.keys():
+        return quaternion_tilt(*normalize_quaternion(*(log.columns[name] for name in QUATERNION)))
+    if not {"phi", "theta"} <= log.columns.keys() & names.keys():
+        return None
+    roll, pitch = (
+        log.columns[name]
+        * to_si(infer_unit(name, names[name], log.columns[name]).settings["unit"], "rad")
+        for name in ("phi", "theta")
+    )
+    return roll, pitch
 
 
 def _project_log(
-    table: Mapping[str, np.ndarray], log: RawTable, candidates: Mapping[str, str]
+    table: Mapping[str, np.ndarray],
+    log: RawTable,
+    candidates: Mapping[str, str],
+    names: Mapping[str, str],
 ) -> RawTable:
     """Return a log with horizontal velocities; see `project_on_horizontal`."""
-    if not {*QUATERNION, "u", "v"} <= log.columns.keys():
+    tilt = _extract_tilt(log, names)
+    if tilt is None or not {"u", "v"} <= log.columns.keys():
         return log
+    roll, pitch = tilt
     z = table.get(candidates["z"], np.zeros(0))
     if z.size != log.t.size or z.size < 10:
         return log
-    roll, pitch = quaternion_tilt(
-        *normalize_quaternion(*(log.columns[name] for name in QUATERNION))
-    )
     cosine = np.cos(roll) * np.cos(pitch)
     if float(np.nanquantile(cosine, 0.05)) > np.cos(_MIN_TILT):
         return log
