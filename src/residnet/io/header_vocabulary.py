@@ -473,6 +473,7 @@ _DEPTH_RULES = (
     _ChannelRule("q", "pitch rate|speed|angular", "propeller heave"),
     _ChannelRule("theta", "pitch", "propeller heave"),
     _ChannelRule("w", "heave|depth rate|speed|angular"),
+    _ChannelRule("w", "heave", "", r"^heave (?:mps|ms|m s)$"),
     _ChannelRule("z", "depth", "heave"),
 )
 

@@ -856,7 +856,9 @@ def _find_actuator_fields(
     for topic, series in recordings[0].series.items():
         for field in series.fields:
             known = _known_command(recordings[0], topic, field)
-            channel = known[0] if known else match_input_channel(parse_name(f"{topic} {field}"))
+            # a source of MOOS is the name of a program, which says nothing about an actuator
+            name = field if series.message_type == _MOOS_MESSAGE_TYPE else f"{topic} {field}"
+            channel = known[0] if known else match_input_channel(parse_name(name))
             if channel is None or channel in MOTION_CHANNELS or (topic, field) in used_fields:
                 continue
             values = _concatenate_field(recordings, topic, field)
@@ -958,6 +960,8 @@ def _rank_publishers(
     return lambda source: -explained[source]
 
 
+_MOOS_MESSAGE_TYPE = "moos/Variables"
+"""Type of the series of the reader of MOOS, see `readers/formats/moos.py`."""
 INPUTS_KEY = ("signals", "inputs")
 """Key of the inputs in a config."""
 _TABLE_SUFFIXES = (".csv", ".parquet")
