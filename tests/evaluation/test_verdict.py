@@ -407,6 +407,9 @@ def test_the_main_protocol_has_windows_of_equal_length() -> None:
     assert order_protocols(rows, "test", "manoeuvre")[0] == "manoeuvre"
     assert order_protocols(rows, "test", "manoeuvre", {"T30", "T10"})[0] == "T30"
     assert order_protocols(rows, "test", "T10", {"T30", "T10"})[0] == "T10"
+    # a protocol with too few windows for a rating is not the main one
+    rows[1] = rows[1].model_copy(update={"windows": 3})
+    assert order_protocols(rows, "test", "T30", {"T30", "T10"})[0] == "T10"
 
 
 def excitation(state: str, **change: Any) -> ExcitationFile:

@@ -38,8 +38,8 @@ def order_protocols(
 ) -> list[str]:
     """Return the protocols of rows, first the main one of a split.
 
-    The main protocol has windows of equal length, so that all its free runs have one horizon. Among
-    such protocols it is that of the model selection, unless the logs of the split are too short.
+    The main protocol has enough windows for a rating, and windows of equal length, so that all its
+    free runs have one horizon. Among such protocols it is that of the model selection.
 
     Args:
         rows: rows of metrics.json.
@@ -48,11 +48,15 @@ def order_protocols(
         fixed_length: names of the protocols with windows of equal length.
     """
     protocol_names = dict.fromkeys(row.protocol for row in rows)
+    n_windows = {
+        row.protocol: row.windows for row in rows if row.split == split and row.manoeuvre == "all"
+    }
     protocols_of_split = {row.protocol for row in rows if row.split == split}
     return sorted(
         protocol_names,
         key=lambda protocol_name: (
             protocol_name not in protocols_of_split,
+            n_windows.get(protocol_name, 0) < _MIN_WINDOWS,
             protocol_name not in fixed_length,
             protocol_name != selection_protocol,
         ),

@@ -23,7 +23,7 @@ pt.
 """
 INLINE_WIDTH = 3.7
 """Width of a drawing of the first screen in inches, that of a phone: text has at least 11 px."""
-_INLINE_MAP_HEIGHT = 1.9
+_INLINE_MAP_HEIGHT = 1.5
 """Height in inches of a map in a drawing of the first screen."""
 _MAX_INLINE_WIDTH = 5.0
 """Width in inches to which a drawing grows on a large screen."""

@@ -23,7 +23,10 @@ from residnet.evaluation.records import (
     SanityRow,
 )
 from residnet.evaluation.verdict import (
-    LEVEL_TEXTS,
+    DO_NOT_USE,
+    GOOD_LEVEL,
+    LIMITED_LEVEL,
+    TOO_FEW_WINDOWS,
     UNSEEN_SPLITS,
     ProtocolHorizon,
     VerdictEvidence,
@@ -58,6 +61,13 @@ def verdict_sentences(run: RunFiles) -> list[str]:
 
 _NOISE_FLOOR_ROW = "noise floor"
 """Name of the row with the pose errors of the integrated measured velocities."""
+_HORIZON_LEVELS = {
+    GOOD_LEVEL: "✓\u00a0Good",
+    LIMITED_LEVEL: "!\u00a0Limited",
+    DO_NOT_USE: "✗\u00a0Do\u00a0not\u00a0use",
+    TOO_FEW_WINDOWS: "?\u00a0Too\u00a0few",
+}
+"""Labels of the levels in the narrow table of horizons."""
 _NO_POSE_TEXT = (
     "The logs hold no {}: judge the model by its velocities, for errors of position and heading are"
     " those of integrated velocities."
@@ -312,10 +322,7 @@ def _build_horizon_table(run: RunFiles) -> Table | None:
             ("free runs", lambda horizon: f"{horizon.row.windows} ({horizon.protocol})", str),
             (
                 "level",
-                # symbol and word on one line
-                lambda horizon: LEVEL_TEXTS[rate_horizon(evidence, horizon.row)].replace(
-                    " ", "\u00a0", 1
-                ),
+                lambda horizon: _HORIZON_LEVELS[rate_horizon(evidence, horizon.row)],
             ),
         ],
         is_selected=lambda horizon: horizon.row.seconds == main_seconds,
