@@ -125,9 +125,12 @@ def describe_domain(domain: OperatingDomain, units: Mapping[str, str]) -> list[s
                 f"{format_number(gain, 3)} {channel}"
                 for channel, gain in zip(relation.channels, relation.gains, strict=True)
             )
+            # rounding errors are no offset
+            is_negligible = abs(relation.offset) < 1e-6 * relation.tolerance
+            sign = "+" if relation.offset >= 0 else "-"
+            offset_text = "" if is_negligible else f" {sign} {quantity(abs(relation.offset), name)}"
             sentences.append(
-                f"{name} was {terms} {'+' if relation.offset >= 0 else '-'}"
-                f" {quantity(abs(relation.offset), name)} (tolerance {tolerance}): the effect of a"
+                f"{name} was {terms}{offset_text} (tolerance {tolerance}): the effect of a"
                 f" difference between {name} and {', '.join(relation.channels)} is unknown."
             )
         else:

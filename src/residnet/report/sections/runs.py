@@ -237,11 +237,13 @@ def track_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | Non
     ]
     has_track = run.dof.has_position and run.dof.has_heading
     panels = _motion_panels("", display_units(run), run.dof)[: _N_OPENING_PANELS + has_track]
+    # without a track the velocities take its space
+    height = _OPENING_PANEL_HEIGHT if has_track else MAX_PREVIEW_HEIGHT // len(panels)
     panels = [
         replace(panel, height=MAX_PREVIEW_HEIGHT)
         if panel.kind == "map"
         # there is no space for the full name of a velocity, only for its symbol
-        else replace(panel, height=_OPENING_PANEL_HEIGHT, y_label=panel.y_label.split("\n")[-1])
+        else replace(panel, height=height, y_label=panel.y_label.split("\n")[-1])
         for panel in panels
     ]
     panels[-1] = replace(panels[-1], x_label="time since the start of the free run [s]")
