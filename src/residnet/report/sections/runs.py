@@ -52,7 +52,7 @@ _STEADY_SHARE = 0.3
 """Largest standard deviation of the yaw rate in a steady run, as a share of its mean magnitude."""
 _MIN_YAW_RATE = math.radians(0.5)
 """Yaw rate in rad/s below which a run is a straight line."""
-_OPENING_PANEL_HEIGHT = 54
+_OPENING_PANEL_HEIGHT = 62
 """Height of a motion panel on the first screen, so that the table fits below it on a phone."""
 _MOTION_TITLES = {
     "u": "surge velocity\nu",
