@@ -567,7 +567,7 @@ def check_contradicting_logs(logs: LogSet, make_finding: Check) -> Iterator[Find
         # new inputs are no contradiction: the polynomial does not extrapolate
         if not is_explained and consensus.has_majority and consensus.is_only_extrapolating(i):
             text = (
-                f"{log.name} has inputs or motions outside the range of the {n_inliers} other logs"
+                f"{log.name} has inputs outside the range of the {n_inliers} other logs"
                 " that agree: they cannot confirm or contradict it"
             )
             yield make_finding(text, code="beyond_others", level="note")

@@ -715,10 +715,9 @@ class Consensus:
         return [] if is_mostly_idle else idle
 
     def is_only_extrapolating(self, i: int) -> bool:
-        """Return whether a log is an outlier only outside of the inliers' range.
+        """Return whether a log is an outlier only outside of the inliers' range of inputs.
 
-        The range is that of inputs and velocities. A log that lies outside from end to end is
-        neither confirmed nor contradicted.
+        A log that lies outside from end to end has no part that could confirm it.
         """
         fleet = self.fleet
         data = self.fleet.data[i]
@@ -736,9 +735,14 @@ class Consensus:
         is_outside = (log_signals < (lower - margin)[:, None]) | (
             log_signals > (upper + margin)[:, None]
         )
-        count = np.append(0, np.cumsum(is_outside.any(axis=0)))
-        if not count[-1]:
+        is_input_outside = is_outside[: -len(fleet.velocities)].any(axis=0)
+        if not is_input_outside.any() or is_input_outside.all():
             return False
+        # the motion caused by such inputs lasts longer than the inputs
+        is_outside = is_outside.any(axis=0)
+        for start, stop in zip(*find_runs(is_outside), strict=True):
+            is_outside[start:stop] = is_input_outside[start:stop].any()
+        count = np.append(0, np.cumsum(is_outside))
         data_inside = data.subset(count[data.start + data.length + 1] == count[data.start])
         return not data_inside.is_sufficient or not self.is_outlier(i, data_inside)
 
