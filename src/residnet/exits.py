@@ -111,7 +111,7 @@ def _report_skipped_packages() -> None:
     """Print one line for each entry point of another package that could not be loaded."""
     # a command that uses no plug-ins never imports the registry
     registry = sys.modules.get("residnet.core.registry")
-    for line in registry.load_faults() if registry is not None else ():
+    for line in registry.list_load_faults() if registry is not None else ():
         print(f"residnet: warning: {ResidnetError(line)}", file=sys.stderr)
 
 

@@ -106,7 +106,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         (f"'{M}{STOP}}}, {{kind: {STOP}}}]'", "two manoeuvres are named 'a'"),
         (f"~programme.step '{RUN}, name: rigde}}'", "did you mean 'ridge'"),
         (f"programme.step=0.2 '{RUN}, name: ridge}}'", "must be that of model 'ridge' (0.1 s)"),
-        (f"~programme.vessel '{RUN}, name: ridge}}'", "a model flies with actuators"),
+        (f"~programme.vessel '{RUN}, name: ridge}}'", "a model needs actuators to manoeuvre"),
         (f"'{RUN}, name: ridge, actuators: mariner}}'", "the model needs the input 'n_port'"),
         (f"'{RUN}, actuators: wam_v_cal, inputs: {{n_port: {{drive: 1}}}}}}'", "not both"),
         (f"'{RUN}, inputs: {{n_port: {{drive: 3 m}}, n_stbd: {{drive: 1}}}}}}'", "inputs.n_port"),

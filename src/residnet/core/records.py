@@ -17,8 +17,8 @@ RowT = TypeVar("RowT", bound="Record")
 class Record(BaseModel):
     """A JSON object with a fixed set of keys; numbers are finite.
 
-    A key that was not set is absent from the file, so that a key of a later version needs a
-    default to keep earlier files readable.
+    Keys that were not set are not written. A key that a later version adds needs a default, so
+    that files of earlier versions can still be read.
     """
 
     model_config = ConfigDict(
@@ -56,8 +56,8 @@ class StoredFile(BaseModel):
             expected = "list" if cls._json_type is list else "object"
             found = "list" if isinstance(content, list) else type(content).__name__
             raise UsageError(
-                f"{path}: expected a JSON {expected}, found {found}; restore the file or run it"
-                " again"
+                f"{path}: expected a JSON {expected}, found {found}; restore the file or"
+                " repeat the run"
             )
         try:
             return cls.model_validate(content)
@@ -90,7 +90,10 @@ class StoredFile(BaseModel):
 
 
 class FileRecord(Record, StoredFile):
-    """The contents of a whole file, which names its format under `schema`."""
+    """The contents of a whole file.
+
+    A subclass declares the key `schema` with the name of the format, such as `residnet.metrics/1`.
+    """
 
 
 class FileRows(RootModel[tuple[RowT, ...]], StoredFile, Generic[RowT]):

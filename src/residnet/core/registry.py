@@ -10,8 +10,9 @@ is listed with its fault and raises an error only if it is used.
 
 Parts of the core are listed as `module:Class`. A wing of residnet (a package that the core never
 imports, such as `residnet.autopilot`) declares its parts in the same form in its file
-entry_points.toml. A part is imported when a config names it, and `residnet list` reads its summary
-from the source, so that neither imports PyTorch.
+entry_points.toml. A config class is imported when a config names its kind, and `residnet list`
+reads summaries from the source text, so that neither reading a config nor listing parts imports
+PyTorch.
 """
 
 from __future__ import annotations
@@ -127,7 +128,7 @@ def _load_entry_point(entry_point: importlib.metadata.EntryPoint) -> EntryPointP
         return broken
 
 
-def load_faults() -> list[str]:
+def list_load_faults() -> list[str]:
     """Return one line for each entry point that was skipped because it could not be loaded."""
     return [
         f"entry point '{name}' in {group} of the package {package} was skipped ({part.fault});"
@@ -199,8 +200,8 @@ class PluginUnion:
         base: `module:Class` that the kinds of other packages must extend.
         core_kinds: built-in kinds, name -> `module:Class`.
         key: discriminator field.
-        python_kinds: kinds that only Python arguments create, and that no list shows, name ->
-            `module:Class`.
+        python_kinds: kinds that cannot be written in YAML, because they hold a Python object;
+            lists omit them. Name -> `module:Class`.
     """
 
     group: str
@@ -251,7 +252,7 @@ class PluginUnion:
         if name in self.builtin:
             kind_class: type[Any] = import_object(self.builtin[name])
             return kind_class
-        # the first part of a name counts; a second one has a fault
+        # of two packages with the same name, the first one is taken; the second one has a fault
         entry_point = next(part for part in self.entry_point_parts() if part.name == name)
         return entry_point if entry_point.fault else entry_point.part
 
@@ -306,7 +307,10 @@ class PluginUnion:
 
 
 def is_python_part(config: BaseModel) -> bool:
-    """Return whether only this process knows a config, because a Python argument brought it."""
+    """Return whether the class of a config is registered in this process only.
+
+    Such a class was passed to the Python interface, and other processes cannot build it.
+    """
     return type(config) in _registered_kinds.values() or bool(
         getattr(config, "is_process_local", False)
     )

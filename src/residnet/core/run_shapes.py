@@ -1,8 +1,8 @@
 """Types of the values in the JSON files of a run that are read without a typed record.
 
-These are metrics.json, where a model is looked up by its alias, and fit.json, whose notes depend on
-the head (residual model). Other keys are not checked. A value of a wrong type raises an error that
-names the file and the key.
+These are metrics.json, in which a model can have the name of an earlier version, and fit.json,
+whose notes depend on the head (residual model). Other keys are not checked. A value of a wrong type
+raises an error that names the file and the key.
 """
 
 from __future__ import annotations
@@ -28,7 +28,14 @@ class _Shape(BaseModel):
 
 
 class _Row(_Shape):
-    """A row of metrics.json."""
+    """A row of metrics.json: errors of one model on one split, protocol and kind of manoeuvre.
+
+    Attributes:
+        protocol: name of the free-run protocol of the config, such as `T30`.
+        windows: number of free runs.
+        n: number of samples.
+        diverged: number of diverged free runs.
+    """
 
     model: StrictStr
     kind: StrictStr = "head"
@@ -48,7 +55,14 @@ class _Row(_Shape):
 
 
 class _FitMetrics(_Shape):
-    """The contents of metrics.json of a fit."""
+    """The contents of metrics.json of a fit.
+
+    Attributes:
+        selected: single model that the validation logs select.
+        predictor: model that the run recommends, which can be an ensemble.
+        channels: channel -> unit.
+        scales: channel -> divisor of its error in the NRMSE.
+    """
 
     selected: StrictStr | None = None
     predictor: StrictStr | None = None
@@ -58,13 +72,18 @@ class _FitMetrics(_Shape):
 
 
 class _Metrics(_Shape):
-    """The contents of metrics.json of any task."""
+    """The contents of metrics.json of any other task."""
 
     rows: list[dict[str, Any]] = []
 
 
 class _FitNotes(_Shape):
-    """The contents of models/<model>/fit.json."""
+    """The contents of models/<model>/fit.json.
+
+    Attributes:
+        seconds: duration of the fit in s.
+        validation: validation error, in the form that the head writes.
+    """
 
     seconds: Number = None
     validation: Number | list[Any] | dict[str, Any] = None
@@ -101,7 +120,8 @@ def require_shape(path: Path, content: Any) -> None:
         _adapter(shape).validate_python(content)
     except ShapeError as error:
         first_fault = error.errors(include_url=False)[0]
-        # the location of a union ends in the names of its members
+        # pydantic appends the type of the union member that failed, such as list[float]; it is no
+        # key of the file
         key = ".".join(str(part) for part in first_fault["loc"] if "[" not in str(part))
         location = f"key '{key}'" if key else "its contents"
         raise UsageError(

@@ -45,19 +45,21 @@ class _BaselineStep(nn.Module):
         self.model = HybridDynamics(model.signals, model.baseline, head, model.dt, model.integrator)
 
     def forward(self, x: Tensor, w: Tensor) -> Tensor:
-        return self.model.step(x, w, x[:, :0])[0]
+        no_memory = x[:, :0]
+        return self.model.step(x, w, no_memory)[0]
 
     def step_with_theta(self, x: Tensor, w: Tensor, theta: Tensor) -> tuple[Tensor]:
         """Return the state one step later, for flattened parameters theta [1, size]."""
         weights = {"model.baseline.theta": theta.reshape(self.theta_shape)}
-        # baselines share modules with signals, which must not be replaced twice
+        # baseline and signals refer to the same modules; with tie_weights=True theta would be
+        # replaced under each of their names
         next_state: Tensor = torch.func.functional_call(self, weights, (x, w), tie_weights=False)
         return (next_state,)
 
 
 @final
 class StepJacobian:
-    """Jacobian of a step: heading and dynamic states by their previous values and the parameters.
+    """Jacobian of a step: of heading and dynamic states with respect to state and parameters.
 
     The position is omitted, because the dynamics in body axes do not depend on it. All numbers are
     float64.

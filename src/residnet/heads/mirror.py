@@ -68,7 +68,7 @@ class MirroredHead(RenamedStateModule, ResidualHead):
     def calibrate(self, samples: Samples) -> None:
         """Calibrate the inner head on the samples and their mirror images.
 
-        The training range is then mirror-symmetric.
+        The range of channel values that the head records as seen in training is then symmetric.
         """
         self.inner_head.calibrate(add_mirror_images(samples))
 

@@ -63,7 +63,8 @@ def fit_models(
         extensions: callbacks and logger of the user for trainings; None for none.
 
     Raises:
-        FitError: if the data do not determine a part, or no training gave a finite free run.
+        FitError: if the logs do not determine the parameters of a model, or every training
+            diverged in free run.
         DataError: if a split has no sample or no window.
     """
     store = store or FitStore()
@@ -90,7 +91,8 @@ def fit_models(
 def should_include_validation(settings: FitSettings, train: Sequence[PreparedLog]) -> bool:
     """Return whether a fit also uses the validation logs, as the recipe does for short logs.
 
-    With a few minutes of logs a network gains more from these data than a model selection does.
+    With a few minutes of logs, more training data improve a network more than a selection among
+    models does.
     """
     training_duration = sum(len(log) for log in train) * settings.prepare.grid.step
     return settings.recipe is not None and training_duration < LONG_TRAINING_DURATION
@@ -190,7 +192,7 @@ def _fit_heads(fitter: Fitter, logs: Logs, models: dict[str, FittedModel]) -> No
                 fitted_baseline = models[settings.get_baseline_name(name)]
                 if executor is not None:
                     futures[name] = executor.submit(
-                        _submit_to_worker, name, _serialize_model(fitted_baseline)
+                        _run_in_worker, name, _serialize_model(fitted_baseline)
                     )
             for name in head_names:
                 begin_stage(f"fitting {name}")
@@ -233,7 +235,8 @@ def is_long_training(fitter: Fitter, name: str) -> bool:
     """Return whether the training of a head takes long enough for a separate process."""
     settings = fitter.settings
     training_config = settings.training.get(name)
-    # heads in closed form have no training, and another process cannot build a part of this one
+    # heads in closed form are not trained; a class that only this process registered cannot be
+    # built by a worker
     if training_config is None or is_python_part(settings.heads[name]):
         return False
     one_step_config = training_config.one_step
@@ -292,7 +295,7 @@ def _initialize_worker(
     _fit_in_worker = fit_head_in_worker
 
 
-def _submit_to_worker(name: str, serialized_baseline: _SerializedModel) -> _SerializedModel:
+def _run_in_worker(name: str, serialized_baseline: _SerializedModel) -> _SerializedModel:
     return _fit_in_worker(name, serialized_baseline)
 
 

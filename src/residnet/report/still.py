@@ -22,7 +22,7 @@ FIGURE_WIDTH = 7.0
 pt.
 """
 INLINE_WIDTH = 3.7
-"""Width of a drawing of the first screen in inches, that of a phone: text has at least 11 px."""
+"""Width in inches of a drawing at the top of a page: that of a phone, where text has 11 px."""
 _INLINE_MAP_HEIGHT = 1.5
 """Height in inches of a map in a drawing of the first screen."""
 _MAX_INLINE_WIDTH = 5.0

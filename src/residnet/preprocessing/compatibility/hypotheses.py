@@ -1,4 +1,7 @@
-"""Compare contradictory meanings of measured channels by the evidence of a reconstruction."""
+"""Decide between interpretations of measured channels, such as their sign, unit or frame.
+
+The motion is reconstructed with each interpretation, and the BIC ranks the reconstructions.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +26,10 @@ _MIN_EFFECTIVE_SHARE = 0.02
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A meaning of the channels of a log.
+    """An interpretation of the channels of a log.
 
     Attributes:
-        sensors: measurements with this meaning; all hypotheses of a comparison have the same
+        sensors: measurements as interpreted; all hypotheses of a comparison have the same
             values in the same order.
         errors: instrument errors -> prior.
     """

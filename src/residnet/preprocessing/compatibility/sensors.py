@@ -22,7 +22,7 @@ SensorKind = Literal[
 ]
 ANGULAR_KINDS = ("heading", "course", "drift")
 CURRENT_NAMES = ("current_north", "current_east")
-"""Instrument errors that are the components of a steady current in m/s."""
+"""Names of the components of a steady current in m/s, estimated with the instrument errors."""
 
 Parameters = Mapping[str, complex]
 NodeStates = Mapping[int, np.ndarray]
@@ -46,8 +46,10 @@ class Sensor:
         is_through_water: whether a velocity is relative to the water instead of the ground.
         clock: error that is added to the times; empty for none.
         bias: error that is added to the quantity; empty for none.
-        scale: error by whose share the quantity is too large; empty for none.
-        lever_arm: errors with the position of an antenna forward and to starboard in m.
+        scale: name of the scale error e, with which the sensor shows (1 + e) times the quantity;
+            empty for none.
+        lever_arm: names of the two errors that are the position of the antenna forward and to
+            starboard in m; empty for none.
         factor: unit or sign: ratio of the values to the quantity.
     """
 
@@ -109,7 +111,9 @@ class Sensor:
         step: float,
         fraction: np.ndarray | None,
     ) -> list[np.ndarray]:
-        """Predict the measurements from the states; complex steps of any argument propagate.
+        """Predict the measurements from the states.
+
+        Arguments may be complex, so that a caller can differentiate by the complex-step method.
 
         Args:
             parameters: name of an error -> value.
@@ -135,6 +139,7 @@ class Sensor:
             return parameters.get(name, 0.0) if name else 0.0
 
         current_north, current_east = (get(name) for name in CURRENT_NAMES)
+        # the states of a yaw-rate sensor contain no heading, and its value needs none
         heading = interpolate(PSI) if self.kind != "yaw_rate" else before[R]
         if self.kind == "position":
             north = before[X]

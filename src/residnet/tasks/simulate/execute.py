@@ -1,4 +1,4 @@
-"""Carry out the task `simulate`: simulated sea trials as canonical logs, with indices."""
+"""Carry out the task `simulate`: sea trials as canonical logs, and their manoeuvring indices."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def execute(config: SimulateConfig, folder: RunFolder) -> TaskOutcome:
     failures = [line for line, is_listed in fault_messages if is_listed]
     failure_message = failures and (
         f"{failures[-1]} ({len(failures)} of {n_flights} flights were not completed;"
-        " give more duration, drive or steer)"
+        " increase their duration, drive or steer)"
     )
     return TaskOutcome(
         verdict,
@@ -205,8 +205,8 @@ def _build_model_craft(
         forces = Helm.from_plant(plant).forces
     else:
         raise ConfigError(
-            "a model flies with actuators: name a vessel's in programme.model.actuators, or"
-            " give programme.model.inputs"
+            "a model needs actuators to manoeuvre: name a vessel in programme.model.actuators"
+            " whose actuators it uses, or set programme.model.inputs"
         )
     # a learned model has no input for wave loads
     wind_only = programme.disturbance.model_copy(update={"waves": None})
