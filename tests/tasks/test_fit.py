@@ -96,8 +96,10 @@ def test_metrics_follow_from_the_stored_free_runs(tiny_run: Path) -> None:
     error = {r["model"]: r["nrmse"]["mean"] for r in own_rows if r["protocol"] == "manoeuvre"}
     assert error["plant"] < error["ridge"] < error["baseline"] < error["constant_velocity"]
     assert sum(row["diverged"] for row in rows(tiny_run)) == 0
+    # the summary has the main horizon: whole manoeuvres of three logs are too few windows
+    main_error = {r["model"]: r["nrmse"]["mean"] for r in own_rows if r["protocol"] == "T10"}
     figures = read_json(tiny_run / "summary.json")["figures"]
-    assert figures["nrmse"]["value"] == error[read_json(tiny_run / "metrics.json")["selected"]]
+    assert figures["nrmse"]["value"] == main_error[read_json(tiny_run / "metrics.json")["selected"]]
 
 
 def test_goodness_of_every_model_and_axis_agrees_with_the_stored_residuals(tiny_run: Path) -> None:

@@ -283,6 +283,11 @@ class ParametersExporter(Exporter):
         spec = exported.spec
         model = exported.to_precision(torch.float64)
         theta, terms, axis_names = _baseline_terms(spec, model)
+        # accelerations of velocities that the logs lack are no part of the model
+        modelled_axes = [f"{velocity}_dot" for velocity in spec.signals.velocities]
+        rows = [row for row, axis in enumerate(axis_names) if axis in modelled_axes]
+        theta = theta[rows]
+        axis_names = tuple(axis_names[row] for row in rows)
         unidentifiable = list_unidentifiable(theta, terms, axis_names)
         accelerations = tabulate_accelerations(theta, terms, axis_names)
         head_left_out = None if spec.head is None else spec.head.kind

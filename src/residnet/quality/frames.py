@@ -376,8 +376,9 @@ def check_yaw_rate(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
     yaw_rate = rates.averaged_velocities.get("r")
     if yaw_rate is None:
         return
+    min_std = max(5.0 * rates.yaw_rate_noise, _MIN_YAW_RATE_STD)
     reference_std = nan_std(rates.yaw_rate)
-    if reference_std <= max(5.0 * rates.yaw_rate_noise, _MIN_YAW_RATE_STD):
+    if reference_std <= min_std:
         return
     if nan_std(yaw_rate) < NEGLIGIBLE_MOTION_SHARE * reference_std:
         yield make_finding(
@@ -388,7 +389,10 @@ def check_yaw_rate(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
         )
         return
     agreement = estimate_agreement(rates.yaw_rate, yaw_rate, log.sampling_interval)
-    if agreement is not None and abs(agreement.correlation) < _MIN_YAW_CORRELATION:
+    # the samples that all lags share may be a steady turn, whose rates are noise about their mean
+    if agreement is None or agreement.reference_std <= min_std:
+        return
+    if abs(agreement.correlation) < _MIN_YAW_CORRELATION:
         yield make_finding(
             f"r against the rate of psi: correlation {agreement.correlation:.3f} at a lag of"
             f" {agreement.lag:+.2f} s; they do not describe one motion",

@@ -870,10 +870,10 @@ def _convert_decimal_commas(table: pd.DataFrame) -> pd.DataFrame:
     converted: dict[int, pd.Series] = {}
     has_clear_comma = False
     for position, (_, column) in enumerate(table.items()):
-        if pd.api.types.is_numeric_dtype(column):
+        if not pd.api.types.is_object_dtype(column) and not pd.api.types.is_string_dtype(column):
             continue
         texts = column[column.map(lambda cell: isinstance(cell, str))]
-        if not texts.map(lambda text: "," in text).any():
+        if texts.empty or not texts.map(lambda text: "," in text).any():
             continue
         if texts.map(lambda text: _DECIMAL_COMMA.fullmatch(text) is not None).all():
             has_clear_comma |= bool(
