@@ -269,6 +269,8 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> No
     assert loaded.notes["validation"] == pytest.approx(models["ridge"].notes["validation"])
 
 
+# 3 s; tasks/test_simulate.py simulates by config
+@pytest.mark.long
 def test_a_simulation_by_function_and_mapping_is_one() -> None:
     zigzag = {"kind": "zigzag", "drive": 0.6, "steer": 0.4, "heading": "20 deg", "start": 3}
     way = {"kind": "waypoints", "drive": 0.7, "points": [[20, 0], [20, 20]], "acceptance": 3}

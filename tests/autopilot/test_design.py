@@ -104,6 +104,8 @@ def test_gain_and_time_are_enough(tmp_path: Path) -> None:
             draft_autopilot_config([given], tmp_path / f"{out}.yaml", rudder=rudder)
 
 
+# 10 s; test_gain_and_time_are_enough covers the design, configs of .ci/run the export
+@pytest.mark.long
 def test_the_classical_law_is_exported_without_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -247,6 +247,8 @@ def test_what_is_read_from_a_flight() -> None:
     assert row.rudder_rms.mean == pytest.approx(0.2)
 
 
+# 2 s; test_time_optimal_switches_where_the_closed_form_says covers a fast rudder
+@pytest.mark.long
 def test_the_floor_of_a_slow_rudder_comes_to_rest_in_the_least_time() -> None:
     floor = BangBangConfig().build(
         ControlTask(RATED, RATED.estimate_nomoto(LIMIT, 60.0), LIMIT, 0.01)

@@ -137,6 +137,8 @@ def test_a_plant_that_cannot_be_recorded_is_stepped_as_it_is(
     assert torch.equal(RecordedPlantDynamics(plant, 0.1, 5).step(x, w, s)[0], wanted)
 
 
+# 3 s; training/test_current.py covers the current of a hull
+@pytest.mark.long
 def test_in_an_ambient_current_it_moves_over_ground_as_a_hull_in_the_current() -> None:
     """Against the same hull that feels the current through its velocity relative to the water; with
     little rudder, for that one leaves out the current's part along the rolled vessel's vertical

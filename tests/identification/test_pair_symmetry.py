@@ -66,6 +66,8 @@ def test_unequal_propellers_get_a_gain() -> None:
         assert f"multiply n_stbd by {pair.ratio:.2f}" in pair.proposal
 
 
+# 3 s; test_a_reversed_motor_is_named covers boats that also run astern
+@pytest.mark.long
 def test_boats_that_never_run_astern_are_distinguished() -> None:
     """Their inputs follow from a course controller, and all revolutions have one sign."""
     for seed in range(6):

@@ -142,6 +142,8 @@ def idle_splits() -> Splits:
     }
 
 
+# 6 s; test_values_of_a_masked_stretch_enter_no_figure masks, too
+@pytest.mark.long
 def test_unexplained_stretches_are_masked_in_training_only_and_only_on_request(
     idle_splits: Splits,
 ) -> None:

@@ -120,6 +120,8 @@ def test_what_the_hull_lacks_is_found_and_said(tmp_path: Path) -> None:
     assert {figure.name for figure in figures} >= {"scores", "forces_one", "residual_one"}
 
 
+# 3 s; test_what_the_hull_lacks_is_found_and_said covers the verdict
+@pytest.mark.long
 def test_a_residual_of_noise_is_said_to_be_none(tmp_path: Path) -> None:
     log(tmp_path, missing=0.0, noise=20.0)
     settings = config(tmp_path, ols={"fit": {"kind": "ols"}}, surface={"fit": {"kind": "surface"}})

@@ -66,6 +66,8 @@ def hull(name: str) -> Any:
     return of_kind(load_vessel(name).build(), HullPlant).hull
 
 
+# 3 s; .ci/run carries out a study of the ferry
+@pytest.mark.long
 def test_the_lag_and_the_missing_half_are_found_and_flown(short: FerryStudy) -> None:
     model = short.models["lag_ridge"]
     course = short.runs["course"]
@@ -124,6 +126,8 @@ def test_what_the_believed_hull_lacks_stands_beside_what_was_found() -> None:
     assert set(truth) <= set(FERRY_TERMS)
 
 
+# 3 s; .ci/run carries out a study of the ferry
+@pytest.mark.long
 def test_azimuth_thrusters_get_the_controllers_force_and_push_late() -> None:
     near = "course.waypoints=[[0, 0, 0], [2, 0, 0], [2, -1, 0], [2, -1, 20 deg]]"
     flown = config("azimuth", near, "course.interval=5 s")

@@ -76,6 +76,8 @@ def test_the_length_of_the_test_logs_enters_no_choice() -> None:
     assert min(float(one["length"].split()[0]) for one in short["protocols"].values()) < 13.0
 
 
+# 4 s; test_the_length_of_the_test_logs_enters_no_choice covers the lengths
+@pytest.mark.long
 def test_free_runs_are_as_short_as_gaps_ask_for(tmp_path: Path, logs: list[Log]) -> None:
     random = np.random.default_rng(1)
     (log, *_) = logs
@@ -118,6 +120,8 @@ def test_a_config_from_logs_alone(folder: Path) -> None:
             write_new_config([folder / "trials"], folder / file, None, overwrite=False)
 
 
+# 4 s; test_a_config_from_logs_alone drafts a split, too
+@pytest.mark.long
 def test_one_log_is_cut_in_time(folder: Path) -> None:
     only = sorted((folder / "trials").glob("*.csv"))[0]
     draft = residnet.draft_config(only, folder=folder)

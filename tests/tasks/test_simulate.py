@@ -171,6 +171,8 @@ def test_a_replay_gives_the_log_again(ship: Path, tmp_path: Path) -> None:
         assert indices(tmp_path / "run")["wam_v_cal", name]["indices"]["rmse_u"] < 1e-9
 
 
+# 4 s; test_a_vessel_leaves_logs_indices_and_figures simulates, too
+@pytest.mark.long
 def test_trials_are_drawn_split_and_read_by_inspect(tmp_path: Path, command: Command) -> None:
     trials = [{**TINY["data"]["trials"][0], "drive": [0.4]}, TINY["data"]["trials"][3]]
     counts = {"identification": {"three_two_one_one": 2}, "validation": {"constant": 2}}

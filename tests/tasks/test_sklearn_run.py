@@ -75,6 +75,8 @@ def test_the_plain_head_runs_to_its_end(command: Command, tmp_path: Path) -> Non
     assert "scikit-learn need Python" in ended.err
 
 
+# 5 s; test_the_plain_head_runs_to_its_end carries out a run, too
+@pytest.mark.long
 def test_other_classes_need_trust(command: Command, tmp_path: Path) -> None:
     config = write_yaml(tmp_path / "bagging.yaml", _config(BAGGING))
     run = tmp_path / "run"

@@ -51,6 +51,8 @@ def _error(run: Path, split: str, protocol: str) -> float:
     return float(found)
 
 
+# 7 s; .ci/run carries out a sweep
+@pytest.mark.long
 def test_a_grid_is_searched_whole_and_resumed(
     sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:

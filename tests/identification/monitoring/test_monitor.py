@@ -155,6 +155,8 @@ def test_sample_by_sample_it_says_what_windows_say(
     assert all(single.update(y[k], given[k]) is None for k in range(WINDOW))
 
 
+# 6 s; test_a_refit_leaves_errors_of_sensors_and_unchanged_vessels_alone also refits
+@pytest.mark.long
 def test_a_refit_finds_the_size_of_a_planted_change_and_leaves_the_old_model_alone(
     known: tuple[ModelSpec, HybridDynamics], watch: ChangeDetector
 ) -> None:
