@@ -719,7 +719,8 @@ def export(
         bool,
         typer.Option(
             "--anyway",
-            help="Export even if the model is worse than the baseline; its card says so.",
+            help="Export even if the model is worse than the baseline or rated 'do not use'; its"
+            " card says so.",
         ),
     ] = False,
     trust: TrustOption = False,

@@ -205,6 +205,37 @@ def test_what_is_worse_than_zero_or_the_baseline_is_objected_to() -> None:
     assert list_model_objections(evidence(selected="unknown")) == []
 
 
+@pytest.mark.parametrize(
+    ("mlp", "objection"),
+    [
+        (errors(3.0, 5.0), ""),
+        (errors(26.0, 5.0), "its position error is not significantly smaller than that of"),
+        (errors(3.0, 60.0), "its heading error is not significantly smaller than that of"),
+        (errors(25.0, 5.0), "the upper limit of its position error is 28 m"),
+        (errors(3.0, 30.0), "the upper limit of its heading error is 33 deg"),
+    ],
+)
+def test_a_model_rated_do_not_use_by_position_or_heading_alone_is_objected_to(
+    mlp: PoseErrors, objection: str
+) -> None:
+    """Its velocity errors are smaller than those of constant velocity and of the baseline."""
+    judged = evidence(limits_by_protocol=under(horizons=[horizon(30, mlp)]))
+    objections = list_model_objections(judged)
+    assert bool(objections) == (rate_model(judged) == "do not use") == bool(objection)
+    if objection:
+        assert f"in free runs of 30 s on test data {objection}" in "; ".join(objections)
+
+
+def test_an_indistinguishable_model_and_too_few_windows_are_objected_to_as_rated() -> None:
+    compared = {"mlp": {"constant_velocity": difference(-0.01, 0.1)}}
+    assert "not significantly smaller" in "".join(
+        list_model_objections(evidence(limits_by_protocol=under(compared=compared)))
+    )
+    few = evidence(limits_by_protocol=under(horizons=[horizon(30, errors(26.0, 60.0), windows=4)]))
+    assert rate_model(few) == "too few windows"
+    assert list_model_objections(few) == []
+
+
 def test_unsound_models_and_divergences_are_named() -> None:
     fault = selection("", "its damping has the wrong sign")
     rows = {"constant_velocity": row(0.5), "mlp": row(0.2, diverged=7)}

@@ -586,12 +586,13 @@ def _format_errors_with_intervals(errors: PoseErrors) -> str:
 def list_model_objections(evidence: VerdictEvidence) -> list[str]:
     """Return objections to any use of the model, for `residnet.export.base.require_releasable`.
 
-    A model has to be better than constant velocity and than its own baseline.
+    A model has to be better than its own baseline, and its level must not be "do not use": export
+    and report then agree on every model.
     """
     selected_row = evidence.rows_by_model.get(evidence.selected)
     if selected_row is None:
         return []
-    return [
+    objections = [
         f"on {evidence.data_name} its NRMSE is {format_number(selected_row.mean_nrmse)}, that"
         f" of {reference_name}"
         f" {format_number(reference_row.mean_nrmse)}"
@@ -599,6 +600,16 @@ def list_model_objections(evidence: VerdictEvidence) -> list[str]:
         if (reference_row := evidence.rows_by_model.get(reference_name)) is not None
         and selected_row.mean_nrmse > reference_row.mean_nrmse
     ]
+    if rate_model(evidence) != DO_NOT_USE:
+        return objections
+    main = main_horizon(evidence)
+    if main is not None and _is_sufficient(main.row, evidence.selected):
+        objections += [
+            f"in free runs of {format_number(main.row.seconds, 2)} s on {evidence.data_name}"
+            f" {shortfall}"
+            for shortfall in list_shortfalls_of_limited(evidence, main.row)
+        ]
+    return objections or [_explain_uselessness(evidence)]
 
 
 def is_useless(evidence: VerdictEvidence) -> bool:
