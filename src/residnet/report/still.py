@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -135,7 +136,40 @@ def render_matplotlib(
         shown_handles = {label: handles[label] for label in labels if label in handles}
         _legend_above(canvas, shown_handles, width)
         canvas.canvas.draw()
+        if _wrap_axis_labels(canvas):
+            canvas.canvas.draw()
     return canvas
+
+
+def _wrap_axis_labels(canvas: Any) -> bool:
+    """Break labels of axes that are longer than the space of their panel; return if any is.
+
+    Only a drawn label has a length. The label of a horizontal axis may be wider than the axis,
+    because it is centred below it; the label of a vertical axis must not reach the next panel.
+    """
+    is_wrapped = False
+    for axes in canvas.axes:
+        x_extent = axes.xaxis.label.get_window_extent()
+        y_extent = axes.yaxis.label.get_window_extent()
+        grid_spec = axes.get_subplotspec()
+        column_width = canvas.bbox.width / grid_spec.get_gridspec().ncols
+        center = (x_extent.x0 + x_extent.x1) / 2
+        half_space = min(
+            center - column_width * grid_spec.colspan.start,
+            column_width * grid_spec.colspan.stop - center,
+        )
+        for label, length, space in (
+            (axes.xaxis.label, x_extent.width, 2 * half_space),
+            (axes.yaxis.label, y_extent.height, axes.bbox.height),
+        ):
+            text = label.get_text()
+            if text and 0 < space < length:
+                # words differ in width: 5 % of the space remains free
+                n_characters = max(int(0.95 * len(text) * space / length), 1)
+                lines = textwrap.wrap(text, n_characters, break_long_words=False)
+                label.set_text("\n".join(lines))
+                is_wrapped = is_wrapped or len(lines) > 1
+    return is_wrapped
 
 
 def draw_on_axes(figure: Figure, axes: Sequence[Any], panel_numbers: Sequence[int]) -> None:

@@ -15,7 +15,7 @@ from residnet.core.format import format_number, format_signed
 from residnet.core.ownership import record_folder
 from residnet.evaluation.metrics import make_resampling_blocks, paired_difference
 from residnet.evaluation.records import PairedDifference
-from residnet.report.blocks import Block, Cell, Section, Table, build_table, format_paired_interval
+from residnet.report.blocks import Cell, Section, Table, build_table, format_paired_interval
 from residnet.report.figure import MAX_PREVIEW_HEIGHT, Case, Figure, Panel, style_family
 from residnet.report.figure_files import write_figure
 from residnet.report.page import write_page
@@ -112,14 +112,18 @@ def compare_runs(paths: Sequence[Path], output_folder: Path) -> tuple[str, Path]
             # the first screen has space for NRMSE, difference and interval of each run only
             summary_table = _build_paired_table(runs, first_protocol).select_columns(3, 6)
             summary_table.caption = f"Models of the verdicts, {next(iter(first_protocol))}."
-            sections.append(Section("", [_plot_error_growth(runs, output_folder), summary_table]))
-            sections.append(Section("Models of the verdicts over common windows", paired_tables))
+            figure = _plot_error_growth(runs, output_folder)
+            # the first picture of a page needs no JavaScript
+            sections.append(Section("", [figure.preview(), summary_table]))
+            sections.append(
+                Section("Models of the verdicts over common windows", [*paired_tables, figure])
+            )
         sections += [
             Section("Every model of every run", error_tables),
             Section("Where the runs differ", [difference_table]),
         ]
         names = " against ".join(run.name for run in runs)
-        page = write_page(output_folder, "Runs compared", names, [verdict], sections)
+        page = write_page(output_folder, "Comparison of runs", names, [verdict], sections)
     tables = [table.to_text() for table in (*error_tables, *paired_tables, difference_table)]
     return "\n\n".join([*tables, verdict]), page
 
@@ -327,7 +331,7 @@ def _write_conclusion(
     )
 
 
-def _plot_error_growth(runs: Sequence[EvaluatedRun], output_folder: Path) -> Block:
+def _plot_error_growth(runs: Sequence[EvaluatedRun], output_folder: Path) -> Figure:
     """Plot the growth of the errors of the models over the common windows."""
     protocol, windows = next(iter(_common_windows(runs).items()))
     scales = pd.Series(_reference_scales(runs))
@@ -346,7 +350,7 @@ def _plot_error_growth(runs: Sequence[EvaluatedRun], output_folder: Path) -> Blo
         f"Models of the verdicts over {len(windows)} common windows of {protocol}, mean over"
         f" {', '.join(scales.index)}.",
         style_family(error_curves),
-        [Panel("error [-]", "time from the start of a free run [s]", height=MAX_PREVIEW_HEIGHT)],
+        [Panel("NRMSE [-]", "time from the start of a free run [s]", height=MAX_PREVIEW_HEIGHT)],
         [Case("", [error_curves])],
     )
     return write_figure(output_folder / "figures", figure)

@@ -235,7 +235,7 @@ def write_monitoring_page(folder: Path, logs: Sequence[MonitoredLog]) -> Path:
     window_minutes = logs[0].window_seconds / 60.0
     logs_with_alarm = [log for log in logs if log.alarm_time is not None]
     summary = [
-        f"No alarm in {format_count(len(logs), 'log')}: the innovations are as those of the"
+        f"No alarm in {format_count(len(logs), 'log')}: the innovations are like those of the"
         f" reference logs."
     ]
     if logs_with_alarm:
@@ -303,12 +303,14 @@ def write_monitoring_page(folder: Path, logs: Sequence[MonitoredLog]) -> Path:
     )
     return write_page(
         folder,
-        "New logs watched",
+        "Monitoring of new logs",
         f"{format_count(len(scores), 'window')} of {logs[0].window_seconds:g} s, threshold"
         f" {format_number(threshold)}",
         summary,
         [
-            Section("", [write_figure(folder / "figures", figure), overview]),
+            # the first picture of a page needs no JavaScript
+            Section("", [figure.preview(), overview]),
+            Section("Scores over time", [write_figure(folder / "figures", figure)]),
             Section("Every cause, at the end of each log", [suspects], is_folded=True),
         ],
     )
@@ -590,16 +592,20 @@ class NextTrials:
         }
         panel = Panel("north [m]", "east [m]", kind="map", height=300)
         figure = Figure(
-            "tracks", "Tracks", "Simulated by the model.", style_family(curves), [panel],
+            "tracks",
+            "Tracks of the next trials",
+            "Simulated by the model.",
+            style_family(curves),
+            [panel],
             [Case("", [curves])],
-        )  # fmt: skip
-        shown = Section(
-            "", [write_figure(folder / "figures", figure), self.table.select_columns(0, 3)]
         )
+        # the first picture of a page needs no JavaScript
+        shown = Section("", [figure.preview(), self.table.select_columns(0, 3)])
+        track_section = Section("Tracks", [write_figure(folder / "figures", figure)])
         table = Section("Candidates", [self.table], is_folded=True)
-        about = f"For {self.model}."
+        about = f"Trials that best reduce the uncertainty of the model {self.model}"
         summary = [self.recommendation, *self.missing_excitation]
-        page = write_page(folder, "Next trials", about, summary, [shown, table])
+        page = write_page(folder, "Next trials", about, summary, [shown, track_section, table])
         return [trials, tracks, page]
 
 

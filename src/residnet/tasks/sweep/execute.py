@@ -361,7 +361,10 @@ def _write_results(config: SweepConfig, study: optuna.Study, folder: RunFolder) 
     if by_state["ended early"]:
         verdict.append(f"Ended early: {format_count(len(by_state['ended early']), 'trial')}.")
     if failed_rows := by_state["failed"]:
-        verdict.append(f"{len(failed_rows)} trials failed; the first: {failed_rows[0].fault}.")
+        first_fault = failed_rows[0].fault
+        verdict.append(
+            f"{format_count(len(failed_rows), 'trial')} failed; the first: {first_fault}."
+        )
     if n_finished > 1:
         verdict.append(
             f"The best of {n_finished} validation errors is biased by the selection:"

@@ -428,7 +428,7 @@ def _score_figure(rows: Sequence[StudyResults]) -> Figure:
         "better interval": GlyphStyle("", BLUE),
         "better": GlyphStyle("better than the believed model", BLUE, kind="points", size=4.5),
         "other interval": GlyphStyle("", GREY),
-        "other": GlyphStyle("no better", GREY, kind="points", marker="s", size=4.5),
+        "other": GlyphStyle("not significantly better", GREY, kind="points", marker="s", size=4.5),
     }
     panels = []
     panel_traces = []
@@ -458,7 +458,8 @@ def _score_figure(rows: Sequence[StudyResults]) -> Figure:
         panels.append(
             Panel(
                 "",
-                "squared error less the believed model's, mean over axes [% of the mean square]",
+                "squared error minus that of the believed model, mean over axes"
+                " [% of the mean square]",
                 f"{force} force",
                 height=50 + 31 * len(force_rows),
                 y_names=tick_labels(row["model"] for row in force_rows),
@@ -523,7 +524,7 @@ def _gain_sentences(regression_rows: Sequence[StudyResults]) -> list[str]:
         row["model"] for row in regression_rows if row["minus_reference"]["ci95"][3][0] > 0
     ]
     if worse_models:
-        sentences.append(f"Worse than that: {join_list(worse_models)}.")
+        sentences.append(f"Significantly worse: {join_list(worse_models)}.")
     axes_by_model: dict[str, list[str]] = {}
     for axis, name in enumerate(AXES):
         better_rows = [row for row in regression_rows if flags_by_model[row["model"]][axis]]
@@ -575,7 +576,7 @@ def _data_section(config: ForceResidualConfig, results: StudyResults) -> Section
         + (
             ""
             if blocks["of"] == "logs"
-            else " With so few logs they speak for these logs and not for another day."
+            else " With so few logs they hold for these logs only, not for logs of other days."
         ),
         "The model zero predicts no force at all; believed predicts the force of the believed hull,"
         " which is a residual of zero.",
@@ -699,9 +700,9 @@ def _model_table(
         " model's residual, in other trials.",
         groups=[
             ("mean square error", 3),
-            ("% of zero", 3),
+            ("squared error, % of zero force", 3),
             ("% of the believed model's", 3),
-            ("mean over axes less believed, % of zero", 3),
+            ("mean over axes minus believed, % of zero force", 3),
             ("the same less the better of zero and believed on each axis", 3),
         ],
         is_selected=lambda row: row["model"] == _recommended_model(rows),
