@@ -45,7 +45,7 @@ from residnet.report.run_reader import RunFiles
 from residnet.report.sections import runs
 from residnet.report.sections.models import evolution_figures
 from residnet.report.sections.sweep import shorten_keys, slice_figure
-from residnet.report.still import render_matplotlib
+from residnet.report.still import INLINE_WIDTH, render_matplotlib
 
 T = np.linspace(0.0, 10.0, 900)
 needs_browser = pytest.mark.skipif(browser() is None, reason="no browser is installed")
@@ -144,6 +144,23 @@ def test_still_pictures_show_what_is_switched_on() -> None:
     assert "interval" not in labels
     assert [text.get_text() for text in heading.texts] == ["stage"]
     assert len(render_matplotlib(every_kind(), panel_numbers=[1, 2]).axes) == 2
+
+
+def test_long_legends_and_labels_of_axes_stay_within_a_narrow_figure() -> None:
+    names = [f"law {number}, look-ahead" for number in range(10)]
+    curves = {name: (T, np.sin(T)) for name in names}
+    label = "squared error minus that of the reference model, mean over axes [% of the mean square]"
+    panels = [Panel("mean angular rate of the boat [deg/s]", label, height=220)]
+    figure = Figure("long", "Long", "", style_family(curves), panels, [Case("", [curves])])
+    canvas = render_matplotlib(figure, width=INLINE_WIDTH)
+    (axes,) = canvas.axes
+    (legend,) = canvas.legends
+    assert legend.get_window_extent().y0 >= axes.bbox.y1
+    for text in (axes.xaxis.label, axes.yaxis.label):
+        extent = text.get_window_extent()
+        assert "\n" in text.get_text()
+        assert extent.x0 >= 0
+        assert extent.x1 <= canvas.bbox.width
 
 
 def test_outlines_and_steps() -> None:

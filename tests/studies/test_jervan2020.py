@@ -215,7 +215,7 @@ def test_a_feed_forward_is_judged_by_its_flights() -> None:
         "models": {"plsr": {"share_left": [0.1] * 3}, "ridge": {"share_left": [1.4] * 3}},
     }
     (worse,) = list_feed_forward_objections("plsr", results)
-    assert "judging courses is 0.688 m, the believed model's 0.232 m" in worse
+    assert "validation courses is 0.688 m, the believed model's 0.232 m" in worse
     assert list_feed_forward_objections("ridge", results) == []
     assert find_best_flown_model(results) == "ridge"
     results["crossing"] = {"believed": {"position_mae": 0.1}, "ridge": {"position_mae": 0.3}}

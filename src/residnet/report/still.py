@@ -30,6 +30,8 @@ _MAX_INLINE_WIDTH = 5.0
 """Width in inches to which a drawing grows on a large screen."""
 _MAP_HEIGHT = 4.2
 """Height of a row of maps in inches."""
+_LEGEND_LINE_HEIGHT = 0.17
+"""Height of a line of the legend in inches."""
 _MAX_LABELLED_RATIO = 30.0
 """Ratio of the limits of a logarithmic axis up to which ticks between powers of ten have labels:
 more would overlap in a panel of two centimetres.
@@ -134,7 +136,10 @@ def render_matplotlib(
         canvas.align_ylabels()
         labels = dict.fromkeys(style.label for style in figure.styles.values())
         shown_handles = {label: handles[label] for label in labels if label in handles}
-        _legend_above(canvas, shown_handles, width)
+        n_legend_lines = _legend_above(canvas, shown_handles, width)
+        # the height includes a legend of two lines; more of them would cover the panels
+        extra_height = _LEGEND_LINE_HEIGHT * max(n_legend_lines - 2, 0)
+        canvas.set_figheight(canvas.get_figheight() + extra_height)
         canvas.canvas.draw()
         if _wrap_axis_labels(canvas):
             canvas.canvas.draw()
@@ -164,8 +169,8 @@ def _wrap_axis_labels(canvas: Any) -> bool:
         ):
             text = label.get_text()
             if text and 0 < space < length:
-                # words differ in width: 5 % of the space remains free
-                n_characters = max(int(0.95 * len(text) * space / length), 1)
+                # words differ in width, and a broken label of the other axis moves this one
+                n_characters = max(int(0.85 * len(text) * space / length), 1)
                 lines = textwrap.wrap(text, n_characters, break_long_words=False)
                 label.set_text("\n".join(lines))
                 is_wrapped = is_wrapped or len(lines) > 1
@@ -308,19 +313,46 @@ def _draw_curve(axes: Any, style: GlyphStyle, x: np.ndarray, y: np.ndarray) -> A
     return artist
 
 
-def _legend_above(canvas: Any, handles: dict[str, Any], width: float) -> None:
-    """Place a legend above the panels, with the largest number of columns that fit."""
-    # in points: the sample and its spaces, then the text at 9 pt
-    widths = [46.0 + 4.9 * len(text) for text in handles]
-    columns = max(len(widths), 1)
+def _legend_above(canvas: Any, handles: dict[str, Any], width: float) -> int:
+    """Place a legend above the panels, with the largest number of columns that fit.
+
+    A legend that would be a long column has a smaller font. Returns the number of lines.
+    """
+    if not handles:
+        return 0
+    n_columns = _count_legend_columns(list(handles), width, sample_width=46.0, character_width=4.9)
+    font: dict[str, Any] = {}
+    if n_columns == 1 and len(handles) > 4:
+        font = {"fontsize": 8, "handlelength": 2.0, "columnspacing": 1.0}
+        n_columns = _count_legend_columns(
+            list(handles), width, sample_width=34.0, character_width=4.4
+        )
+    canvas.legend(
+        handles.values(), handles.keys(), loc="outside upper center", ncols=n_columns, **font
+    )
+    return -(-len(handles) // n_columns)
+
+
+def _count_legend_columns(
+    labels: Sequence[str], width: float, sample_width: float, character_width: float
+) -> int:
+    """Return the largest number of columns of a legend that fit into a width in inches.
+
+    Args:
+        labels: the texts.
+        width: width of the figure in inches.
+        sample_width: width of the sample and its spaces in points.
+        character_width: mean width of a character in points.
+    """
+    widths = [sample_width + character_width * len(text) for text in labels]
+    n_columns = len(widths)
     # matplotlib fills a legend column by column
     while (
-        columns > 1
-        and sum(max(part) for part in np.array_split(np.array(widths), columns)) > 72.0 * width
+        n_columns > 1
+        and sum(max(part) for part in np.array_split(np.array(widths), n_columns)) > 72.0 * width
     ):
-        columns -= 1
-    if handles:
-        canvas.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=columns)
+        n_columns -= 1
+    return n_columns
 
 
 def draw_svg(figure: Figure) -> str:

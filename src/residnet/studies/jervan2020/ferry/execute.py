@@ -117,16 +117,15 @@ class FerryExecutor(StudyExecutor[FerryStudyConfig]):
         best_name = find_best_model(results)
         remaining_text = join_numbers([100 * share for share in models[best_name]["share_left"]])
         sentences = [
-            f"Of {len(models)} residual models, {best_name} leaves the least of the residual"
-            f" force on"
-            f" the unseen half of the course: {remaining_text} % of its mean square in surge,"
-            f" sway and yaw."
+            f"Of {len(models)} residual models, {best_name} has the smallest residual force on the"
+            f" unseen half of the course: {remaining_text} % of the mean square of the believed"
+            f" model's residual in surge, sway and yaw."
         ]
         judging = results["judging"]
         best_flown = find_best_flown_model(results)
         sentences.append(
-            f"On {len(judging[BELIEVED_NAME]['courses'])} judging courses the exported feed-forward"
-            f" of {best_flown} has the smallest mean position error:"
+            f"On {len(judging[BELIEVED_NAME]['courses'])} validation courses the exported"
+            f" feed-forward of {best_flown} has the smallest mean position error:"
             f" {_error_text(judging[best_flown])}; the believed model's is"
             f" {_error_text(judging[BELIEVED_NAME])}."
         )
@@ -160,7 +159,7 @@ class FerryExecutor(StudyExecutor[FerryStudyConfig]):
                 for axis, share in shares
             }
             | {
-                f"mean position error on the judging courses with {name}": SummaryMetric(
+                f"mean position error on the validation courses with {name}": SummaryMetric(
                     run["position_mae"], "m"
                 )
                 for name, run in results["judging"].items()
@@ -182,7 +181,7 @@ class FerryExecutor(StudyExecutor[FerryStudyConfig]):
         sections_written = [
             Section("", [*run_pictures[:1], residual_table.select_columns(3, 6)]),
             Section("Residual force on the unseen half", [residual_table]),
-            Section("Judging courses", [_judging_table(results)]),
+            Section("Validation courses", [_judging_table(results)]),
         ]
         for run_kind, title in (
             ("course", "Course in closed loop"),
@@ -228,8 +227,8 @@ def export_model(config: FerryStudyConfig, request: ExportRequest) -> Path:
     results = read_json(request.run.path / config.results_file)
     if "judging" not in results:
         raise UsageError(
-            f"{run.path}: {config.results_file} has no flights on judging courses (key 'judging');"
-            " it is from an earlier version, so run the study again"
+            f"{run.path}: {config.results_file} has no simulations of validation courses (key"
+            " 'judging'); it is from an earlier version, so run the study again"
         )
     name = find_best_flown_model(results) if request.model == "selected" else request.model
     if name not in config.models:
@@ -711,8 +710,8 @@ def list_feed_forward_objections(name: str, results: StudyResults) -> list[str]:
         results["judging"][model_name]["position_mae"] for model_name in (name, BELIEVED_NAME)
     )
     if model_error is None:
-        return ["the closed loop with it is unstable on a judging course"]
-    compared_errors = {"judging courses": (model_error, believed_error)}
+        return ["the closed loop with it is unstable on a validation course"]
+    compared_errors = {"validation courses": (model_error, believed_error)}
     if name in (crossing := results["crossing"]):
         compared_errors["crossing"] = (
             crossing[name]["position_mae"],
@@ -750,7 +749,7 @@ def _judging_table(results: StudyResults) -> Table:
         {
             "name": name,
             **judging[name],
-            "decision": "the controller's"
+            "decision": "reference"
             if name == BELIEVED_NAME
             else "; ".join(list_feed_forward_objections(name, results)) or "exported",
         }
@@ -817,8 +816,9 @@ def _residual_table(config: FerryStudyConfig, results: StudyResults) -> Table:
             *comparison_columns("left", AXES, 3),
             ("chosen by the estimator", "notes"),
         ],
-        caption="Mean square of the residual, and what is left of the believed model's.",
-        groups=[("mean square", 3), ("% left of the residual force", 3)],
+        caption="Mean square of the residual force, absolute and as a share of that of the believed"
+        " model.",
+        groups=[("mean square", 3), ("% of the believed model's residual", 3)],
         is_selected=lambda row: row["name"] == find_best_model(results),
     )
 
