@@ -14,6 +14,7 @@ from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.units import canonical_unit, to_si
 from residnet.io.readers import ReaderConfig
+from residnet.io.readers.text_tables import read_table_head
 from residnet.io.readers.timestamps import detect_date_order, is_date_column, parse_texts
 
 SPELT = {
@@ -128,6 +129,30 @@ def test_an_excel_sheet(tmp_path: Path) -> None:
     path.write_bytes(b"PK nothing")
     with pytest.raises(DataError, match="damaged or not an Excel file"):
         _read(path, {**settings, "channels": CHANNELS})
+
+
+NUMBERS = "0.0,1.0,2.0,10\n0.1,1.1,2.1,10\n0.2,1.2,2.2,10\n0.3,1.3,2.3,10\n"
+
+
+def test_names_in_two_rows_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text(f"Time,Position,Position,Rudder\ns,X,Y,deg\n{NUMBERS}")
+    with pytest.raises(DataError, match=r"run\.csv.*'Position' above X, Y.*'Position X'.*--names"):
+        read_table_head(path, 4)
+
+
+def test_a_row_that_groups_names_is_skipped(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text(f"Time,Position,Position,Rudder\nt,X,Y,delta\n{NUMBERS}")
+    table, _ = read_table_head(path, 4)
+    assert list(table.columns) == ["t", "X", "Y", "delta"]
+
+
+def test_units_below_repeated_names_are_no_names(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text(f"Time,Speed,Speed,Rudder\ns,m/s,kn,deg\n{NUMBERS}")
+    table, _ = read_table_head(path, 4)
+    assert list(table.columns) == ["Time", "Speed.0", "Speed.1", "Rudder"]
 
 
 @pytest.mark.parametrize(

@@ -393,6 +393,8 @@ def read_table_head(
             )
         if column_names is None:
             delimiter, cells, (header_row, n_lines_above) = _detect_delimiter(path, lines)
+            if header_row + 1 < n_lines_above:
+                _refuse_names_in_two_rows(path, cells[header_row], cells[header_row + 1])
         else:
             delimiter, cells, n_lines_above = _detect_values(path, lines, len(column_names))
             # the names take the place of the line above the values
@@ -719,6 +721,7 @@ def find_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
             header_row + 1 < first_value_row
             and _has_repeated_cells(rows[header_row])
             and not _has_repeated_cells(rows[header_row + 1])
+            and not _has_units_below_names(rows[header_row], rows[header_row + 1])
         ):
             header_row += 1
         # skip a smaller table above, which describes the columns
@@ -733,6 +736,39 @@ def find_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
                 return first_value_row + nested_header[0], first_value_row + nested_header[1]
         return header_row, first_value_row
     return None
+
+
+def _has_units_below_names(upper: Sequence[str], lower: Sequence[str]) -> bool:
+    """Return whether a row has units below all names that the row above has once.
+
+    The first letters of a name, such as `t` below `Time`, abbreviate it and are no unit.
+    """
+    cells_of_single_names = [
+        (name, below)
+        for name, below in zip(upper, lower, strict=False)
+        if name and below and list(upper).count(name) == 1
+    ]
+    return bool(cells_of_single_names) and all(
+        is_unit(below.strip("[]()")) and not name.lower().startswith(below.lower())
+        for name, below in cells_of_single_names
+    )
+
+
+def _refuse_names_in_two_rows(path: Path, upper: Sequence[str], lower: Sequence[str]) -> None:
+    """Refuse a header such as `Position`, `Position` above `X`, `Y`: neither row has all names.
+
+    Raises:
+        DataError: if words in the lower row distinguish columns of one name in the upper row.
+    """
+    for name in dict.fromkeys(cell for cell in upper if cell):
+        words = [below for above, below in zip(upper, lower, strict=False) if above == name]
+        is_distinguished = len(words) > 1 and all(words) and not _has_repeated_cells(words)
+        if is_distinguished and not any(is_unit(word.strip("[]()")) for word in words):
+            raise DataError(
+                f"{path}: two rows together name the columns: '{name}' above"
+                f" {', '.join(words)}; write the names in one row, for example '{name} {words[0]}',"
+                " or name all columns in order: residnet new --names t,x,y,..."
+            )
 
 
 def _has_repeated_cells(row: Sequence[str]) -> bool:
