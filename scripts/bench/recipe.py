@@ -230,8 +230,8 @@ def fitted(splits: Splits, effort: float, parts: Sequence[str]) -> Any:
     """Fit the recipe with some parts of it changed."""
     whole = settings.make_portfolio
 
-    def changed(facts: Any) -> dict[str, Any]:
-        plan = whole(facts)
+    def changed(facts: Any, **options: Any) -> dict[str, Any]:
+        plan = whole(facts, **options)
         for part in parts:
             change(plan, part)
         return plan

@@ -2,12 +2,11 @@
 
     python scripts/bench/recurrent.py [--logs measured|boats|shipped] [--count 4] [--seed S]
         [--minutes 5] [--past 5 10] [--arms NAME ...] [--save FILE]
-        [--plain NAME ...] [--cache FOLDER]
+        [--plain NAME ...]
     python scripts/bench/recurrent.py --summary FILE ...
 
 `--plain` adds networks of `peers.py` with one setting changed each, which depend on no other code
-of the project; `plain` has those of the published recipe. `--cache` stores the errors of the arms
-of a draw with its logs, so that further plain networks need no fit.
+of the project; `plain` has those of the published recipe.
 
 Each draw has three training logs and one validation log, `minutes` long together, and four logs for
 the comparison. The hull and all arms are fitted to the same logs, and each arm is compared in the
@@ -19,7 +18,6 @@ for every value. The draws of a seed are for choices: report with another seed.
 from __future__ import annotations
 
 import json
-import pickle
 import time
 from pathlib import Path
 from typing import Any
@@ -114,7 +112,9 @@ def fit_draw(
 ) -> tuple[dict[str, np.ndarray], np.ndarray, dict[str, float], Any, tuple[str, ...]]:
     """Fit hull and arms; return errors by model [N, n], first rows of windows, times, the logs."""
     with (
-        mock.patch.object(settings, "make_portfolio", lambda summary: make_plan(summary, arms)),
+        mock.patch.object(
+            settings, "make_portfolio", lambda summary, **_: make_plan(summary, arms)
+        ),
         mock.patch.object(recipe, "make_protocols", lambda T: make_protocols(T, past, first)),
     ):
         models = residnet.fit(splits, bands=None)
@@ -168,22 +168,11 @@ def compare_arms(
     plain: list[str],
     past: float,
     first: float,
-    cache: Path | None,
 ) -> dict[str, Any]:
     """Fit all arms, and return the errors of the single models and of the means, and the times."""
-    if cache is not None and cache.exists():
-        # only files of this script are read, which the caller names
-        draw = pickle.loads(cache.read_bytes())
-    else:
-        draw = fit_draw(splits, arms, past, first)
-        if cache is not None:
-            cache.write_bytes(pickle.dumps(draw))
-    by_name, begins, seconds, data, channels = draw
+    by_name, begins, seconds, data, channels = fit_draw(splits, arms, past, first)
     for name in plain:
-        if name not in by_name:
-            by_name[name], seconds[name] = fit_plain(name, data, channels)
-            if cache is not None:
-                cache.write_bytes(pickle.dumps(draw))
+        by_name[name], seconds[name] = fit_plain(name, data, channels)
     means = [(name,) for name in by_name]
     means += [members for members in MEANS if set(members) <= set(by_name)]
     means += [(*reference, name) for name in plain for reference in (("hull",), MEANS[0])]
@@ -240,7 +229,7 @@ def main() -> None:
     """Fit the arms to each draw and print the table, or print the table of stored draws."""
     given = bench.options(
         __doc__, logs="measured", count=4, seed=100, first=0, minutes=5.0, past=[5.0],
-        arms=list(ARMS), plain=[""], cache=None, vessels=[], save=None, summary=[],
+        arms=list(ARMS), plain=[""], vessels=[], save=None, summary=[],
     )  # fmt: skip
     records: list[dict[str, Any]] = []
     for file in given.summary:
@@ -255,11 +244,8 @@ def main() -> None:
         )
         for past in given.past:
             begin = time.process_time()
-            cache = None
-            if given.cache:
-                cache = Path(given.cache) / f"{name}_{given.seed}_{number}_{past:g}.pickle"
             plain = [arm for arm in given.plain if arm]
-            record = compare_arms(splits, given.arms, plain, past, max(given.past), cache)
+            record = compare_arms(splits, given.arms, plain, past, max(given.past))
             record |= {"name": name, "draw": number, "seed": given.seed, "past": past}
             record["cpu"] = round(time.process_time() - begin, 1)
             records.append(record)

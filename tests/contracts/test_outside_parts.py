@@ -165,7 +165,7 @@ def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     }
     write_package(site, "outside", CODE, **entry_points)
     monkeypatch.syspath_prepend(site)
-    registry.clear_caches()
+    _forget_kinds()
     folder = tmp_path / "logs"
     folder.mkdir()
     t = np.arange(0.0, 40.0, 0.2)
@@ -175,8 +175,14 @@ def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         np.savetxt(folder / name, np.stack(columns, axis=1), delimiter=";")
     yield folder
     monkeypatch.undo()
-    registry.clear_caches()
+    _forget_kinds()
     sys.modules.pop("outside", None)
+
+
+def _forget_kinds() -> None:
+    """List the kinds again, also in the schema of `FitSettings`, which its first use builds."""
+    registry.clear_caches()
+    FitSettings.model_rebuild(force=True)
 
 
 def test_endings_of_a_registered_reader_are_logs(logs: Path) -> None:
