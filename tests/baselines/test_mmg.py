@@ -12,10 +12,11 @@ from made_samples import sampled
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from residnet.baselines.mmg import MMGBaseline
+from residnet.baselines.mmg import MMGBaseline, soeding_normal_coefficient
 from residnet.baselines.mmg_config import MMGConfig, SemiEmpiricalConfig
 from residnet.baselines.mmg_parameters import (
     PARAMETER_NAMES,
+    MMGRudder,
     clarke_priors,
     default_priors,
 )
@@ -214,3 +215,63 @@ def test_the_evidence_widens_priors_that_the_logs_contradict_and_keeps_right_one
         factors[name] = solution.notes["prior_factor"]
     assert factors["right"] == 1.0
     assert factors["wrong"] > 1.0
+
+
+def _soeding(angles_deg: list[float], aspect: float, reynolds_number: float) -> Tensor:
+    rudder = MMGRudder(area=1.0, aspect=aspect, race=1.0, curve="soeding")
+    angles = torch.deg2rad(torch.tensor(angles_deg, dtype=torch.float64))
+    return soeding_normal_coefficient(
+        angles,
+        torch.full_like(angles, reynolds_number),
+        lift_slope=rudder.lift_slope,
+        aspect=aspect,
+    )
+
+
+def test_the_rudder_curve_of_soeding_has_the_limits_of_theory() -> None:
+    # thin aerofoil (2 pi) for a large aspect ratio, about Jones' slender wing (pi/2 Lambda) below
+    slopes = {
+        aspect: MMGRudder(area=1.0, aspect=aspect, race=1.0, curve="soeding").lift_slope
+        for aspect in (1e-4, 1.0, 2.0, 1e6)
+    }
+    assert slopes[1e6] == pytest.approx(2 * math.pi, rel=1e-5)
+    assert slopes[1e-4] / 1e-4 == pytest.approx(2 * math.pi * 0.7 / 1.7**2, rel=1e-3)
+    assert slopes[1e-4] / 1e-4 == pytest.approx(math.pi / 2, rel=0.05)
+    # near Fujii's slope for rudders of ships
+    for aspect in (1.0, 2.0):
+        fujii = MMGRudder(area=1.0, aspect=aspect, race=1.0).lift_slope
+        assert slopes[aspect] == pytest.approx(fujii, rel=0.25)
+
+
+def test_the_rudder_curve_of_soeding_is_odd_and_adds_the_friction_of_the_plate() -> None:
+    forward = _soeding([0.0, 5.0, 20.0, 35.0], 1.8, 1e7)
+    torch.testing.assert_close(_soeding([0.0, -5.0, -20.0, -35.0], 1.8, 1e7), -forward)
+    assert float(forward[0]) == 0.0
+    assert bool((forward.diff() > 0).all())
+    # at 90 degrees the lift of the cross flow vanishes: C_N = C_D
+    slope = MMGRudder(area=1.0, aspect=1.8, race=1.0, curve="soeding").lift_slope
+    across = float(_soeding([90.0], 1.8, 1e7))
+    assert across == pytest.approx(slope**2 / (math.pi * 1.8) + 1.0 + 2.5 * 0.075 / 25, rel=1e-9)
+    # 0.075 / (log10(R_n) - 2)^2 is 0.003 at 1e7 and 0.0046875 at 1e6
+    angle = math.radians(20.0)
+    friction = float(_soeding([20.0], 1.8, 1e6) - _soeding([20.0], 1.8, 1e7))
+    assert friction == pytest.approx(2.5 * (0.0046875 - 0.003) * math.sin(angle), rel=1e-9)
+    # the friction line is bounded at rest
+    assert bool(_soeding([20.0], 1.8, 0.0).isfinite().all())
+
+
+def test_the_rudder_curve_of_soeding_turns_the_semi_empirical_ship() -> None:
+    content = {**TANKER, "kind": "semi_empirical"}
+    fujii = SemiEmpiricalConfig.model_validate(content).build(NAMES)
+    content["rudder"] = {**TANKER["rudder"], "curve": "soeding"}
+    soeding = SemiEmpiricalConfig.model_validate(content).build(NAMES)
+    z = torch.tensor([[1.0, 0, 0, 10, 0.0], [1.0, 0, 0, 10, 0.02], [1.0, 0, 0, 10, 0.5]]).double()
+    ratio = soeding(z)[1:, 2] - soeding(z)[0, 2]
+    ratio = ratio / (fujii(z)[1:, 2] - fujii(z)[0, 2])
+    slopes = [
+        MMGRudder.model_validate({**TANKER["rudder"], "curve": curve}).lift_slope
+        for curve in ("soeding", "fujii")
+    ]
+    # small angles: the ratio of the slopes; large ones: the cross flow adds to the force
+    assert float(ratio[0]) == pytest.approx(slopes[0] / slopes[1], rel=0.03)
+    assert float(ratio[1]) > 1.03 * float(ratio[0])

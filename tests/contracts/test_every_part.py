@@ -73,7 +73,7 @@ BASELINES: dict[str, tuple[dict[str, Any], str]] = {
         {
             "hull": {"length": 6, "beam": 2, "draught": 0.4, "mass": 1500, "x_G": 0},
             "propeller": {"diameter": 0.3, "x": -0.48, "thrust": [0.29, -0.28, -0.14]},
-            "rudder": {"area": 0.1, "aspect": 1.5, "race": 0.6},
+            "rudder": {"area": 0.1, "aspect": 1.5, "race": 0.6, "curve": "soeding"},
         },
         "example_rudder_boat",
     ),

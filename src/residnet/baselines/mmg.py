@@ -39,6 +39,41 @@ _WAKE_SLOPE = 2.0
 """
 # lower bound of U^2, so that v / U is defined at rest; (m/s)^2
 _MIN_SPEED_SQUARED = 1e-6
+_CROSS_FLOW_DRAG = 1.0
+"""C_Q in `soeding_normal_coefficient`, about 1 for rudders with sharp edges at tip and root."""
+_KINEMATIC_VISCOSITY = 1.139e-6
+"""Of fresh water at 15 degrees Celsius in m^2/s; ITTC Recommended Procedure 7.5-02-01-03."""
+_MIN_REYNOLDS_NUMBER = 1e4
+"""Lower bound in the friction line, which has a pole at 100."""
+
+
+def soeding_normal_coefficient(
+    attack_angle: Tensor, reynolds_number: Tensor, *, lift_slope: float, aspect: float
+) -> Tensor:
+    """Compute the coefficient C_N of the normal force of a rudder by Söding (1982).
+
+    C_L = lift_slope sin(alpha) + C_Q sin(alpha) |sin(alpha)| cos(alpha)
+    C_D = C_L^2 / (pi Lambda) + C_Q |sin(alpha)|^3 + C_D0
+    C_N = C_L cos(alpha) + C_D sin(alpha)
+    with C_D0 = 2.5 * 0.075 / (log10(R_n) - 2)^2. The formulas are valid below the angle of stall.
+
+    Source: Söding, Prediction of ship steering capabilities, Schiffstechnik 29 (1982) 3-29;
+    reprinted in Brix, Manoeuvring Technical Manual, Seehafen Verlag, Hamburg (1993), and in
+    Bertram, Practical Ship Hydrodynamics, 2nd ed., Butterworth-Heinemann (2012), section 6.4.
+
+    Args:
+        attack_angle: angles of attack [...] in rad.
+        reynolds_number: Reynolds numbers [...] by chord and inflow.
+        lift_slope: slope of the lift coefficient at zero angle of attack.
+        aspect: aspect ratio Lambda.
+    """
+    sine = torch.sin(attack_angle)
+    cosine = torch.cos(attack_angle)
+    lift = lift_slope * sine + _CROSS_FLOW_DRAG * sine * sine.abs() * cosine
+    bounded = torch.clamp(reynolds_number, min=_MIN_REYNOLDS_NUMBER)
+    friction_drag = 2.5 * 0.075 / (torch.log10(bounded) - 2.0) ** 2
+    drag = lift * lift / (math.pi * aspect) + _CROSS_FLOW_DRAG * sine.abs() ** 3 + friction_drag
+    return lift * cosine + drag * sine
 
 
 @final
@@ -71,7 +106,12 @@ class MMGForces(nn.Module):
         self.density = float(hull.density)
         self.diameter = float(propeller.diameter)
         self.k0, self.k1, self.k2 = propeller.thrust
-        self.lift_factor = 0.5 * hull.density * rudder.area * rudder.lift_slope
+        self.rudder_factor = 0.5 * hull.density * rudder.area
+        self.lift_factor = self.rudder_factor * rudder.lift_slope
+        self.lift_slope = rudder.lift_slope
+        self.rudder_curve = rudder.curve
+        self.aspect = float(rudder.aspect)
+        self.chord = rudder.chord
         self.x_P = propeller.x
         self.x_R = rudder.x
         self.race_share = rudder.race
@@ -172,11 +212,17 @@ class MMGForces(nn.Module):
         rudder_drift = -v_nondim - l_R * r_nondim
         rudder_inflow_y = speed * torch.where(rudder_drift > 0, gamma_p, gamma_n) * rudder_drift
         attack_angle = delta - torch.atan2(rudder_inflow_y, rudder_inflow_x)
-        normal_force = (
-            self.lift_factor
-            * (rudder_inflow_x * rudder_inflow_x + rudder_inflow_y * rudder_inflow_y)
-            * torch.sin(attack_angle)
-        )
+        inflow_squared = rudder_inflow_x * rudder_inflow_x + rudder_inflow_y * rudder_inflow_y
+        if self.rudder_curve == "soeding":
+            normal_coefficient = soeding_normal_coefficient(
+                attack_angle,
+                torch.sqrt(inflow_squared) * self.chord / _KINEMATIC_VISCOSITY,
+                lift_slope=self.lift_slope,
+                aspect=self.aspect,
+            )
+            normal_force = self.rudder_factor * inflow_squared * normal_coefficient
+        else:
+            normal_force = self.lift_factor * inflow_squared * torch.sin(attack_angle)
         x_rudder = -(1 - t_R) * normal_force * torch.sin(delta)
         side_force = -normal_force * torch.cos(delta)
         # equations of motion about midship, solved for the accelerations

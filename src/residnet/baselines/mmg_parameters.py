@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from pydantic import Field
 
@@ -66,17 +66,31 @@ class MMGRudder(Config):
         x: longitudinal position divided by the length, positive forward of midship.
         race: share of the span in the slipstream (propeller race), propeller diameter divided by
             span.
+        curve: normal force over the angle of attack: `fujii` (Fujii and Tsuda 1961), a sine with
+            the slope `lift_slope`, or `soeding` (Söding 1982), lift and drag with the separated
+            flow at the edges of a rudder of small aspect ratio.
     """
 
     area: SquareMetres = Field(gt=0)
     aspect: float = Field(gt=0)
     x: float = -0.5
     race: float = Field(gt=0, le=1)
+    curve: Literal["fujii", "soeding"] = "fujii"
 
     @property
     def lift_slope(self) -> float:
-        """Gradient of the rudder normal force by the formula of Fujii, dimensionless."""
+        """Gradient of the rudder normal force at zero angle of attack, dimensionless.
+
+        With `soeding`, the friction of the rudder, less than 0.02, is not part of it.
+        """
+        if self.curve == "soeding":
+            return 2.0 * math.pi * self.aspect * (self.aspect + 0.7) / (self.aspect + 1.7) ** 2
         return 6.13 * self.aspect / (2.25 + self.aspect)
+
+    @property
+    def chord(self) -> float:
+        """Mean chord in m."""
+        return math.sqrt(self.area / self.aspect)
 
 
 class ParameterPrior(NamedTuple):
