@@ -70,6 +70,17 @@ def test_pages_show_what_they_should() -> None:
     assert all(re.search(rf"^{re.escape(line)}", TEXT, re.M) for line in NOT_RUN)
 
 
+MAX_DOCUMENTATION_WORDS = 30_000
+"""Of the pages written by hand: those of `docs/reference` are generated from code."""
+
+
+def test_the_documentation_is_short_enough_to_read() -> None:
+    pages = [page for page in (ROOT / "docs").rglob("*.md") if page.parent.name != "reference"]
+    n_words = sum(len(page.read_text().split()) for page in pages)
+    assert len(pages) > 40
+    assert n_words <= MAX_DOCUMENTATION_WORDS
+
+
 GUIDES = [page for page in PAGES if page.parent.name in ("howto", "tutorials", "results")]
 MAX_WORDS = 60
 """Of prose above the first table, picture or example."""

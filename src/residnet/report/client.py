@@ -44,6 +44,8 @@ _FIGURES = {
     ),
 }
 """Caption of each figure of the fit that the report contains, by its name."""
+_MAP_HEIGHTS = {"track": 2.2, "booklet_circles": 3.0}
+"""Heights of maps in inches."""
 
 
 class ClientText(Config):
@@ -175,7 +177,10 @@ def _draw_figures(run: RunFiles) -> Iterator[tuple[str, str, Any]]:
     ]
     for figure in figures:
         if figure is not None and figure.name in _FIGURES:
-            yield figure.name, _FIGURES[figure.name], render_matplotlib(figure)
+            # two pictures and a table share a page; texts keep their size in narrower pictures
+            map_height = _MAP_HEIGHTS.get(figure.name, 0.0)
+            canvas = render_matplotlib(figure, map_height=map_height)
+            yield figure.name, _FIGURES[figure.name], canvas
     derivatives = run.read_record(DerivativesFile, "derivatives.json")
     if derivatives is not None:
         rows = [row for row in derivatives.rows if row.prime_i_error is not None]
@@ -252,7 +257,7 @@ def _draw_repeated_indices(booklet: BookletFile) -> Any | None:
     if not points:
         return None
     with rc_context(RC_PARAMS):
-        canvas = Canvas(figsize=(7.0, 0.7 + 0.17 * len(points)), layout="constrained")
+        canvas = Canvas(figsize=(7.0, 0.6 + 0.16 * len(points)), layout="constrained")
         FigureCanvasSVG(canvas)
         panel = canvas.subplots()
         labels = []

@@ -408,7 +408,7 @@ def _validation_section(
         )
     )
     for file, width in (
-        ("track.svg", 0.85),
+        ("track.svg", 1.0),
         ("booklet_zigzags_1.svg", 1.0),
         ("repeated_indices.svg", 1.0),
     ):
@@ -453,9 +453,7 @@ def _prediction_section(booklet: BookletFile, figures: Mapping[str, str]) -> Rep
     is_scaled = booklet.scale != 1.0
     section = ReportSection("Full-scale predictions" if is_scaled else "Predictions")
     if "booklet_circles.svg" in figures:
-        section.blocks.append(
-            ReportPicture("booklet_circles.svg", figures["booklet_circles.svg"], 0.8)
-        )
+        section.blocks.append(ReportPicture("booklet_circles.svg", figures["booklet_circles.svg"]))
     rows = []
     for page in booklet.pages:
         if page.split:
