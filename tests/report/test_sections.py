@@ -326,7 +326,7 @@ def test_indices_stand_flight_by_flight_or_by_kind(
     assert table[0] == ["log", "first overshoot [deg]", "initial turning distance [m]"]
     assert len(table) == 1 + 2 * 13
     assert table[2] == ["zigzag_01 (model)", "11.00|beyond the IMO limit", "8.000"]
-    assert "Flights without indices: constant." in text
+    assert "Runs without indices: constant." in text
 
 
 def test_an_import_shows_gaps_channels_and_findings(page_of: Callable[[str], Path]) -> None:

@@ -145,7 +145,7 @@ def test_a_manoeuvre_that_never_ends_is_an_error_where_it_is_listed(
     assert said.code == 1
     [error] = [line for line in said.err.splitlines() if line.startswith("residnet:")]
     assert "zigzag_01: timed out after 7.9 s before 2 reversals at 20 deg" in error
-    assert "(1 of 3 flights were not completed" in error
+    assert "(1 of 3 runs were not completed" in error
     logs = logs_of(run)
     assert logs["logs/zigzag_01"].meta["timed_out"] is True
     assert "timed_out" not in logs["logs/three_two_one_one_01"].meta

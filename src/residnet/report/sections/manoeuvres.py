@@ -152,7 +152,7 @@ def _trials_table(content: IndicesFile) -> Table:
         return DASH if entry is None else "{} {}".format(*_format_index(content, name, entry.value))
 
     rows = sorted(content.rows, key=lambda row: not row.fault)
-    columns: list[Column[FlightIndices]] = [("flight", lambda row: row.log)]
+    columns: list[Column[FlightIndices]] = [("run", lambda row: row.log)]
     if len({row.craft for row in rows}) > 1:
         columns.append(("vessel", lambda row: row.craft))
     columns += [("outcome", outcome), ("value", value, str)]
@@ -172,7 +172,7 @@ def _introduction(content: IndicesFile) -> str:
         row.manoeuvre.replace("_", " ") for row in content.rows if not row.indices
     )
     return text + (
-        f" Flights without indices: {', '.join(kinds_without_indices)}."
+        f" Runs without indices: {', '.join(kinds_without_indices)}."
         if kinds_without_indices
         else ""
     )

@@ -110,7 +110,7 @@ def execute(config: SimulateConfig, folder: RunFolder) -> TaskOutcome:
         log_message(line)
     failures = [line for line, is_listed in fault_messages if is_listed]
     failure_message = failures and (
-        f"{failures[-1]} ({len(failures)} of {n_flights} flights were not completed;"
+        f"{failures[-1]} ({len(failures)} of {n_flights} runs were not completed;"
         " increase their duration, drive or steer)"
     )
     return TaskOutcome(
