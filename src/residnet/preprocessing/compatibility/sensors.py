@@ -126,13 +126,15 @@ class Sensor:
         Returns:
             One array [N] per column of the values.
         """
+        # once for all states: the weights cost as much as an interpolation
+        weights = None if fraction is None else compute_hermite_weights(step, fraction)
 
         def interpolate(state: int) -> np.ndarray:
             rate = DERIVATIVE_OF[state]
-            if fraction is None:
+            if weights is None:
                 return before[state]
             return interpolate_hermite(
-                before[state], before[rate], after[state], after[rate], step, fraction
+                before[state], before[rate], after[state], after[rate], weights
             )
 
         def get(name: str) -> complex:
@@ -144,14 +146,14 @@ class Sensor:
         if self.kind == "position":
             north = before[X]
             east = before[Y]
-            if fraction is not None:
+            if weights is not None:
                 rates = [
                     compute_ground_velocity(node, current_north, current_east)
                     for node in (before, after)
                 ]
                 north, east = (
                     interpolate_hermite(
-                        before[state], rates[0][k], after[state], rates[1][k], step, fraction
+                        before[state], rates[0][k], after[state], rates[1][k], weights
                     )
                     for k, state in enumerate((X, Y))
                 )
@@ -211,19 +213,30 @@ def compute_ground_velocity(
     return north, node[U] * sine + node[V] * cosine + current_east
 
 
+HermiteWeights = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Weights of the value and the rate at the start of a step, and of both at its end."""
+
+
+def compute_hermite_weights(step: float, fraction: np.ndarray) -> HermiteWeights:
+    """Return the weights of the cubic Hermite polynomial at fractions of a step."""
+    square = fraction * fraction
+    cube = square * fraction
+    return (
+        2.0 * cube - 3.0 * square + 1.0,
+        (cube - 2.0 * square + fraction) * step,
+        3.0 * square - 2.0 * cube,
+        (cube - square) * step,
+    )
+
+
 def interpolate_hermite(
     start: np.ndarray,
     start_rate: np.ndarray,
     end: np.ndarray,
     end_rate: np.ndarray,
-    step: float,
-    fraction: np.ndarray,
+    weights: HermiteWeights,
 ) -> np.ndarray:
     """Interpolate by the cubic polynomial with given values and rates at both ends of a step."""
-    square = fraction * fraction
-    cube = square * fraction
-    from_start = (2.0 * cube - 3.0 * square + 1.0) * start
-    from_start = from_start + (cube - 2.0 * square + fraction) * step * start_rate
-    return np.asarray(
-        from_start + (3.0 * square - 2.0 * cube) * end + (cube - square) * step * end_rate
-    )
+    from_start = weights[0] * start
+    from_start = from_start + weights[1] * start_rate
+    return np.asarray(from_start + weights[2] * end + weights[3] * end_rate)
