@@ -521,6 +521,6 @@ def find_broken_vessels() -> list[EntryPointPart]:
             if files[path.stem] != path:
                 fault_text = f"{files[path.stem]} is the vessel of that name"
                 broken_parts.append(
-                    EntryPointPart(path.stem, f"of the entry point {name}", fault=fault_text)
+                    EntryPointPart(path.stem, f"with the entry point '{name}'", fault=fault_text)
                 )
     return broken_parts

@@ -419,8 +419,8 @@ _NON_MOTION_CONCEPTS = (
 _DRIVE_CONCEPTS = ("engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque")
 _EARTH_AXIS_CONCEPTS = "north east angular voltage"
 _POSITION_SOURCES = (
-    "(?:mocap|vicon|optitrack|qualisys|qtm|uwb|rtk|gps|gnss|nav|odom|ekf|utm|enu|ned|world|map|local|"
-    "global)"
+    "(?:mocap|vicon|optitrack|qualisys|qtm|uwb|rtk|gps|gnss|nav|odom|ekf|utm|enu|ned|world|map|"
+    "local|global)"
 )
 """Names of instruments and frames before an axis of a position."""
 _STATE_RULES = (

@@ -298,7 +298,7 @@ class FroudeScaling:
 
     @property
     def time_factor(self) -> float:
-        """Factor of times."""
+        """Ratio of times of the target to times of the original: sqrt(scale), dimensionless."""
         return math.sqrt(self.scale)
 
     def factor(self, dimension: Dimension) -> float:

@@ -11,6 +11,7 @@ from residnet.core.log import Remark, make_remark
 _COUNTER_BITS = (16, 24, 32, 48)
 """Widths of the counters that microcontrollers use as clocks."""
 _DAY_IN_SECONDS = 86_400.0
+"""Length of a day; a clock of the day falls by this amount at midnight."""
 _N_SAMPLED_STAMPS = 1000
 """Evenly spaced stamps that are tested first; most other clocks fail on one of them."""
 _SIGNIFICANT_DIGITS = (2, 3, 4, 5, 6, 7)

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 # MATLAB's day number of 1 January 1970
 _DATENUM_1970 = 719_529.0
 _SECONDS_PER_DAY = 86_400.0
+"""Length of a day: MATLAB counts a datenum in days, a log in seconds."""
 _MAX_COLUMNS = 64
 """Largest number of columns of a matrix of channels; images and point clouds have more."""
 _MIN_SAMPLES = 20
