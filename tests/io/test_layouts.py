@@ -191,6 +191,10 @@ def test_forces_by_their_units_and_speed_by_its_letter() -> None:
     assert acting["acting_tau_x"] == "acting_tau_x [N]"
     speed = match_channels(["X", "Y", "Heading", "V [m/s]", "Drift angle", "Rudder"], DraftNotes())
     assert "V [m/s]" not in speed.values()
+    notes = DraftNotes()
+    read = match_channels(["Time", "V [m/s]", "Drift angle [deg]", "Yaw rate"], notes)
+    assert read["u"] == "V [m/s]"
+    assert "v = -V sin(beta)" in " ".join(reason for _, reason in notes.guessed_values)
 
 
 @pytest.mark.parametrize(

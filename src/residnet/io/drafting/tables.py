@@ -630,6 +630,10 @@ def _select_one_vessel(
     return match_channels(columns, draft_notes, has_heading=has_heading)
 
 
+_DRIFT_ANGLE = re.compile(r"drift\W*(angle|winkel)|\bbeta\b", re.IGNORECASE)
+"""Names of columns with the drift angle of the hull."""
+
+
 def match_channels(
     columns: Sequence[str], draft_notes: DraftNotes, *, has_heading: bool = True
 ) -> dict[str, str]:
@@ -682,9 +686,16 @@ def match_channels(
     )
     if "u" not in names and speeds and ("v" in names or not (has_position and has_heading)):
         names["u"] = speeds[0]
-        draft_notes.add_guess(
-            (*CHANNELS_KEY, "u"), f"'{speeds[0]}' is assumed the surge velocity, not the speed"
-        )
+        text = f"'{speeds[0]}' is assumed the surge velocity, not the speed"
+        drift = next((column for column in columns if _DRIFT_ANGLE.search(column)), None)
+        if drift is not None and "v" not in names:
+            # readers have no channel of the drift angle
+            text = (
+                f"'{speeds[0]}' is read as the surge velocity, and '{drift}' is not read; write"
+                " columns u = V cos(beta) and v = -V sin(beta) for speed V and drift angle beta"
+                " (positive with the flow from port)"
+            )
+        draft_notes.add_guess((*CHANNELS_KEY, "u"), text)
     ordered_channels = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
     return {name: names[name] for name in ordered_channels if name in names}
 
