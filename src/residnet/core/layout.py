@@ -180,7 +180,9 @@ class DegreesOfFreedom:
         recorded = {name for name in channels if name not in angles or _is_motion(channels[name])}
         has_planar_motion = recorded >= {"u", "v"} or recorded >= {"x", "y"}
         if (
-            recorded >= {"theta", "z", "psi"}
+            recorded >= {"z", "psi"}
+            # a vessel that dives by heave alone does not pitch, and needs a measured w
+            and ("theta" in recorded or ("theta" in channels and "w" in channels))
             and "phi" in channels
             and has_planar_motion
             and _depth_follows_motion(channels)

@@ -31,6 +31,7 @@ from residnet.io.drafting.velocities import (
     require_compatible,
 )
 from residnet.io.header_vocabulary import (
+    Scaling,
     guess_scaling,
     guess_unit_from_size,
     infer_unit,
@@ -1183,7 +1184,17 @@ class ChannelMapper:
 
     def _infer_unit(self, name: str, *, should_note: bool = True) -> str:
         """Return the unit of a channel from its header or its values, noting a guess."""
-        scaling = infer_unit(name, self._names[name], self._concatenate_values(name))
+        values = self._concatenate_values(name)
+        scaling = infer_unit(name, self._names[name], values)
+        if (
+            name in ("phi", "theta")
+            and scaling.reason
+            and "psi" in self._names
+            and np.nanmax(np.abs(values * to_si(self._psi_unit, "rad")), initial=0.0) < np.pi
+        ):
+            # small angles in deg have the size of angles in rad
+            reason = f"the header has no unit; assumed that of the heading, {self._psi_unit}"
+            scaling = Scaling({"unit": self._psi_unit}, reason)
         if should_note and scaling.reason:
             self._draft_notes.add_guess((*CHANNELS_KEY, name), scaling.reason)
         return str(scaling.settings["unit"])

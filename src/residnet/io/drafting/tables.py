@@ -37,6 +37,7 @@ from residnet.io.drafting.vertical import (
     VERTICAL_CHANNELS,
     draft_vertical_motion,
     project_on_horizontal,
+    refuse_vertical_y,
 )
 from residnet.io.header_vocabulary import (
     DATE_PART_NAMES,
@@ -175,15 +176,20 @@ def draft_tables(
             f" {_suggest_table_fix(main_preview, clock, common_numeric)}"
         )
     logs = _build_raw_tables(previews, column_by_channel, errors, step)
-    cells = [
-        str(text) for texts in main_preview.text_columns.values() for text in texts.unique()[:20]
-    ]
     tables = [preview.numeric_columns for preview in previews]
+    refuse_vertical_y(main_preview.path, simple_columns, tables, column_by_channel)
     channels = draft_channel_map(
         column_by_channel,
         project_on_horizontal(simple_columns, tables, logs, column_by_channel),
         draft_notes,
-        [*main_preview.column_names, *cells],
+        [
+            *main_preview.column_names,
+            *(
+                str(text)
+                for cells in main_preview.text_columns.values()
+                for text in cells.unique()[:20]
+            ),
+        ],
         is_up_positive=is_vertical_axis_up(
             simple_columns,
             column_by_channel,
@@ -1219,6 +1225,9 @@ def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]
     """Load the first sheet with two or more columns of numbers, otherwise the first sheet.
 
     Further sheets of the same recording are joined.
+
+    Raises:
+        DataError: if several sheets have the same columns, such as a sheet for each test.
     """
     names = list_sheet_names(path)
     tables = {name: read_excel_sheet(path, name, rows) for name in names}
@@ -1230,6 +1239,18 @@ def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]
         return joined, {"kind": "excel", "sheet": tuple(numeric_sheets)}
     name = next(iter([*numeric_sheets, *names]))
     table = tables[name]
+    groups = (
+        [other for other in numeric_sheets if tables[other].columns.equals(tables[first].columns)]
+        for first in numeric_sheets
+    )
+    logs = max(groups, key=len, default=[])
+    if len(logs) > 1:
+        raise DataError(
+            f"{path}: sheets {truncate(', '.join(logs), 60)} have the same columns, one log per"
+            " file was expected; write each sheet to a file, in Python"
+            " [sheet.to_csv(f'{name}.csv', index=False, header=False) for name, sheet in"
+            f" pandas.read_excel({path.name!r}, sheet_name={logs!r}, header=None).items()]"
+        )
     table.attrs["other_sheets"] = tuple(numeric_sheets[1:])
     return table, {"kind": "excel", **({"sheet": name} if name != names[0] else {})}
 

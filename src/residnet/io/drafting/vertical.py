@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from residnet.core.errors import DataError
 from residnet.core.layout import DegreesOfFreedom
 from residnet.core.units import to_si
 from residnet.io.drafting.channels import CHANNELS_KEY, RawTable
@@ -30,6 +32,58 @@ def _match_vertical_columns(columns: Sequence[str]) -> dict[str, str]:
     """Return channel -> column of the first column of each vertical channel."""
     matches = {match_depth_channel(parse_name(column)): column for column in reversed(columns)}
     return {name: matches[name] for name in VERTICAL_CHANNELS if name in matches}
+
+
+_MAX_FLAT_SHARE = 0.02
+"""Largest ratio of standard deviations of a vertical and a horizontal coordinate."""
+_N_PATH_SPANS = 100
+"""Number of spans of a path whose directions are counted."""
+_MIN_SECTOR_SHARE = 0.05
+
+
+def refuse_vertical_y(
+    path: Path,
+    columns: Sequence[str],
+    tables: Sequence[Mapping[str, np.ndarray]],
+    names: Mapping[str, str],
+) -> None:
+    """Refuse tracks whose y axis points up, as those of motion-capture systems.
+
+    In all tables y is almost constant beside x and z, and the path in the plane of x and z turns
+    through three quadrants, which a path that ascends and descends does not.
+
+    Args:
+        path: first table.
+        columns: names of the columns of numbers.
+        tables: column -> values of each table.
+        names: channel -> column of the mapped columns.
+
+    Raises:
+        DataError: if the y axis points up.
+    """
+    z = _match_vertical_columns(columns).get("z")
+    if z is None or not {"x", "y"} <= names.keys():
+        return
+    for table in tables:
+        if not {names["x"], names["y"], z} <= table.keys():
+            return
+        x, y, depth = (table[name] for name in (names["x"], names["y"], z))
+        spread = min(np.nanstd(x), np.nanstd(depth))
+        if not np.nanstd(y) < _MAX_FLAT_SHARE * spread:
+            return
+        span = max(1, x.size // _N_PATH_SPANS)
+        steps = np.diff(x[::span] + 1j * depth[::span])
+        steps = steps[np.isfinite(steps)]
+        # sectors of 90 deg about the axes
+        sectors = np.round(np.angle(steps) / (0.5 * np.pi)) % 4
+        shares = np.array([np.abs(steps[sectors == k]).sum() for k in range(4)])
+        if np.count_nonzero(shares > _MIN_SECTOR_SHARE * shares.sum()) < 3:
+            return
+    raise DataError(
+        f"{path}: column '{names['y']}' is almost constant, and '{names['x']}' and '{z}' have the"
+        " track: y points up, as in motion capture, but z was expected to; put -z and y for y and z"
+        " of position and quaternion, in all files"
+    )
 
 
 def project_on_horizontal(

@@ -87,6 +87,8 @@ TABLE_KINDS = {
 FIX_CHANNELS = ("latitude", "longitude")
 _HEADER_SEARCH_ROWS = 60
 """Rows of a sheet in which the header is searched."""
+_MIN_TABLE_COLUMNS = 3
+"""Smallest number of columns of a table that occurs several times in a sheet."""
 _MAX_LIST_COLUMNS = 16
 """Longest JSON list whose entries become columns."""
 _MIN_TABLE_ROWS = 20
@@ -796,7 +798,7 @@ def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> 
 
     Raises:
         UsageError: if the sheet does not exist.
-        DataError: if the file cannot be read.
+        DataError: if the file cannot be read, or the sheet has several tables.
     """
     import pandas as pd
 
@@ -819,6 +821,7 @@ def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> 
     if header_row > 0 and _is_unit_row(names):
         unit_rows = head_rows[header_row:first_value_row]
         names = _join_grouped_names(head_rows[:header_row])
+    _refuse_several_tables(path, table, names, first_value_row)
     table.columns = pd.Index(make_names_unique(names))
     table = _convert_decimal_commas(table.dropna(how="all"))
     table.attrs |= {
@@ -826,6 +829,45 @@ def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> 
         "unit_rows": unit_rows,
     }
     return table
+
+
+def _refuse_several_tables(
+    path: Path, table: pd.DataFrame, names: Sequence[str], first_value_row: int
+) -> None:
+    """Refuse a sheet with several tables of the same columns, such as a table for each test.
+
+    Args:
+        path: Excel file.
+        table: cells below the column names.
+        names: column names.
+        first_value_row: number of rows above the values.
+
+    Raises:
+        DataError: if the column names occur again in a later row, or further right.
+    """
+    filled = [name for name in names if name]
+    if len(filled) < _MIN_TABLE_COLUMNS:
+        return
+    instruction = "copy each table to a separate file, and give the folder of the files"
+    first_name = names.index(filled[0])
+    is_repeated = table.iloc[:, first_name].map(lambda cell: str(cell).strip() == filled[0])
+    for position in is_repeated.to_numpy().nonzero()[0]:
+        cells = [str(cell).strip() for cell in table.iloc[position]]
+        if all(name in ("", cell) for name, cell in zip(names, cells, strict=True)):
+            raise DataError(
+                f"{path}: row {first_value_row + position + 1} has the column names again"
+                f" ('{filled[0]}', '{filled[1]}', ...), a sheet has one log; {instruction}"
+            )
+    half = len(filled) // 2
+    if half >= _MIN_TABLE_COLUMNS and filled[0] in filled[1:]:
+        width = filled.index(filled[0], 1)
+        if width >= _MIN_TABLE_COLUMNS and all(
+            name == filled[k % width] for k, name in enumerate(filled)
+        ):
+            raise DataError(
+                f"{path}: has {len(filled) // width} tables side by side, each with '{filled[0]}',"
+                f" '{filled[1]}', ..., a sheet has one log; {instruction}"
+            )
 
 
 def _is_unit_row(row: Sequence[str]) -> bool:
