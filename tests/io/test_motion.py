@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import numpy as np
 import pytest
 from known_logs import wavy
 from scipy.spatial.transform import Rotation
+from simulated_motion import BOATS, simulate_motion
 
 from residnet.core.config import validate_config
 from residnet.core.errors import DataError, UsageError
@@ -13,6 +16,7 @@ from residnet.core.layout import DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES
 from residnet.preprocessing.align import GridConfig
+from residnet.preprocessing.compatibility import sway
 from residnet.preprocessing.motion import (
     Antenna,
     MotionConfig,
@@ -20,7 +24,7 @@ from residnet.preprocessing.motion import (
     fill_sparse,
     smooth_measured_motion,
 )
-from residnet.preprocessing.prepare import PrepareConfig, prepare_log
+from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
 
 TRUTH = wavy(seconds=120.0)
 
@@ -93,6 +97,48 @@ def test_complete_motion_leaves_dense_channels_unchanged() -> None:
     assert error(complete_motion(off, MotionConfig()), "v") > 0.2
     config = validate_config({"antenna": {"x": "30 cm"}, "delay": "400 ms"}, MotionConfig, "here")
     assert (config.antenna, config.delay) == (Antenna(x=0.3), 0.4)
+
+
+def test_unmeasured_sway_is_reconstructed_with_its_derivative() -> None:
+    motion = simulate_motion(BOATS["catamaran"], np.random.default_rng(3))
+    t = np.arange(1.0, 119.0, 0.1)
+    channels = {name: motion.sample(name, t) for name in STATE_NAMES}
+    truth = Log("truth", t, {**channels, "delta": channels["r"]})
+    noise = np.random.default_rng(4).standard_normal((5, t.size))
+    stds = {"x": 0.3, "y": 0.3, "psi": 0.005, "u": 0.03, "r": 0.003}
+    noisy = {
+        name: channels[name] + std * row
+        for (name, std), row in zip(stds.items(), noise, strict=True)
+    }
+    for name in ("x", "y"):
+        noisy[name][np.arange(t.size) % 10 != 0] = np.nan
+    log = Log("without sway", t, {**noisy, "delta": channels["r"]})
+    config = PrepareConfig(grid=GridConfig(step=0.1))
+    exact = prepare_log(truth, "train", ["delta"], config)
+    prepared = prepare_log(log, "train", ["delta"], config)
+    with mock.patch.object(sway, "reconstruct_without_sway", return_value=None):
+        smoothed = prepare_log(log, "train", ["delta"], config)
+    rows = prepared.trainable & smoothed.trainable & exact.trainable
+
+    def compute_errors(estimate: PreparedLog) -> np.ndarray:
+        """Return the standard deviations of the errors of sway velocity and acceleration."""
+        errors = (
+            estimate.smoothed[rows, 4] - exact.smoothed[rows, 4],
+            estimate.nu_dot[rows, 1] - exact.nu_dot[rows, 1],
+        )
+        return np.std(errors, axis=1)
+
+    assert (compute_errors(prepared) < 0.8 * compute_errors(smoothed)).all()
+    # the reconstructed derivative itself is used; measured velocities are differentiated as before
+    completed = complete_motion(log, MotionConfig())
+    assert np.array_equal(prepared.nu_dot[rows, 1], completed["v_dot"][rows])
+    assert np.array_equal(prepared.nu_dot[rows][:, [0, 2]], smoothed.nu_dot[rows][:, [0, 2]])
+
+
+def test_sway_of_contradicting_surge_is_smoothed() -> None:
+    log = measured(noise=(0.02, 0.003), kept=("u", "r"))
+    wrong = log.replace(channels={**log.channels, "u": log["u"][::-1]})
+    assert "v_dot" not in complete_motion(wrong, MotionConfig()).channels
 
 
 def test_smooth_measured_motion_combines_nine_quantities() -> None:

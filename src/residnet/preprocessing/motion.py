@@ -138,12 +138,14 @@ def _complete_states(log: Log, config: MotionConfig, dof: DegreesOfFreedom) -> L
     made_names |= set(POSE_NAMES) if config.has_position_offset else set()
     smoothed_names = [name for name in STATE_NAMES if name in made_names]
     smoothed_motion = _smooth_planar_motion(log_without_held, config)
+    # its derivative is estimated with the velocity
+    made_channels = [*smoothed_names, *(["v_dot"] if "v_dot" in smoothed_motion else [])]
     note = f"{', '.join(smoothed_names)} come from a smoother of the measured motion: "
     note += ", ".join(
         f"{name} {_describe_source(log_without_held, name)}" for name in smoothed_names
     )
     return _with_channels(
-        log, {name: smoothed_motion[name] for name in smoothed_names}, note, smoothed=smoothed_names
+        log, {name: smoothed_motion[name] for name in made_channels}, note, smoothed=made_channels
     )
 
 
@@ -508,7 +510,11 @@ def _is_within_bridged_interval(t: np.ndarray, measurement_times: np.ndarray) ->
 
 
 def _smooth_planar_motion(log: Log, config: MotionConfig) -> dict[str, np.ndarray]:
-    """Smooth the planar motion; NaN in gaps of position or heading."""
+    """Smooth the planar motion; NaN in gaps of position or heading.
+
+    Without sway, but with surge, the motion is reconstructed in body axes with the derivative v_dot
+    of the sway velocity.
+    """
     t = log.t
     psi = unwrap_angle(log["psi"])
     positions = np.stack((log["x"], log["y"]), axis=1)
@@ -523,15 +529,29 @@ def _smooth_planar_motion(log: Log, config: MotionConfig) -> dict[str, np.ndarra
             " least 5 of each are needed to estimate the motion; exclude the log"
         )
     u, v = (log.channels.get(name, np.full(t.size, np.nan)) for name in ("u", "v"))
-    heading, yaw_rate = _smooth_angle(log, psi, "r")
     # delayed positions belong to times between the samples
     fix_times = t[fix_indices] - config.delay
+    is_observed = _is_within_bridged_interval(t, fix_times) & _is_within_bridged_interval(
+        t, t[heading_indices]
+    )
+    antenna = config.antenna or Antenna()
+    if "v" not in log.channels and "u" in log.channels:
+        # scipy is imported only if a log needs it
+        from residnet.preprocessing.compatibility.sway import reconstruct_without_sway
+
+        fix_headings = np.interp(fix_times, t[heading_indices], psi[heading_indices])
+        lever_arm = np.stack(rotate(antenna.x, antenna.y, fix_headings), axis=1)
+        motion = reconstruct_without_sway(
+            t, fix_times, positions[fix_indices] - lever_arm, psi, log["u"], log.channels.get("r")
+        )
+        if motion is not None:
+            return {name: np.where(is_observed, values, np.nan) for name, values in motion.items()}
+    heading, yaw_rate = _smooth_angle(log, psi, "r")
     filter_times = np.union1d(t, fix_times) if config.delay else t
     sample_indices = np.searchsorted(filter_times, t)
     headings_at_clock = np.interp(filter_times, t, heading)
     measurements = np.full((filter_times.size, 2, 2), np.nan)
     measurements[np.searchsorted(filter_times, fix_times), 0] = positions[fix_indices]
-    antenna = config.antenna or Antenna()
     measurements[:, 0] -= np.stack(rotate(antenna.x, antenna.y, headings_at_clock), axis=1)
     noise_ratio = 1.0
     if "u" in log.channels and "v" in log.channels:
@@ -547,9 +567,6 @@ def _smooth_planar_motion(log: Log, config: MotionConfig) -> dict[str, np.ndarra
         )
     track = smooth_track(filter_times, measurements, (1.0, noise_ratio))[sample_indices]
     u, v = rotate(track[:, 1, 0], track[:, 1, 1], -heading)
-    is_observed = _is_within_bridged_interval(t, fix_times) & _is_within_bridged_interval(
-        t, t[heading_indices]
-    )
     channels_and_values = zip(
         STATE_NAMES, (track[:, 0, 0], track[:, 0, 1], heading, u, v, yaw_rate), strict=True
     )

@@ -14,6 +14,7 @@ from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
 from residnet.core.layout import POSE, SURGE_SWAY_YAW, DegreesOfFreedom
 from residnet.core.log import Log
+from residnet.core.names import POSE_NAMES
 from residnet.core.sample_origins import SampleOrigins
 from residnet.core.stretches import number_runs
 from residnet.preprocessing.align import GridConfig, align_to_grid
@@ -197,6 +198,13 @@ def prepare_log(
         )[1]
         smoothed_nu = window_means[:, : dof.n_dynamic]
         rate_inputs = np.where(has_derivative[:, None], window_means[:, dof.n_dynamic :], w)
+    elif "v_dot" in log.meta.get("smoothed", ()):
+        # the reconstruction estimates sway with its derivative: differentiation would add the noise
+        # of a second estimate, and a second filter would attenuate both
+        sway = dof.state_names.index("v") - len(POSE_NAMES)
+        has_derivative &= np.isfinite(log["v_dot"])
+        smoothed_nu[:, sway] = nu[:, sway]
+        nu_dot[:, sway] = np.where(has_derivative, log["v_dot"], np.nan)
     smoothed = np.concatenate(
         (y[:, POSE], np.where(has_derivative[:, None], smoothed_nu, nu)), axis=1
     )

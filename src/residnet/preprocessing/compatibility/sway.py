@@ -1,0 +1,102 @@
+"""Motion of logs whose sensors measure surge, but not sway."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from residnet.core.errors import DataError
+from residnet.core.names import STATE_NAMES
+from residnet.preprocessing.channel_values import nan_std
+from residnet.preprocessing.compatibility.reconstruction import reconstruct
+from residnet.preprocessing.compatibility.sensors import (
+    DERIVATIVE_OF,
+    PSI,
+    V_DOT,
+    R,
+    Sensor,
+    U,
+    V,
+    X,
+    Y,
+    compute_ground_velocity,
+    compute_hermite_weights,
+    interpolate_hermite,
+)
+
+_NODES_PER_FIX = 4.0
+"""Nodes per interval between positions, unless the samples are farther apart."""
+_MAX_NODES = 6000
+"""Largest number of nodes; a longer log is smoothed, since a node takes 0.1 ms."""
+_MAX_SURGE_NOISE = 0.5
+"""Largest noise of surge as a share of its standard deviation: beyond, the sensors contradict each
+other, for example surge through the water in a current.
+"""
+
+
+def reconstruct_without_sway(
+    t: np.ndarray,
+    fix_times: np.ndarray,
+    positions: np.ndarray,
+    heading: np.ndarray,
+    surge: np.ndarray,
+    yaw_rate: np.ndarray | None,
+) -> dict[str, np.ndarray] | None:
+    """Reconstruct the motion with the derivative of sway from all sensors but sway.
+
+    The random jerk acts in body axes, in which sway varies less than the velocities in earth axes,
+    and measured surge and yaw rate determine the remaining motion.
+
+    Args:
+        t: times of the samples [T] in s.
+        fix_times: times of the positions [F] in s.
+        positions: north and east of the vessel's centre [F, 2] in m.
+        heading: unwrapped heading [T] in rad; NaN where it was not measured.
+        surge: surge velocity over ground [T] in m/s.
+        yaw_rate: yaw rate [T] in rad/s; None if it was not measured.
+
+    Returns:
+        x, y, psi, u, v, r and v_dot [T] by name; None if the log is too long, or the sensors have
+        too few values or contradict each other.
+    """
+    sample_interval = float(np.median(np.diff(t)))
+    fix_interval = float(np.median(np.diff(fix_times)))
+    stride = max(int(fix_interval / _NODES_PER_FIX / sample_interval + 1e-6), 1)
+    step = stride * sample_interval
+    if (t[-1] - t[0]) / step > _MAX_NODES:
+        return None
+    sensors = [
+        Sensor("position", fix_times, positions),
+        Sensor("heading", t, heading),
+        Sensor("surge", t, surge),
+    ]
+    if yaw_rate is not None:
+        sensors.append(Sensor("yaw_rate", t, yaw_rate))
+    try:
+        motion = reconstruct(sensors, {}, step)
+    except (DataError, np.linalg.LinAlgError):
+        return None
+    surge_fit = motion.sensors.get("surge")
+    if surge_fit is None or surge_fit.noise_std > _MAX_SURGE_NOISE * nan_std(surge):
+        return None
+    # values at the samples by cubic polynomials between nodes
+    index = np.clip((t - motion.t[0]) / step, 0.0, len(motion.t) - 1.0)
+    before = np.minimum(index.astype(int), len(motion.t) - 2)
+    fraction = index - before
+    states = motion.states.T
+    rates = {state: states[rate] for state, rate in DERIVATIVE_OF.items()}
+    rates[X], rates[Y] = compute_ground_velocity(dict(enumerate(states)), 0.0, 0.0)
+    weights = compute_hermite_weights(step, fraction)
+    sampled = {
+        name: interpolate_hermite(
+            states[state][before],
+            rates[state][before],
+            states[state][before + 1],
+            rates[state][before + 1],
+            weights,
+        )
+        for name, state in zip(STATE_NAMES, (X, Y, PSI, U, V, R), strict=True)
+    }
+    sway_acceleration = states[V_DOT]
+    sampled["v_dot"] = (1.0 - fraction) * sway_acceleration[before]
+    sampled["v_dot"] += fraction * sway_acceleration[before + 1]
+    return sampled
