@@ -141,6 +141,25 @@ def test_sway_of_contradicting_surge_is_smoothed() -> None:
     assert "v_dot" not in complete_motion(wrong, MotionConfig()).channels
 
 
+def test_sway_beside_a_speed_log_is_smoothed() -> None:
+    # surge through the water, in a current of 0.3 m/s to the north
+    motion = simulate_motion(BOATS["dinghy"], np.random.default_rng(3))
+    t = np.arange(1.0, 119.0, 0.1)
+    noise = np.random.default_rng(4).standard_normal((4, t.size))
+    stds = {"x": 0.3, "y": 0.3, "psi": 0.005, "u": 0.03}
+    channels = {
+        name: motion.sample(name, t) + std * row
+        for (name, std), row in zip(stds.items(), noise, strict=True)
+    }
+    over_ground = Log("over ground", t, channels)
+    through_water = {**channels, "u": channels["u"] - 0.3 * np.cos(channels["psi"])}
+    assert "v_dot" in complete_motion(over_ground, MotionConfig()).channels
+    assert (
+        "v_dot"
+        not in complete_motion(over_ground.replace(channels=through_water), MotionConfig()).channels
+    )
+
+
 def test_smooth_measured_motion_combines_nine_quantities() -> None:
     rates = [np.gradient(TRUTH[name], TRUTH.t) for name in "uvr"]
     truth = np.stack([*(TRUTH[name] for name in STATE_NAMES), *rates], axis=1)

@@ -182,14 +182,7 @@ def draft_tables(
         column_by_channel,
         project_on_horizontal(simple_columns, tables, logs, column_by_channel),
         draft_notes,
-        [
-            *main_preview.column_names,
-            *(
-                str(text)
-                for cells in main_preview.text_columns.values()
-                for text in cells.unique()[:20]
-            ),
-        ],
+        _collect_texts(main_preview),
         is_up_positive=is_vertical_axis_up(
             simple_columns,
             column_by_channel,
@@ -634,6 +627,12 @@ def _select_one_vessel(
                     for channel, suffix in match_channels([*prefix_columns], draft_notes).items()
                 }
     return match_channels(columns, draft_notes, has_heading=has_heading)
+
+
+def _collect_texts(preview: TablePreview) -> list[str]:
+    """Return the column names of a table and the first different texts of its cells."""
+    cells = [str(text) for texts in preview.text_columns.values() for text in texts.unique()[:20]]
+    return [*preview.column_names, *cells]
 
 
 _DRIFT_ANGLE = re.compile(r"drift\W*(angle|winkel)|\bbeta\b", re.IGNORECASE)
@@ -1243,13 +1242,14 @@ def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]
         [other for other in numeric_sheets if tables[other].columns.equals(tables[first].columns)]
         for first in numeric_sheets
     )
-    logs = max(groups, key=len, default=[])
-    if len(logs) > 1:
+    similar_sheets = max(groups, key=len, default=[])
+    if len(similar_sheets) > 1:
         raise DataError(
-            f"{path}: sheets {truncate(', '.join(logs), 60)} have the same columns, one log per"
-            " file was expected; write each sheet to a file, in Python"
+            f"{path}: sheets {truncate(', '.join(similar_sheets), 60)} have the same columns, one"
+            " log per file was expected; write each sheet to a file, in Python"
             " [sheet.to_csv(f'{name}.csv', index=False, header=False) for name, sheet in"
-            f" pandas.read_excel({path.name!r}, sheet_name={logs!r}, header=None).items()]"
+            f" pandas.read_excel({path.name!r}, sheet_name={similar_sheets!r},"
+            " header=None).items()]"
         )
     table.attrs["other_sheets"] = tuple(numeric_sheets[1:])
     return table, {"kind": "excel", **({"sheet": name} if name != names[0] else {})}

@@ -26,19 +26,18 @@ VERTICAL_CHANNELS = ("z", "w", "q", "p")
 _MIN_TILT = 0.1
 """Angle in rad between the vertical and the vertical axis of a vessel, exceeded in 5 % of the
 samples, above which velocities along its axes differ from horizontal ones (by at least 0.5 %)."""
+_MAX_FLAT_SHARE = 0.02
+"""Largest ratio of standard deviations of a vertical and a horizontal coordinate."""
+_N_PATH_SPANS = 100
+"""Number of spans of a path whose directions are counted."""
+_MIN_SECTOR_SHARE = 0.05
+"""Smallest share of the path in a sector of directions; less is noise of the positions."""
 
 
 def _match_vertical_columns(columns: Sequence[str]) -> dict[str, str]:
     """Return channel -> column of the first column of each vertical channel."""
     matches = {match_depth_channel(parse_name(column)): column for column in reversed(columns)}
     return {name: matches[name] for name in VERTICAL_CHANNELS if name in matches}
-
-
-_MAX_FLAT_SHARE = 0.02
-"""Largest ratio of standard deviations of a vertical and a horizontal coordinate."""
-_N_PATH_SPANS = 100
-"""Number of spans of a path whose directions are counted."""
-_MIN_SECTOR_SHARE = 0.05
 
 
 def refuse_vertical_y(

@@ -7,8 +7,10 @@ import numpy as np
 from residnet.core.errors import DataError
 from residnet.core.names import STATE_NAMES
 from residnet.preprocessing.channel_values import nan_std
-from residnet.preprocessing.compatibility.reconstruction import reconstruct
+from residnet.preprocessing.compatibility.hypotheses import MIN_MARGIN, Hypothesis, compare
+from residnet.preprocessing.compatibility.reconstruction import Prior
 from residnet.preprocessing.compatibility.sensors import (
+    CURRENT_NAMES,
     DERIVATIVE_OF,
     PSI,
     V_DOT,
@@ -29,8 +31,10 @@ _MAX_NODES = 6000
 """Largest number of nodes; a longer log is smoothed, since a node takes 0.1 ms."""
 _MAX_SURGE_NOISE = 0.5
 """Largest noise of surge as a share of its standard deviation: beyond, the sensors contradict each
-other, for example surge through the water in a current.
+other.
 """
+_SURGE_ERRORS = {"surge scale": Prior(0.0, 0.3), **dict.fromkeys(CURRENT_NAMES, Prior(0.0, 1.0))}
+"""Errors of a speed log, which measures through the water: its scale [-] and the current [m/s]."""
 
 
 def reconstruct_without_sway(
@@ -44,7 +48,9 @@ def reconstruct_without_sway(
     """Reconstruct the motion with the derivative of sway from all sensors but sway.
 
     The random jerk acts in body axes, in which sway varies less than the velocities in earth axes,
-    and measured surge and yaw rate determine the remaining motion.
+    and measured surge and yaw rate determine the remaining motion. An error of surge would become
+    one of sway. The log is therefore not reconstructed if its BIC is smaller, by `MIN_MARGIN` or
+    more, with a scale error and a current, as of a speed log that measures through the water.
 
     Args:
         t: times of the samples [T] in s.
@@ -56,7 +62,7 @@ def reconstruct_without_sway(
 
     Returns:
         x, y, psi, u, v, r and v_dot [T] by name; None if the log is too long, or the sensors have
-        too few values or contradict each other.
+        too few values or contradict each other, or surge has an error.
     """
     sample_interval = float(np.median(np.diff(t)))
     fix_interval = float(np.median(np.diff(fix_times)))
@@ -64,17 +70,22 @@ def reconstruct_without_sway(
     step = stride * sample_interval
     if (t[-1] - t[0]) / step > _MAX_NODES:
         return None
-    sensors = [
-        Sensor("position", fix_times, positions),
-        Sensor("heading", t, heading),
-        Sensor("surge", t, surge),
-    ]
+    other_sensors = [Sensor("position", fix_times, positions), Sensor("heading", t, heading)]
     if yaw_rate is not None:
-        sensors.append(Sensor("yaw_rate", t, yaw_rate))
+        other_sensors.append(Sensor("yaw_rate", t, yaw_rate))
+    speed_log = Sensor("surge", t, surge, is_through_water=True, scale="surge scale")
+    hypotheses = {
+        "surge over ground": Hypothesis([*other_sensors, Sensor("surge", t, surge)]),
+        "surge of a speed log": Hypothesis([*other_sensors, speed_log], _SURGE_ERRORS),
+    }
     try:
-        motion = reconstruct(sensors, {}, step)
+        ranking = compare(hypotheses, step)
     except (DataError, np.linalg.LinAlgError):
         return None
+    without_error = next(ranked for ranked in ranking if ranked.name == "surge over ground")
+    if without_error.margin >= MIN_MARGIN:
+        return None
+    motion = without_error.reconstruction
     surge_fit = motion.sensors.get("surge")
     if surge_fit is None or surge_fit.noise_std > _MAX_SURGE_NOISE * nan_std(surge):
         return None
