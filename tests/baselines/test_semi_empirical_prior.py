@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
@@ -13,7 +15,7 @@ from residnet.physics.similarity import Particulars, estimate_lateral_dynamics
 
 NAMES = ("u", "v", "r", "delta")
 SHIP = Particulars(length=7.0, speed=1.18, beam=1.27, draught=0.46, mass=3270.0)
-TERMS = {
+TERMS: dict[Literal["u", "v", "r", "w", "p", "q"], tuple[str, ...]] = {
     "u": ("1", "u|u|", "v r"),
     "v": ("v", "r", "u v", "u r", "u|u| delta"),
     "r": ("v", "r", "u v", "u r", "u|u| delta"),

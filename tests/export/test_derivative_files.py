@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, cast
 from xml.etree import ElementTree
 
 import numpy as np
@@ -31,7 +31,7 @@ SHIP = Particulars(
     length=7.0, speed=1.2, beam=1.27, draught=0.46, mass=3270.0, centre_of_gravity=0.24
 )
 # third order in all variables, so that the Taylor series is exact
-TERMS = {
+TERMS: dict[Literal["u", "v", "r", "w", "p", "q"], tuple[str, ...]] = {
     "u": ("1", "u", "u^2", "v r", "r^2", "n", "n^2", "delta^2"),
     "v": ("1", "v", "r", "u v", "v^3", "v^2 r", "delta", "u^2 delta", "v|v|", "v|r|"),
     "r": ("1", "v", "r", "u r", "v^3", "v r^2", "delta", "u^2 delta", "r|r|", "r|v|"),
@@ -52,7 +52,7 @@ def make_model() -> tuple[ModelSpec, HybridDynamics]:
     )
     model = spec.build()
     theta: Any = model.baseline.theta
-    terms = list(model.baseline.library.terms)
+    terms = list(cast(Any, model.baseline).library.terms)
     generator = np.random.default_rng(4)
     table = generator.normal(size=(3, len(terms))) * np.array([[0.01], [0.05], [0.02]])
     # resistance, thrust and a rudder that turns to starboard

@@ -313,7 +313,7 @@ def test_names_of_a_sheet_in_groups_above_units(tmp_path: Path) -> None:
         ["Time", "Position", None, "Heading", "Velocity", None],
         [None, "X", "Y", None, "u", "v"],
         ["s", "m", "m", "deg", "m/s", "m/s"],
-        *([0.1 * k, 1.0 * k, 2.0 * k, 3.0, 1.0, 0.5] for k in range(20)),
+        *(list[object]((0.1 * k, 1.0 * k, 2.0 * k, 3.0, 1.0, 0.5)) for k in range(20)),
     ]
     pd.DataFrame(rows).to_excel(path := tmp_path / "log.xlsx", index=False, header=False)
     sheet = read_excel_sheet(path, None)

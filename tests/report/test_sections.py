@@ -49,7 +49,7 @@ def spread(mean: float) -> dict[str, float]:
 
 def made_autopilot(run: Path) -> Path:
     """Two controllers of one vessel; the second does not settle in four flights."""
-    sea = {"significant_height": 1.5, "peak_period": 8.0, "direction": 45 * DEG}
+    sea: dict[str, Any] = {"significant_height": 1.5, "peak_period": 8.0, "direction": 45 * DEG}
     sea |= {"hull": {"length": 20.0, "breadth": 5.0, "draught": 1.5}}
     test: dict[str, Any] = {
         "heading": 30 * DEG,
