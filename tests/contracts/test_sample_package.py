@@ -104,8 +104,12 @@ def test_its_head_runs_by_name_from_yaml(site: Path, tmp_path: Path) -> None:
     rows = json.loads((run / "metrics.json").read_text())["rows"]
     assert {row["model"] for row in rows} >= {"constant_velocity", "baseline", "slow"}
     assert (run / "report.html").is_file()
+    # the tiny fit is rated "do not use", so that its export has to be demanded
+    assert not (run / "exports" / "slow.pt").exists()
+    done = python(site, "-m", "residnet.cli", "export", run, "--model", "slow", "--anyway")
+    assert done.returncode == 0, done.stderr
     assert (run / "exports" / "slow.pt").is_file()
-    words = ("export", run, "--model", "slow", "--format", "numbers")
+    words = ("export", run, "--model", "slow", "--format", "numbers", "--anyway")
     done = python(site, "-m", "residnet.cli", *words)
     assert done.returncode == 0, done.stderr
     assert "head.readout.weight,0," in (run / "exports" / "slow.csv").read_text()
