@@ -189,8 +189,11 @@ def test_forces_by_their_units_and_speed_by_its_letter() -> None:
     acting = match_channels(["acting_tau_x [N]", "tau_x [N]", "psi"], DraftNotes())
     assert acting["tau_x"] == "tau_x [N]"
     assert acting["acting_tau_x"] == "acting_tau_x [N]"
-    speed = match_channels(["X", "Y", "Heading", "V [m/s]", "Drift angle", "Rudder"], DraftNotes())
-    assert "V [m/s]" not in speed.values()
+    columns = ["X", "Y", "Heading", "V [m/s]", "Drift angle", "Rudder"]
+    assert "V [m/s]" not in match_channels(columns, DraftNotes()).values()
+    speed = match_channels(columns, DraftNotes(), with_drift_angle=True)
+    assert speed["speed"] == "V [m/s]"
+    assert speed["drift_angle"] == "Drift angle"
     notes = DraftNotes()
     read = match_channels(["Time", "V [m/s]", "Drift angle [deg]", "Yaw rate"], notes)
     assert read["u"] == "V [m/s]"

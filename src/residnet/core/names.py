@@ -123,7 +123,12 @@ CHANNEL_UNITS: dict[str, str] = {
     "current_east": "m/s",
 }
 _SI_OF_PREFIX = {
-    **{r"n(_|$)": "1/s", "delta|azimuth": "rad", "tau_x|tau_y|thrust": "N", "tau_n": "N m"},
+    **{
+        r"n(_|$)": "1/s",
+        "delta|azimuth|drift_angle": "rad",
+        "tau_x|tau_y|thrust": "N",
+        "tau_n": "N m",
+    },
     "throttle": "-",
 }
 """Pattern of the start of a non-standard channel name -> SI unit."""

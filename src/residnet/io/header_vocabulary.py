@@ -58,6 +58,9 @@ MANOEUVRE_PATTERNS: dict[str, re.Pattern[str]] = {
     for kind, text in _VOCABULARY["manoeuvre_names"].items()
 }
 """Kind of manoeuvre -> pattern of the normalised names of its files."""
+_DRIFT_ANGLE_PATTERN = re.compile(
+    re.sub(r"\|\s+", "|", _VOCABULARY["drift_angle_names"].strip()), re.IGNORECASE
+)
 REVOLUTION_PATTERN = re.compile("|".join(_VOCABULARY["revolution_patterns"].split()), re.IGNORECASE)
 """Words for revolutions."""
 
@@ -540,6 +543,12 @@ def match_depth_channel(parsed_name: ParsedName) -> str | None:
         if parsed_name.has_none(*excluded_concepts)
         else None
     )
+
+
+def is_drift_angle(column: str) -> bool:
+    """Return whether a column has the name of the drift angle of the hull, and no other unit."""
+    is_named = _DRIFT_ANGLE_PATTERN.search(normalize_name(column)) is not None
+    return is_named and find_mismatched_unit(column, "rad") is None
 
 
 def match_axis_velocity(parsed_name: ParsedName) -> str | None:

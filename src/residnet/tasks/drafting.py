@@ -34,7 +34,12 @@ from residnet.io.drafting.questions import (
     dump_commented_yaml,
 )
 from residnet.io.drafting.reading import INPUTS_KEY, find_log_files, read_drafted
-from residnet.io.readers.quantities import COSINE_SUFFIX, QUATERNION, SINE_SUFFIX
+from residnet.io.readers.quantities import (
+    COSINE_SUFFIX,
+    QUATERNION,
+    SINE_SUFFIX,
+    SPEED_CHANNELS,
+)
 from residnet.io.split import SPLITS, extract_segment, remove_copies, split_logs, splits_from_names
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.quality import inspect_log
@@ -523,6 +528,7 @@ class _DraftLogs:
             ]
             state_channels += [] if "x" in channels else ["latitude", "longitude"]
             state_channels += [] if "psi" in channels else QUATERNION
+            state_channels += [] if {"u", "v"} & channels.keys() else SPEED_CHANNELS
             self.reader["channels"] = {
                 renamed_inputs.get(name, name): entry
                 for name, entry in channels.items()

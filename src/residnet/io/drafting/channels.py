@@ -24,11 +24,13 @@ from residnet.io.drafting.velocities import (
     HeadingOffset,
     MeaningChoice,
     MeasuredVelocities,
+    choose_drift_angle,
     choose_meaning,
     estimate_drift_free_offset,
     make_measured_velocities,
     measure_contradiction,
     require_compatible,
+    resolve_drift_angle,
 )
 from residnet.io.header_vocabulary import (
     Scaling,
@@ -45,6 +47,7 @@ from residnet.io.readers.quantities import (
     PLANAR_QUATERNION,
     QUATERNION,
     SINE_SUFFIX,
+    SPEED_CHANNELS,
     complete_quaternion,
     normalize_quaternion,
     project_fixes,
@@ -613,9 +616,13 @@ def draft_channel_map(
         channel_columns["psi"] = "heading of the quaternion [rad]"
     logs = [_add_derived_angles(raw, derived_angles) for raw in logs]
     channel_columns, logs, degrees_per_count = _project_fixes(channel_columns, logs, draft_notes)
+    channel_columns, logs, drift = _derive_drift_velocities(
+        channel_columns, logs, draft_notes, degrees_per_count, candidate_frames
+    )
     entries = ChannelMapper(
         channel_columns, logs, draft_notes, degrees_per_count, candidate_frames
     ).draft_entries()
+    entries = _restore_drift_angle(entries, drift, draft_notes)
     if degrees_per_count:
         entries = {_FIX_OF_AXIS.get(name, name): entry for name, entry in entries.items()}
     # convert the entries of these angles to entries of their columns
@@ -650,6 +657,210 @@ def draft_channel_map(
         )
         draft_notes.add_guess((*CHANNELS_KEY, "qw"), text)
     return entries
+
+
+class _DriftAngle(NamedTuple):
+    """Columns of speed and drift angle, and their interpretation.
+
+    Attributes:
+        speed_column: column of the speed.
+        angle_column: column of the drift angle.
+        unit: unit of the drift angle.
+        sign: 1 if the drift angle is positive with the flow from port, -1 otherwise.
+        is_speed: whether the first column is the speed; otherwise it is the surge velocity.
+    """
+
+    speed_column: str
+    angle_column: str
+    unit: str
+    sign: int
+    is_speed: bool
+
+
+def _derive_drift_velocities(
+    names: Mapping[str, str],
+    logs: Sequence[RawTable],
+    draft_notes: DraftNotes,
+    degrees_per_count: float,
+    candidate_frames: Sequence[PoseFrame],
+) -> tuple[dict[str, str], list[RawTable], _DriftAngle | None]:
+    """Replace speed and drift angle by surge and sway velocity, in the unit of the speed.
+
+    Args:
+        names: channel -> column, perhaps with `speed` and `drift_angle`.
+        logs: tables.
+        draft_notes: receives guesses, notes and the question for the meaning of the speed.
+        degrees_per_count: unit of the columns x and y, see `ChannelMapper`.
+        candidate_frames: possible frames, see `ChannelMapper`.
+
+    Returns:
+        Channel -> column with `u` and `v`, tables with these columns, and the drift angle; None if
+        there is none, or it is not used.
+    """
+    if not names.keys() >= {*SPEED_CHANNELS}:
+        return dict(names), list(logs), None
+    other_names = {name: column for name, column in names.items() if name not in SPEED_CHANNELS}
+    measured: list[MeasuredVelocities] = []
+    if {"x", "y", "psi"} <= other_names.keys():
+        reference = ChannelMapper(
+            other_names, logs, DraftNotes(), degrees_per_count, candidate_frames
+        )
+        reference.choose_frame()
+        measured = reference.measure_velocities((*SPEED_CHANNELS,), logs)
+    tables = [table for table in logs if table.columns.keys() >= {*SPEED_CHANNELS}]
+    drift = _interpret_drift_angle(names, tables, measured, draft_notes)
+    if drift is None:
+        return other_names, list(logs), None
+    derived = []
+    for table in logs:
+        columns = dict(table.columns)
+        if columns.keys() >= {*SPEED_CHANNELS}:
+            speed = columns.pop("speed")
+            angle = drift.sign * columns.pop("drift_angle") * to_si(drift.unit, "rad")
+            u, v = resolve_drift_angle(speed, angle)
+            columns |= {"u": u, "v": v} if drift.is_speed else {"u": speed}
+        derived.append(RawTable(table.t, columns))
+    if not drift.is_speed:
+        text = f"'{drift.angle_column}' is not read: '{drift.speed_column}' is the surge velocity"
+        draft_notes.add_note(CHANNELS_KEY, text)
+        return {**other_names, "u": drift.speed_column}, derived, None
+    return {**other_names, **dict.fromkeys(("u", "v"), drift.speed_column)}, derived, drift
+
+
+def _interpret_drift_angle(
+    names: Mapping[str, str],
+    tables: Sequence[RawTable],
+    measured: Sequence[MeasuredVelocities],
+    draft_notes: DraftNotes,
+) -> _DriftAngle | None:
+    """Choose unit and direction of a drift angle, and the meaning of the speed next to it.
+
+    Position and heading determine them. Without these the direction is that in which the stern
+    swings out in turns.
+
+    Args:
+        names: channel -> column, with `speed` and `drift_angle`.
+        tables: tables with both columns.
+        measured: motion of the tables with position and heading, and both columns.
+        draft_notes: receives guesses, notes and the question for the meaning of the speed.
+
+    Returns:
+        The interpretation; None if the columns contradict position and heading.
+    """
+    speed_column = names["speed"]
+    angle_column = names["drift_angle"]
+    key = (*CHANNELS_KEY, "drift_angle")
+    header_unit = parse_header_unit(angle_column, "rad")
+    # the symbol u is that of the surge velocity, U and V are those of the speed
+    can_be_surge = speed_column.strip().startswith("u")
+    is_speed = True
+    if measured:
+        units = [header_unit] if header_unit else ["deg", "rad"]
+        choice = choose_drift_angle(measured, units, can_be_surge=can_be_surge)
+        if not choice.is_consistent:
+            text = (
+                f"'{speed_column}' and '{angle_column}' are left out: as speed and drift angle they"
+                f" differ from position and heading by {100.0 * choice.unexplained_share:.0f} %"
+            )
+            draft_notes.add_note(CHANNELS_KEY, text)
+            return None
+        unit = choice.unit
+        sign = choice.sign
+        is_speed = choice.is_speed
+        unit_reason = f"the header has no unit; position and heading are most consistent in {unit}"
+        can_be_surge &= choice.is_ambiguous
+    else:
+        angles = np.concatenate([table.columns["drift_angle"] for table in tables])
+        unit, unit_reason = guess_unit_from_size("drift_angle", angles)
+        unit = header_unit or unit
+        sign = _find_drift_direction(tables, angle_column, draft_notes)
+    if header_unit is None:
+        draft_notes.add_guess(key, unit_reason)
+    if can_be_surge:
+        options = ("speed", "surge velocity")
+        reason = f"'{speed_column}' next to the drift angle '{angle_column}' is assumed the speed"
+        question = f"meaning of '{speed_column}' next to the drift angle '{angle_column}'"
+        answer = draft_notes.ask_question(
+            (*CHANNELS_KEY, "speed"), question, options[0], reason, options
+        )
+        is_speed = answer == options[0]
+    return _DriftAngle(speed_column, angle_column, unit, sign, is_speed)
+
+
+def _find_drift_direction(
+    tables: Sequence[RawTable], angle_column: str, draft_notes: DraftNotes
+) -> int:
+    """Return the direction of a drift angle without position: 1 if positive by SNAME, else -1.
+
+    In a turn to starboard the stern swings out to port, so that the flow comes from port forward of
+    the pivot point and the drift angle of SNAME has the sign of the yaw rate.
+
+    Args:
+        tables: tables with the columns `drift_angle` and perhaps `r`.
+        angle_column: column of the drift angle, for the guess.
+        draft_notes: receives the guess.
+    """
+    key = (*CHANNELS_KEY, "drift_angle")
+    product = angle_energy = rate_energy = 0.0
+    for table in tables:
+        if "r" not in table.columns:
+            continue
+        is_finite = np.isfinite(table.columns["drift_angle"]) & np.isfinite(table.columns["r"])
+        angle = table.columns["drift_angle"][is_finite]
+        rate = table.columns["r"][is_finite]
+        product += float(angle @ rate)
+        angle_energy += float(angle @ angle)
+        rate_energy += float(rate @ rate)
+    energy = np.sqrt(angle_energy * rate_energy)
+    correlation = product / energy if energy > 0.0 else 0.0
+    if abs(correlation) < _MIN_CORRELATION:
+        text = f"'{angle_column}' is assumed positive with the flow from port: v = -U sin(beta)"
+        draft_notes.add_guess(key, text)
+        return 1
+    direction = "port" if correlation > 0.0 else "starboard"
+    text = (
+        f"'{angle_column}' is positive with the flow from {direction}: so the stern swings out in"
+        f" turns (correlation with the yaw rate {correlation:.2f})"
+    )
+    draft_notes.add_guess(key, text)
+    return 1 if correlation > 0.0 else -1
+
+
+def _restore_drift_angle(
+    entries: dict[str, dict[str, Any]], drift: _DriftAngle | None, draft_notes: DraftNotes
+) -> dict[str, dict[str, Any]]:
+    """Replace the entries of derived velocities by those of speed and drift angle.
+
+    Args:
+        entries: channel -> entry, with u and v of the drift angle unless these were left out.
+        drift: columns and interpretation of the drift angle; None changes nothing.
+        draft_notes: notes on u and v become notes on speed and drift angle.
+    """
+    if drift is None:
+        return entries
+    others = {name: entry for name, entry in entries.items() if name not in ("u", "v")}
+    if len(others) > len(entries) - 2 or "frame" in entries["u"]:
+        text = (
+            f"'{drift.speed_column}' and '{drift.angle_column}' are left out: u and v follow from"
+            " position and heading"
+        )
+        draft_notes.add_note(CHANNELS_KEY, text)
+        return others
+    speed_sign = entries["u"].get("sign", 1)
+    angle_sign = drift.sign * speed_sign * entries["v"].get("sign", 1)
+    for name, channel in (("u", "speed"), ("v", "drift_angle")):
+        draft_notes.move_key((*CHANNELS_KEY, name), (*CHANNELS_KEY, channel))
+    text = (
+        f"u = U cos(beta) and v = -U sin(beta) follow from the speed U '{drift.speed_column}' and"
+        f" the drift angle beta '{drift.angle_column}'"
+    )
+    draft_notes.add_note((*CHANNELS_KEY, "speed"), text)
+    signs = [{"sign": -1} if sign < 0 else {} for sign in (speed_sign, angle_sign)]
+    velocities = {
+        "speed": {"column": drift.speed_column, "unit": entries["u"]["unit"], **signs[0]},
+        "drift_angle": {"column": drift.angle_column, "unit": drift.unit, **signs[1]},
+    }
+    return {**others, **velocities}
 
 
 def _add_derived_angles(table: RawTable, derived_angles: Mapping[str, tuple[str, ...]]) -> RawTable:
@@ -769,7 +980,7 @@ class ChannelMapper:
         """Return channel -> entry."""
         if {"x", "y", "psi"} <= set(self._names):
             self._choose_velocity_meaning()
-            self._choose_heading_frame()
+            self.choose_frame()
             for name in [
                 velocity_name for velocity_name in ("u", "v", "r") if velocity_name in self._names
             ]:
@@ -825,7 +1036,7 @@ class ChannelMapper:
         parts = [raw.columns[name] for raw in self._logs if name in raw.columns]
         return np.concatenate(parts) if parts else np.zeros(0)
 
-    def _choose_heading_frame(self) -> None:
+    def choose_frame(self) -> None:
         """Choose unit and frame of the heading that are most consistent with the motion."""
         score = self._search_heading_frame()
         x, y = parse_name(self._names["x"]), parse_name(self._names["y"])
@@ -947,7 +1158,7 @@ class ChannelMapper:
         if len(names) < 2 or not is_consistent:
             other_names = {n: column for n, column in self._names.items() if n not in names}
             reference = self._try_heading_frame(other_names)
-            if logs := reference._measure_velocities(names, self._logs):
+            if logs := reference.measure_velocities(names, self._logs):
                 choice = choose_meaning(logs)
         meaning = choice.meaning
         if choice.is_ambiguous:
@@ -987,10 +1198,10 @@ class ChannelMapper:
         mapper = ChannelMapper(
             names, self._logs, DraftNotes(), self._degrees_per_count, self._candidate_frames
         )
-        mapper._choose_heading_frame()
+        mapper.choose_frame()
         return mapper
 
-    def _measure_velocities(
+    def measure_velocities(
         self, names: Sequence[str], logs: Sequence[RawTable]
     ) -> list[MeasuredVelocities]:
         """Return the motion of the logs with columns of velocities, on uniform grids.
@@ -1037,7 +1248,7 @@ class ChannelMapper:
         """Stop where integrated velocities contradict the positions."""
         if not {"u", "v"} <= self._names.keys():
             self._heading_offset = estimate_drift_free_offset(
-                self._measure_velocities((), self._logs)
+                self.measure_velocities((), self._logs)
             )
             return
         tables = []
@@ -1050,7 +1261,7 @@ class ChannelMapper:
                 if name in columns:
                     columns[name] = sign * factor * columns[name]
             tables.append(RawTable(table.t, columns))
-        logs = self._measure_velocities(("u", "v"), tables)
+        logs = self.measure_velocities(("u", "v"), tables)
         contradiction = measure_contradiction(logs)
         if contradiction is not None:
             require_compatible(contradiction, [self._names[name] for name in ("u", "v")])

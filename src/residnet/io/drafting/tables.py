@@ -47,6 +47,7 @@ from residnet.io.header_vocabulary import (
     VESSEL_COLUMN_NAMES,
     ParsedName,
     find_mismatched_unit,
+    is_drift_angle,
     match_input_channel,
     match_state_channel,
     normalize_name,
@@ -155,6 +156,7 @@ def draft_tables(
         main_preview.numeric_columns,
         draft_notes,
         has_heading=has_heading or has_sin_cos_heading or bool(attitudes),
+        with_drift_angle=True,
     )
     if select:
         _drop_ais_turn_rate(column_by_channel, main_preview, draft_notes)
@@ -576,6 +578,7 @@ def _select_one_vessel(
     draft_notes: DraftNotes,
     *,
     has_heading: bool,
+    with_drift_angle: bool = False,
 ) -> dict[str, str]:
     """Match columns to channels, using one vessel of tables with several.
 
@@ -588,6 +591,7 @@ def _select_one_vessel(
         numeric_columns: column -> values.
         draft_notes: receives guesses and notes.
         has_heading: whether another source may have the heading.
+        with_drift_angle: see `match_channels`.
 
     Returns:
         Channel -> column.
@@ -622,11 +626,13 @@ def _select_one_vessel(
                     f" vessels or sensors {prefix} is read; write the others to separate tables"
                 )
                 draft_notes.add_guess(CHANNELS_KEY, text)
-                return {
-                    channel: prefix_columns[suffix]
-                    for channel, suffix in match_channels([*prefix_columns], draft_notes).items()
-                }
-    return match_channels(columns, draft_notes, has_heading=has_heading)
+                matched = match_channels(
+                    [*prefix_columns], draft_notes, with_drift_angle=with_drift_angle
+                )
+                return {channel: prefix_columns[suffix] for channel, suffix in matched.items()}
+    return match_channels(
+        columns, draft_notes, has_heading=has_heading, with_drift_angle=with_drift_angle
+    )
 
 
 def _collect_texts(preview: TablePreview) -> list[str]:
@@ -635,12 +641,16 @@ def _collect_texts(preview: TablePreview) -> list[str]:
     return [*preview.column_names, *cells]
 
 
-_DRIFT_ANGLE = re.compile(r"drift\W*(angle|winkel)|\bbeta\b", re.IGNORECASE)
-"""Names of columns with the drift angle of the hull."""
+_SPEED_SYMBOL = re.compile(r"[uv]( ?(s|m|c|0|ship|model|tot|total|abs|res|cg|ms))?")
+"""Normalised name of a speed next to a drift angle: a symbol, perhaps with an index."""
 
 
 def match_channels(
-    columns: Sequence[str], draft_notes: DraftNotes, *, has_heading: bool = True
+    columns: Sequence[str],
+    draft_notes: DraftNotes,
+    *,
+    has_heading: bool = True,
+    with_drift_angle: bool = False,
 ) -> dict[str, str]:
     """Match columns to channels by their names.
 
@@ -650,6 +660,8 @@ def match_channels(
         columns: names of the columns.
         draft_notes: receives guesses and notes.
         has_heading: whether another source may have the heading.
+        with_drift_angle: whether a speed and the drift angle next to it may be the channels
+            `speed` and `drift_angle`, which readers of tables resolve to u and v.
 
     Returns:
         Channel -> column.
@@ -664,6 +676,7 @@ def match_channels(
             [name for name in columns if name not in north_east.values()],
             other_notes,
             has_heading=has_heading,
+            with_drift_angle=with_drift_angle,
         )
         if not {"x", "y", "latitude", "longitude"} & set(other_channels):
             # next to a column E, N is no shaft speed
@@ -671,12 +684,13 @@ def match_channels(
             text = f"'{north_east['x']}' and '{north_east['y']}' are assumed north and east"
             draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
             return {**north_east, **other_channels}
-    parsed_names = {column: parse_name(column) for column in columns}
-    names, duplicates, speeds = _assign_columns(columns, parsed_names, draft_notes)
+    drift_angle = next((column for column in columns if is_drift_angle(column)), None)
+    parsed_names = {column: parse_name(column) for column in columns if column != drift_angle}
+    names, duplicates, speeds = _assign_columns([*parsed_names], parsed_names, draft_notes)
     _resolve_duplicates(names, duplicates, columns, draft_notes)
     has_position = bool({"x", "y", "latitude", "longitude"} & names.keys())
     theta = next(
-        (column for column in columns if "theta" in parsed_names[column].text.split()), None
+        (column for column in parsed_names if "theta" in parsed_names[column].text.split()), None
     )
     if has_position and theta is not None and not {"psi", "phi"} & names.keys():
         names["psi"] = theta
@@ -689,20 +703,66 @@ def match_channels(
         or "psi" in names
         or any("course" in parsed.concepts for parsed in parsed_names.values())
     )
-    if "u" not in names and speeds and ("v" in names or not (has_position and has_heading)):
+    if drift_angle is not None and with_drift_angle:
+        names |= _pair_speed_with_drift_angle(drift_angle, names, speeds, parsed_names, draft_notes)
+    if "speed" in names:
+        # u and v follow from speed and drift angle
+        for name in {"u", "v"} & names.keys():
+            del names[name]
+    elif "u" not in names and speeds and ("v" in names or not (has_position and has_heading)):
         names["u"] = speeds[0]
         text = f"'{speeds[0]}' is assumed the surge velocity, not the speed"
-        drift = next((column for column in columns if _DRIFT_ANGLE.search(column)), None)
-        if drift is not None and "v" not in names:
-            # readers have no channel of the drift angle
+        if drift_angle is not None and "v" not in names:
+            # readers of recordings have no channel of the drift angle
             text = (
-                f"'{speeds[0]}' is read as the surge velocity, and '{drift}' is not read; write"
+                f"'{speeds[0]}' is read as the surge velocity, '{drift_angle}' is not read; write"
                 " columns u = V cos(beta) and v = -V sin(beta) for speed V and drift angle beta"
                 " (positive with the flow from port)"
             )
         draft_notes.add_guess((*CHANNELS_KEY, "u"), text)
     ordered_channels = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
     return {name: names[name] for name in ordered_channels if name in names}
+
+
+def _pair_speed_with_drift_angle(
+    drift_angle: str,
+    names: Mapping[str, str],
+    speeds: Sequence[str],
+    parsed_names: Mapping[str, ParsedName],
+    draft_notes: DraftNotes,
+) -> dict[str, str]:
+    """Return the channels of a speed and a drift angle if they are the velocities of a table.
+
+    Args:
+        drift_angle: column of the drift angle.
+        names: channel -> column by names alone, in which the symbols U and V are u and v.
+        speeds: columns of speed.
+        parsed_names: other columns and their parsed names.
+        draft_notes: receives notes.
+
+    Returns:
+        Column by channel `speed` and `drift_angle`; empty if surge and sway velocity are measured.
+    """
+    velocities = {name: names[name] for name in ("u", "v") if name in names}
+    if len(velocities) == 2:
+        return {}
+    symbols = [
+        column
+        for column, parsed in parsed_names.items()
+        if _SPEED_SYMBOL.fullmatch(parsed.text)
+        and (column in velocities.values() or column not in names.values())
+        and find_mismatched_unit(column, "m/s") is None
+    ]
+    speed = next(iter([*speeds, *symbols]), None)
+    if speed is None:
+        text = f"'{drift_angle}' is not read: no column is the speed next to this drift angle"
+        draft_notes.add_note(CHANNELS_KEY, text)
+        return {}
+    for column in velocities.values():
+        if column != speed:
+            text = f"'{column}' is left out: u and v follow from '{speed}' and '{drift_angle}'"
+            draft_notes.add_note(CHANNELS_KEY, text)
+    return {"speed": speed, "drift_angle": drift_angle}
 
 
 def _assign_columns(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.frames import rotate
+from residnet.core.units import to_si
 from residnet.preprocessing.compatibility.hypotheses import (
     MIN_MARGIN,
     Hypothesis,
@@ -27,6 +29,8 @@ _MIN_IMPROVEMENT = 0.5
 """Largest ratio of unexplained shares from which a meaning replaces the one of the names."""
 _CONSISTENT_SHARE = 0.1
 """Unexplained share below which columns have the meaning of their names."""
+_MIN_MEANING_RATIO = 0.9
+"""Ratio of unexplained shares below which the data decide between speed and surge velocity."""
 _MAX_COMPARED_LOGS = 2
 """Largest number of logs in the comparison by evidence, those with most yaw."""
 _MAX_NODES = 300
@@ -60,6 +64,35 @@ SPEED_AS_V = Meaning(("surge", "speed"), "v is the speed")
 SPEED_AS_U = Meaning(("speed", "sway"), "u is the speed")
 _PAIR_MEANINGS = (BODY_AXES, EARTH_AXES, EXCHANGED_EARTH_AXES, SPEED_AS_V)
 _SINGLE_MEANINGS = {"u": (BODY_AXES,), "v": (BODY_AXES, SPEED_AS_V)}
+
+
+class DriftAngleChoice(NamedTuple):
+    """Interpretation of a speed and a drift angle that suits the motion best.
+
+    Attributes:
+        unit: unit of the drift angle.
+        sign: 1 if the drift angle is positive with the flow from port, -1 otherwise.
+        is_speed: whether the other column is the speed; otherwise it is the surge velocity.
+        unexplained_share: unexplained share of u and v from both columns.
+        other_share: that of the best interpretation with the other meaning of the column; infinite
+            if there is none.
+    """
+
+    unit: str
+    sign: int
+    is_speed: bool
+    unexplained_share: float
+    other_share: float
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether the columns follow the motion."""
+        return self.unexplained_share < _MAX_UNEXPLAINED_SHARE
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether speed and surge velocity explain the motion almost equally well."""
+        return self.other_share < self.unexplained_share / _MIN_MEANING_RATIO
 
 
 @dataclass(frozen=True)
@@ -170,6 +203,50 @@ def choose_meaning(logs: Sequence[MeasuredVelocities]) -> MeaningChoice:
     )
     margin = evidence[ranking[1]] - evidence[ranking[0]]
     return MeaningChoice(ranking[0], ranking[1], margin, text)
+
+
+def resolve_drift_angle(
+    speed: np.ndarray, drift_angle: np.ndarray, *, is_speed: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return surge and sway velocity [T] of a vessel with a drift angle.
+
+    Args:
+        speed: speed [T], or surge velocity.
+        drift_angle: drift angle [T] in rad, positive with the flow from port (SNAME 1952).
+        is_speed: whether `speed` is the speed.
+    """
+    if is_speed:
+        return speed * np.cos(drift_angle), -speed * np.sin(drift_angle)
+    return speed, -speed * np.tan(drift_angle)
+
+
+def choose_drift_angle(
+    logs: Sequence[MeasuredVelocities], units: Sequence[str], *, can_be_surge: bool
+) -> DriftAngleChoice:
+    """Choose unit and direction of a drift angle, and the meaning of the speed next to it.
+
+    Args:
+        logs: logs with the columns `speed` and `drift_angle`, at least one.
+        units: possible units of the drift angle.
+        can_be_surge: whether the speed may be the surge velocity.
+    """
+    choices = []
+    for unit, is_speed in itertools.product(units, (True, False)[: 1 + can_be_surge]):
+        candidates = []
+        for log in logs:
+            u, v = resolve_drift_angle(
+                log.columns["speed"],
+                log.columns["drift_angle"] * to_si(unit, "rad"),
+                is_speed=is_speed,
+            )
+            candidates.append(dataclasses.replace(log, columns={"u": u, "v": v}))
+        share = _compute_unexplained_share(candidates, ("u", "v"), BODY_AXES.components)
+        factors = _fit_factors(candidates, ("u", "v"), BODY_AXES.components)
+        sign = -1 if factors["v"] < 0.0 else 1
+        choices.append(DriftAngleChoice(unit, sign, is_speed, share, np.inf))
+    best = min(choices, key=lambda choice: choice.unexplained_share)
+    others = [choice.unexplained_share for choice in choices if choice.is_speed != best.is_speed]
+    return best._replace(other_share=min(others, default=np.inf))
 
 
 def _fit_factors(

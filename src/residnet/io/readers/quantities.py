@@ -37,6 +37,8 @@ QUATERNION = ("qx", "qy", "qz", "qw")
 """Channels with the parts of a quaternion, from which tables without a heading derive it."""
 PLANAR_QUATERNION = ("qz", "qw")
 """Channels with the parts of a quaternion about the vertical axis, whose other parts are zero."""
+SPEED_CHANNELS = {"speed": "m/s", "drift_angle": "rad"}
+"""Channels, with their SI units, from which tables without u and v derive these velocities."""
 COSINE_SUFFIX = "_cos"
 SINE_SUFFIX = "_sin"
 """Suffixes of channels with the cosine and the sine of an angle."""

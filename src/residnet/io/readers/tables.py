@@ -46,6 +46,7 @@ from residnet.io.readers.quantities import (
     PLANAR_QUATERNION,
     QUATERNION,
     SINE_SUFFIX,
+    SPEED_CHANNELS,
     ChannelMap,
     complete_quaternion,
     conversion_factor,
@@ -180,7 +181,8 @@ class TableConfig(ConfiguredReader, ABC):
         channels: channel name (canonical or user-defined) -> column, which must exist. `latitude`
             and `longitude` become x and y unless these are mapped; `qx`, `qy`, `qz`, `qw` become
             the heading psi unless it is mapped; the cosine and sine of an angle (`psi_cos` and
-            `psi_sin`) become the angle.
+            `psi_sin`) become the angle; `speed` U and `drift_angle` beta become the velocities
+            u = U cos(beta) and v = -U sin(beta), unless u or v is mapped.
         manoeuvre: type of manoeuvre of every file; `folder` takes the name of each file's folder;
             `auto` infers it from the name of the file, else from rudder angle and heading; null
             means unknown.
@@ -200,6 +202,12 @@ class TableConfig(ConfiguredReader, ABC):
     def _validate_channels(cls, channels: dict[str, ChannelMap]) -> dict[str, ChannelMap]:
         for name, entry in channels.items():
             entry.require_valid_channel(name)
+        if channels.keys() >= {*SPEED_CHANNELS}:
+            for name, unit in SPEED_CHANNELS.items():
+                try:
+                    conversion_factor(channels[name].unit, unit)
+                except ValueError as error:
+                    raise ValueError(f"channel {name}: {error}") from error
         quaternion_names = [name for name in QUATERNION if name in channels]
         if quaternion_names and (*quaternion_names,) not in (QUATERNION, PLANAR_QUATERNION):
             missing_names = ", ".join(name for name in QUATERNION if name not in channels)
@@ -267,7 +275,8 @@ class TableConfig(ConfiguredReader, ABC):
         _add_angles_of_components(channels)
         if "u" in channels and channel_maps["u"].frame == "ned":
             channels["u"], channels["v"] = rotate(channels["u"], channels["v"], -channels["psi"])
-        derived_units = {"x": "m", "y": "m"}
+        channels = _resolve_drift_angle(channels)
+        derived_units = {"x": "m", "y": "m", "u": "m/s", "v": "m/s"}
         units = {
             n: channel_maps[n].si_unit_of(n) if n in channel_maps else derived_units.get(n, "rad")
             for n in channels
@@ -737,6 +746,21 @@ def _add_angles_of_components(channels: dict[str, np.ndarray]) -> None:
             sine = channels.pop(name + SINE_SUFFIX)
             cosine = channels.pop(name + COSINE_SUFFIX)
             channels[name] = unwrap_angle(np.arctan2(sine, cosine))
+
+
+def _resolve_drift_angle(channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Replace speed and drift angle by surge and sway velocity, unless one of these is mapped.
+
+    A positive drift angle is that of a flow from port, v = -U sin(beta) (SNAME, Technical and
+    Research Bulletin 1-5, 1952).
+    """
+    if not channels.keys() >= {*SPEED_CHANNELS} or {"u", "v"} & channels.keys():
+        return dict(channels)
+    speed = channels["speed"]
+    drift_angle = channels["drift_angle"]
+    velocities = {"u": speed * np.cos(drift_angle), "v": -speed * np.sin(drift_angle)}
+    others = {name: values for name, values in channels.items() if name not in SPEED_CHANNELS}
+    return {**others, **velocities}
 
 
 def _to_local_plane(

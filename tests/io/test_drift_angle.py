@@ -1,0 +1,179 @@
+"""Speed and drift angle as the velocities of a table, in layouts of model basins."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import residnet
+from residnet.core.log import Log
+from residnet.io.drafting.channels import CHANNELS_KEY
+from residnet.io.drafting.questions import DraftNotes
+from residnet.io.drafting.tables import draft_tables, match_channels
+from residnet.io.header_vocabulary import is_drift_angle
+from residnet.io.readers.tables import CsvConfig
+from residnet.tasks.drafting import write_new_config
+from residnet.tasks.registry import load_task
+
+CORPUS = Path(__file__).parents[1] / "corpus"
+TRUTH = [pd.read_csv(CORPUS / f"truth_{trip}.csv") for trip in (1, 2)]
+SPEED_NAMES = ("V", "U", "Vs", "Speed", "Ship speed", "V_model", "Geschwindigkeit")
+DRIFT_NAMES = ("beta", "Drift angle", "BETA", "\u03b2", "Driftwinkel", "Drift", "leeway angle")
+KNOT = 1852.0 / 3600.0
+
+
+def write_layout(folder: Path, seed: int) -> tuple[str, list[dict[str, np.ndarray]]]:
+    """Write both trips in a drawn layout, and return it in words and the true u and v."""
+    random = np.random.default_rng(seed)
+    speed_name = str(random.choice(SPEED_NAMES))
+    drift_name = str(random.choice(DRIFT_NAMES))
+    is_degrees = bool(random.integers(2))
+    is_full_scale = bool(random.integers(2))
+    is_reversed = bool(random.integers(2))
+    has_track = bool(random.integers(2))
+    has_units = bool(random.integers(2)) or (is_full_scale and not has_track)
+    is_excel = bool(random.integers(2))
+    length_scale = 50.0 if is_full_scale else 1.0
+    time_scale = np.sqrt(length_scale)
+    speed_unit = KNOT if is_full_scale else 1.0
+    truth = []
+    for number, trip in enumerate(TRUTH, 1):
+        u = trip.u.to_numpy() * time_scale
+        v = trip.v.to_numpy() * time_scale
+        drift_angle = np.arctan2(-v, u) * (-1.0 if is_reversed else 1.0)
+        drift_angle = np.degrees(drift_angle) if is_degrees else drift_angle
+        speed_text = " [kn]" if is_full_scale else " [m/s]"
+        angle_text = " [deg]" if is_degrees else " [rad]"
+        table = {"Time [s]": trip.t * time_scale}
+        if has_track:
+            table |= {"X [m]": trip.x * length_scale, "Y [m]": trip.y * length_scale}
+            table["Heading [deg]"] = np.degrees(trip.psi) % 360.0
+        table[speed_name + speed_text * has_units] = np.hypot(u, v) / speed_unit
+        table[drift_name + angle_text * has_units] = drift_angle
+        table["Yaw rate [deg/s]"] = np.degrees(trip.r) / time_scale
+        table |= {"Rudder [deg]": np.degrees(trip.delta), "RPM": trip.n * 60.0 / time_scale}
+        path = folder / f"test_{number}"
+        if is_excel:
+            pd.DataFrame(table).to_excel(path.with_suffix(".xlsx"), index=False)
+        else:
+            pd.DataFrame(table).to_csv(path.with_suffix(".csv"), index=False)
+        truth.append({"u": u, "v": v})
+    layout = f"{speed_name}, {drift_name}, {is_degrees=}, {is_full_scale=}, {is_reversed=}"
+    return f"{layout}, {has_track=}, {has_units=}, {is_excel=}", truth
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_speed_and_drift_angle_of_drawn_layouts_become_u_and_v(seed: int, tmp_path: Path) -> None:
+    layout, truth = write_layout(tmp_path, seed)
+    logs = residnet.read_logs(tmp_path)
+    for log, expected in zip(logs, truth, strict=True):
+        assert isinstance(log, Log)
+        for name, values in expected.items():
+            error = np.abs(log[name] - values).max()
+            assert error < 0.01 * np.abs(expected["u"]).max(), (layout, name)
+
+
+def test_a_drafted_config_has_both_columns_with_their_meaning(tmp_path: Path) -> None:
+    trip = TRUTH[0]
+    speed = np.hypot(trip.u, trip.v)
+    beta = np.degrees(np.arctan2(-trip.v, trip.u))
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    for number in range(3):
+        rows = slice(number, None)
+        table = {"t [s]": trip.t[rows], "U [m/s]": speed[rows], "beta [deg]": beta[rows]}
+        table |= {"r [deg/s]": np.degrees(trip.r[rows]), "n [rpm]": 60.0 * trip.n[rows]}
+        table["rudder [deg]"] = np.degrees(trip.delta[rows])
+        pd.DataFrame(table).to_csv(logs / f"log_{number}.csv", index=False)
+    config = tmp_path / "boat.yaml"
+    write_new_config([logs], config, None, overwrite=False)
+    text = " ".join(config.read_text().replace("#", " ").split())
+    assert "'beta [deg]' is positive with the flow from port" in text
+    assert "speed: {column: 'U [m/s]', unit: m/s}" in text
+    assert "drift_angle: {column: 'beta [deg]', unit: deg}" in text
+    load_task(config, []).check()
+
+
+def draft(table: dict[str, np.ndarray], path: Path) -> tuple[dict[str, dict[str, str]], str]:
+    """Return the channel map of a table, and its guesses and notes."""
+    pd.DataFrame(table).to_csv(path, index=False)
+    notes = DraftNotes()
+    reader, errors = draft_tables([path], notes)
+    assert not errors
+    texts = [text for _, text in notes.guessed_values + notes.notes]
+    return reader["channels"], "; ".join(texts)
+
+
+def test_the_symbol_u_is_the_speed_or_the_surge_velocity_by_the_track(tmp_path: Path) -> None:
+    trip = TRUTH[0]
+    beta = np.degrees(np.arctan2(-trip.v, trip.u))
+    track = {"t": trip.t, "x [m]": trip.x, "y [m]": trip.y, "psi [deg]": np.degrees(trip.psi)}
+    speed = {"u [m/s]": np.hypot(trip.u, trip.v), "beta [deg]": beta, "rudder": trip.delta}
+    channels, _ = draft(track | speed, tmp_path / "speed.csv")
+    assert channels["speed"]["column"] == "u [m/s]"
+    channels, text = draft(track | speed | {"u [m/s]": trip.u}, tmp_path / "surge.csv")
+    assert channels["u"]["column"] == "u [m/s]"
+    assert "'beta [deg]' is not read: 'u [m/s]' is the surge velocity" in text
+    channels, text = draft({"t": trip.t, "r": trip.r} | speed, tmp_path / "no_track.csv")
+    assert channels["speed"]["column"] == "u [m/s]"
+    assert "'u [m/s]' next to the drift angle 'beta [deg]' is assumed the speed" in text
+
+
+def test_an_angle_that_is_no_drift_angle_is_left_out(tmp_path: Path) -> None:
+    trip = TRUTH[0]
+    table = {"t": trip.t, "x [m]": trip.x, "y [m]": trip.y, "psi [deg]": np.degrees(trip.psi)}
+    beta = 60.0 * np.sin(trip.t)
+    table |= {"V [m/s]": np.hypot(trip.u, trip.v), "beta [deg]": beta, "rudder": trip.delta}
+    channels, text = draft(table, tmp_path / "pod.csv")
+    assert not {"speed", "drift_angle", "u", "v"} & channels.keys()
+    assert "'V [m/s]' and 'beta [deg]' are left out: as speed and drift angle they differ" in text
+
+
+def test_measured_velocities_take_precedence(tmp_path: Path) -> None:
+    columns = ["t", "u [m/s]", "v [m/s]", "beta [deg]", "V [m/s]", "rudder"]
+    names = match_channels(columns, DraftNotes(), with_drift_angle=True)
+    assert names["u"] == "u [m/s]"
+    assert names["v"] == "v [m/s]"
+    assert "speed" not in names
+
+
+def test_names_of_drift_angles() -> None:
+    for name in (*DRIFT_NAMES, "beta_deg", "Drift angle [deg]", "angle de d\u00e9rive", "sideslip"):
+        assert is_drift_angle(name), name
+    for name in ("drift [m/s]", "drift speed", "beta_motor", "rudder angle", "alphabeta"):
+        assert not is_drift_angle(name), name
+
+
+def test_units_of_the_channels_are_checked() -> None:
+    channels = {"speed": {"column": "V", "unit": "deg"}}
+    channels["drift_angle"] = {"column": "beta", "unit": "deg"}
+    with pytest.raises(ValueError, match="channel speed"):
+        CsvConfig.model_validate({"time": {"column": "t"}, "channels": channels})
+
+
+def test_a_mapped_velocity_is_not_replaced(tmp_path: Path) -> None:
+    trip = TRUTH[0]
+    table = {"t": trip.t, "u": trip.u, "V": np.hypot(trip.u, trip.v), "beta": -trip.v}
+    pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
+    entries = {"u": {"column": "u", "unit": "m/s"}, "speed": {"column": "V", "unit": "m/s"}}
+    entries["drift_angle"] = {"column": "beta", "unit": "rad"}
+    settings = {"time": {"column": "t"}, "channels": entries}
+    log = CsvConfig.model_validate(settings).build().read(tmp_path / "log.csv")
+    assert set(log.channels) == set(entries)
+    del entries["u"]
+    log = CsvConfig.model_validate(settings).build().read(tmp_path / "log.csv")
+    assert set(log.channels) == {"u", "v"}
+    assert log.units["v"] == "m/s"
+
+
+def test_a_drift_angle_alone_is_noted() -> None:
+    notes = DraftNotes()
+    names = match_channels(["t", "r", "beta [deg]", "rudder"], notes, with_drift_angle=True)
+    assert "drift_angle" not in names
+    assert (
+        CHANNELS_KEY,
+        "'beta [deg]' is not read: no column is the speed next to this drift angle",
+    ) in notes.notes
