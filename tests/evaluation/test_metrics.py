@@ -16,10 +16,12 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.evaluation.freerun import Candidate, FreeRun, FreeRunErrors, Prediction
 from residnet.evaluation.metrics import (
     ProtocolEvaluation,
+    WindowErrors,
     bootstrap_intervals,
     bootstrap_tail_probability,
     build_metrics_file,
     build_metrics_table,
+    estimate_spread_between_logs,
     find_row,
     make_resampling_blocks,
     paired_difference,
@@ -485,7 +487,7 @@ def test_intervals_hold_for_new_logs_of_the_column_that_looks_surest(logs: int) 
         seen, new = np.exp(
             sizes.repeat(windows, axis=1) + 0.1 * random.normal(size=(2, 3 * logs, 6))
         )
-        spans = np.array(prediction_intervals(seen, numbers))
+        spans = np.array(prediction_intervals(WindowErrors(seen, numbers)))
         surest = int(np.log(seen.reshape(logs, windows, 6).mean(1)).std(0).argmin())
         low, high = spans[surest]
         held.append(low <= new.mean(0)[surest] <= high)
@@ -496,12 +498,12 @@ def test_intervals_hold_for_new_logs_of_the_column_that_looks_surest(logs: int) 
 def test_what_ran_away_or_is_exact_leaves_the_intervals_of_others() -> None:
     values = np.exp(np.random.default_rng(4).normal(size=(12, 4)))
     numbers = np.repeat(np.arange(4), 3)
-    plain = prediction_intervals(values[:, :2], numbers)
+    plain = prediction_intervals(WindowErrors(values[:, :2], numbers))
     values[:, 2], values[5, 3] = 0.0, np.inf
-    spans = prediction_intervals(values, numbers)
+    spans = prediction_intervals(WindowErrors(values, numbers))
     assert spans[:2] == plain
     assert spans[2] == (0.0, 0.0)
-    assert prediction_intervals(values[:6], numbers[:6]) == [None] * 4
+    assert prediction_intervals(WindowErrors(values[:6], numbers[:6])) == [None] * 4
 
 
 def test_a_log_without_an_error_widens_no_interval() -> None:
@@ -511,8 +513,68 @@ def test_a_log_without_an_error_widens_no_interval() -> None:
     for _ in range(400):
         # one log in six goes straight, and nothing goes wrong in it
         seen, new = np.abs(random.normal(size=(2, 12, 2))) * (random.random((2, 12, 1)) > 1 / 6)
-        low, high = np.array(prediction_intervals(seen, np.arange(12))).T
+        low, high = np.array(prediction_intervals(WindowErrors(seen, np.arange(12)))).T
         held.append((low <= new.mean(0)) & (new.mean(0) <= high))
         factors.append(high[0] / seen.mean(0)[0])
     assert 0.92 <= np.mean(held) <= 0.98
     assert np.median(factors) < 2.5
+
+
+def draw_log_errors(
+    random: np.random.Generator, n_logs: int, n_windows: int, spread: float, scale: float = 1.0
+) -> WindowErrors:
+    """Draw errors of four columns; half of the variance between logs is common to them."""
+    sizes = spread * np.sqrt(0.5) * random.normal(size=(n_logs, 1, 1))
+    sizes = sizes + spread * np.sqrt(0.5) * random.normal(size=(n_logs, 1, 4))
+    log_errors = sizes + 0.3 * random.normal(size=(n_logs, n_windows, 4))
+    return WindowErrors(
+        scale * np.exp(log_errors).reshape(-1, 4), np.repeat(np.arange(n_logs), n_windows)
+    )
+
+
+def test_logs_of_other_splits_estimate_the_spread_between_logs() -> None:
+    random = np.random.default_rng(6)
+    covered = []
+    widths = []
+    for _ in range(400):
+        test, new = (draw_log_errors(random, 3, 2, 0.4) for _ in range(2))
+        # errors on training logs are smaller, which does not change their relative spread
+        others = [draw_log_errors(random, 5, 2, 0.4, 0.5), draw_log_errors(random, 2, 2, 0.4, 0.9)]
+        alone = np.array(prediction_intervals(test))
+        pooled = np.array(prediction_intervals(test, others))
+        np.testing.assert_allclose(np.sqrt(pooled.prod(1)), test.values.mean(0))
+        new_means = new.values.mean(0)
+        covered.append((pooled[:, 0] <= new_means) & (new_means <= pooled[:, 1]))
+        widths.append([np.log(limits[0, 1] / limits[0, 0]) for limits in (alone, pooled)])
+    assert 0.93 <= np.mean(covered) <= 0.98
+    median_alone, median_pooled = np.median(widths, axis=0)
+    assert median_pooled < 0.9 * median_alone
+
+
+def test_a_significantly_larger_spread_is_not_pooled() -> None:
+    random = np.random.default_rng(7)
+    test = draw_log_errors(random, 4, 2, 1.2)
+    others = [draw_log_errors(random, 8, 2, 0.1)]
+    assert prediction_intervals(test, others) == prediction_intervals(test)
+    assert estimate_spread_between_logs(test, others).n_logs == 4
+    # a smaller spread is pooled: the interval does not become narrower than that of all logs
+    assert estimate_spread_between_logs(others[0], [test]).n_logs == 12
+
+
+def test_spread_refers_to_the_number_of_windows_of_the_logs() -> None:
+    random = np.random.default_rng(8)
+    one, many = (
+        np.mean(
+            [
+                estimate_spread_between_logs(
+                    draw_log_errors(random, 3, n_windows, 0.05),
+                    [draw_log_errors(random, 30, 4, 0.05)],
+                ).variance
+                for _ in range(200)
+            ]
+        )
+        for n_windows in (1, 9)
+    )
+    # 0.3 is the relative standard deviation of windows, 0.05 that of logs
+    assert one == pytest.approx(0.3**2 + 0.05**2, rel=0.2)
+    assert many == pytest.approx(0.3**2 / 9 + 0.05**2, rel=0.35)

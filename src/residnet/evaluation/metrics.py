@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 import scipy
@@ -148,49 +148,160 @@ def bootstrap_intervals(
     ]
 
 
+class WindowErrors(NamedTuple):
+    """Errors of the windows of one split.
+
+    Attributes:
+        values: non-negative errors [W, C]; a column is one kind of error of one model.
+        log_indices: log index [W] of each window.
+    """
+
+    values: np.ndarray
+    log_indices: np.ndarray
+
+    @property
+    def n_logs(self) -> int:
+        """Number of logs."""
+        return len(np.unique(self.log_indices))
+
+
+class SpreadBetweenLogs(NamedTuple):
+    """Relative variance of the mean error of a log.
+
+    Attributes:
+        variance: the variance in units of the squared mean over logs.
+        n_logs: number of logs that estimate it.
+        degrees_of_freedom: degrees of freedom of the estimate.
+    """
+
+    variance: float
+    n_logs: int
+    degrees_of_freedom: int
+
+
+_HOMOGENEITY_LEVEL = 0.25
+"""Level of the F test by which a larger spread of a split is not pooled with that of others.
+
+Source: Bancroft 1964, Biometrics 20, 427-442, who recommends 0.25 for tests before pooling. In
+simulations the coverage of the 95 % intervals is 0.953 for equal spreads, and 0.943 where that of
+three test logs is twice that of the others; a level of 0.05 gives 0.941 and 0.866.
+"""
+
+
 def prediction_intervals(
-    window_errors: np.ndarray, log_indices: np.ndarray
+    errors: WindowErrors, other_splits: Sequence[WindowErrors] = ()
 ) -> list[Interval | None]:
-    """Return 95 % prediction intervals of the means of columns [W, C] over new logs.
+    """Return 95 % prediction intervals of the means of columns over new logs.
 
     The number of new logs equals the number of logs in the data. Windows of a log share manoeuvre,
     weather and speed, so the spread of the means of logs counts. Errors are positive with a random
     scale: the interval is Student's t for the logarithm of the mean over logs, with the variance of
-    the observed and of the new logs. The variance refers to the mean over logs, so that a log with
-    nearly no error does not widen the interval. It is pooled over all columns, since a few logs
-    estimate it poorly and the best column would get too narrow an interval. Correlated columns
-    count as two.
+    the observed and of the new logs (Hahn and Meeker 1991, Statistical Intervals, chapter 4).
 
     Args:
-        window_errors: non-negative errors of windows; a column is one kind of error of one model.
-        log_indices: log index [W] of each window.
+        errors: errors of the windows, which alone determine the means.
+        other_splits: errors of the same models at the same horizon on other logs, which also
+            estimate the spread between logs, see `estimate_spread_between_logs`.
 
     Returns:
         An interval for each column; None for fewer than three logs.
     """
-    unique_logs, log_positions = np.unique(log_indices, return_inverse=True)
-    n_logs = len(unique_logs)
-    if n_logs < MIN_LOGS_FOR_INTERVAL:
-        return [None] * window_errors.shape[1]
-    log_sums = np.stack(
-        [np.bincount(log_positions, column, n_logs) for column in window_errors.T], axis=1
-    )
-    # columns without any error, or with a diverged one, would distort the pooled variance
-    log_means = (log_sums / np.bincount(log_positions)[:, None])[
-        :, log_sums.any(axis=0) & np.isfinite(log_sums).all(0)
-    ]
-    relative_variances = (log_means / log_means.mean(axis=0)).var(axis=0, ddof=1)
-    relative_std = math.sqrt(relative_variances.mean()) if relative_variances.size else 0.0
-    degrees_of_freedom = min(window_errors.shape[1], 2) * (n_logs - 1)
-    half_width_factor = scipy.stats.t.ppf(
-        0.5 + CONFIDENCE_LEVEL / 2, degrees_of_freedom
-    ) * math.sqrt(2 / n_logs)
+    if errors.n_logs < MIN_LOGS_FOR_INTERVAL:
+        return [None] * errors.values.shape[1]
+    spread = estimate_spread_between_logs(errors, other_splits)
+    half_width = scipy.stats.t.ppf(
+        0.5 + CONFIDENCE_LEVEL / 2, spread.degrees_of_freedom
+    ) * math.sqrt(2 / errors.n_logs * spread.variance)
     # relative deviations of means are deviations of logarithms in first order
-    interval_factor = math.exp(half_width_factor * relative_std)
+    interval_factor = math.exp(half_width)
     return [
         (float(mean / interval_factor), float(mean * interval_factor))
-        for mean in window_errors.mean(0)
+        for mean in errors.values.mean(0)
     ]
+
+
+def estimate_spread_between_logs(
+    errors: WindowErrors, other_splits: Sequence[WindowErrors] = ()
+) -> SpreadBetweenLogs:
+    """Return the relative variance of the mean error of a log of the first split.
+
+    The variance refers to the mean over logs of its split, so that a log with nearly no error does
+    not increase it, and smaller errors on training logs do not bias it. It is pooled over all
+    columns, since a few logs estimate it poorly and the best column would get too narrow an
+    interval; correlated columns count as two. It is also pooled over splits, which have the same
+    coefficient of variation (pooled variance), unless the first split varies significantly more
+    (one-sided F test). Where the logs of splits have different numbers of windows k, the component
+    of variance of the windows, which contributes a share 1 / k, is adjusted to that of the first
+    split (one-way random model, Searle, Casella and McCulloch 1992, Variance Components, chapter
+    3).
+    """
+    splits = [split for split in (errors, *other_splits) if split.n_logs > 1]
+    components = [_estimate_variance_components(split) for split in splits]
+    within_degrees = np.array([len(split.values) - split.n_logs for split in splits])
+    within_variance = float(
+        within_degrees @ [component.within_logs for component in components]
+    ) / max(int(within_degrees.sum()), 1)
+    variances = np.array(
+        [
+            max(
+                component.between_logs
+                + within_variance * (1 / components[0].n_windows - 1 / component.n_windows),
+                0.0,
+            )
+            for component in components
+        ]
+    )
+    n_logs = np.array([split.n_logs for split in splits])
+    degrees_of_freedom = min(errors.values.shape[1], 2) * (n_logs - 1)
+    if len(splits) > 1:
+        others = slice(1, None)
+        other_variance = float(np.average(variances[others], weights=degrees_of_freedom[others]))
+        largest_ratio = scipy.stats.f.ppf(
+            1 - _HOMOGENEITY_LEVEL, degrees_of_freedom[0], degrees_of_freedom[others].sum()
+        )
+        if variances[0] <= largest_ratio * other_variance:
+            return SpreadBetweenLogs(
+                float(np.average(variances, weights=degrees_of_freedom)),
+                int(n_logs.sum()),
+                int(degrees_of_freedom.sum()),
+            )
+    return SpreadBetweenLogs(float(variances[0]), int(n_logs[0]), int(degrees_of_freedom[0]))
+
+
+class _VarianceComponents(NamedTuple):
+    """Relative variances of the errors of a split, means over its columns.
+
+    Attributes:
+        between_logs: variance of the means of logs.
+        within_logs: variance of the windows about the mean of their log.
+        n_windows: harmonic mean of the number of windows of a log.
+    """
+
+    between_logs: float
+    within_logs: float
+    n_windows: float
+
+
+def _estimate_variance_components(errors: WindowErrors) -> _VarianceComponents:
+    """Return the relative variances of errors of at least two logs, between and within logs."""
+    unique_logs, log_positions = np.unique(errors.log_indices, return_inverse=True)
+    n_logs = len(unique_logs)
+    windows_per_log = np.bincount(log_positions)
+    # columns without any error, or with a diverged one, would distort the pooled variance
+    is_usable = errors.values.any(axis=0) & np.isfinite(errors.values).all(axis=0)
+    values = errors.values[:, is_usable]
+    n_windows = float(n_logs / (1 / windows_per_log).sum())
+    if values.shape[1] == 0:
+        return _VarianceComponents(0.0, 0.0, n_windows)
+    log_sums = np.stack([np.bincount(log_positions, column, n_logs) for column in values.T], axis=1)
+    log_means = log_sums / windows_per_log[:, None]
+    split_means = log_means.mean(axis=0)
+    within_sum = (((values - log_means[log_positions]) / split_means) ** 2).sum(axis=0).mean()
+    return _VarianceComponents(
+        float((log_means / split_means).var(axis=0, ddof=1).mean()),
+        float(within_sum) / max(len(values) - n_logs, 1),
+        n_windows,
+    )
 
 
 def bootstrap_tail_probability(n_blocks: int) -> float:
@@ -255,6 +366,69 @@ _HORIZONS = (10.0, 30.0, 100.0)
 """Horizons in s of the reported pose errors."""
 
 
+@dataclass(frozen=True)
+class HorizonErrors:
+    """Errors of the W windows of one split and protocol that reach a horizon.
+
+    Attributes:
+        n_steps: the horizon in time steps.
+        seconds: the horizon in s.
+        log_indices: log index [W] of each window.
+        mean_speeds: mean speed [W] of each window in m/s.
+        distance: mean distance travelled in m.
+        integration_errors: magnitudes [W] of the pose errors of the integrated measured velocities.
+        pose_errors: magnitudes [W] of the pose errors by model and name.
+    """
+
+    n_steps: int
+    seconds: float
+    log_indices: np.ndarray
+    mean_speeds: np.ndarray
+    distance: float
+    integration_errors: Mapping[str, np.ndarray]
+    pose_errors: Mapping[str, Mapping[str, np.ndarray]]
+
+    def summarize(self, other_splits: Sequence[HorizonErrors] = ()) -> HorizonRow:
+        """Return means and intervals at the horizon.
+
+        Args:
+            other_splits: errors of the same models on other logs after the same time, which also
+                estimate the spread between logs.
+        """
+        (floor,) = _summarize_pose_errors(
+            {"floor": self.integration_errors}, self.log_indices
+        ).values()
+        other_errors = [other._to_window_errors(self.pose_errors) for other in other_splits]
+        n_logs = len(np.unique(self.log_indices))
+        return HorizonRow(
+            seconds=self.seconds,
+            windows=len(self.log_indices),
+            logs=n_logs,
+            logs_of_spread=(
+                estimate_spread_between_logs(
+                    self._to_window_errors(self.pose_errors), other_errors
+                ).n_logs
+                if n_logs >= MIN_LOGS_FOR_INTERVAL
+                else 0
+            ),
+            slowest=float(self.mean_speeds.min()),
+            fastest=float(self.mean_speeds.max()),
+            sailed=self.distance,
+            floor=floor,
+            models=_summarize_pose_errors(self.pose_errors, self.log_indices, other_errors),
+            change_from_constant_velocity=_compare_pose_errors(self.pose_errors, self.log_indices),
+        )
+
+    def _to_window_errors(self, models: Collection[str]) -> WindowErrors:
+        """Return the pose errors of models as one table, in the order of the models."""
+        return WindowErrors(
+            np.column_stack(
+                [sizes for name in models for sizes in self.pose_errors[name].values()]
+            ),
+            self.log_indices,
+        )
+
+
 class ProtocolEvaluation:
     """Errors of all models over the W windows of one protocol, and statistics of them.
 
@@ -289,6 +463,7 @@ class ProtocolEvaluation:
         self.nrmse_by_window = {
             name: errors.nrmse(self.state_scales) for name, errors in self.errors.items()
         }
+        self._horizon_errors: list[HorizonErrors] | None = None
 
     def paired_difference(
         self,
@@ -413,25 +588,58 @@ class ProtocolEvaluation:
             **final_pose_errors,
         )
 
-    def build_limits(self, dt: float) -> ProtocolLimits:
-        """Return the part of limits.json for one protocol and split; `dt` of the grid in s."""
+    def build_limits(
+        self, dt: float, other_splits: Sequence[ProtocolEvaluation] = ()
+    ) -> ProtocolLimits:
+        """Return the part of limits.json for one protocol and split.
+
+        Args:
+            dt: time step of the grid in s.
+            other_splits: the same models and protocol on other logs, which also estimate the spread
+                between logs.
+        """
         return ProtocolLimits(
             kinematics=self.evaluate_kinematics(dt),
             bands=tuple(self.evaluate_by_class()),
             worst={name: tuple(self.list_worst_windows(name)) for name in self.errors},
             compared=self.compare_with_references(),
             outside=self.share_outside_training_range(),
-            horizons=tuple(self.evaluate_horizons(dt)),
+            horizons=tuple(self.evaluate_horizons(dt, other_splits)),
             beyond_calibration=self.share_beyond_calibration(),
         )
 
-    def evaluate_horizons(self, dt: float) -> list[HorizonRow]:
+    def evaluate_horizons(
+        self, dt: float, other_splits: Sequence[ProtocolEvaluation] = ()
+    ) -> list[HorizonRow]:
+        """Return means and prediction intervals of the pose errors, see `compute_horizon_errors`.
+
+        Args:
+            dt: time step of the grid in s.
+            other_splits: the same models and protocol on other logs.
+        """
+        other_errors = [
+            horizon
+            for evaluation in other_splits
+            for horizon in evaluation.compute_horizon_errors(dt)
+        ]
+        return [
+            horizon.summarize([other for other in other_errors if other.n_steps == horizon.n_steps])
+            for horizon in self.compute_horizon_errors(dt)
+        ]
+
+    def compute_horizon_errors(self, dt: float) -> list[HorizonErrors]:
         """Return position and attitude errors of all models after 10, 30 and 100 s and at the end.
+
+        Each split needs those of all others, so that they are computed once.
+
+        Args:
+            dt: time step of the grid in s.
 
         Returns:
             One entry for each horizon below the length of the longest window and one for its end.
-            `intervals` are prediction intervals, see `prediction_intervals`.
         """
+        if self._horizon_errors is not None:
+            return self._horizon_errors
         from residnet.evaluation.freerun import compute_integration_errors
 
         any_errors = next(iter(self.errors.values()))
@@ -450,7 +658,6 @@ class ProtocolEvaluation:
             ]
             if not reaches_horizon.any():
                 continue
-            log_indices = self.log_indices[reaches_horizon]
             long_slices = (self.log_slices[i] for i in np.flatnonzero(reaches_horizon).tolist())
             measured_states = [
                 log.y[window_slice][: n_steps + 1] for log, window_slice in long_slices
@@ -459,29 +666,25 @@ class ProtocolEvaluation:
                 float(np.hypot(*states[:, VELOCITIES][:, :2].T).sum()) * dt
                 for states in measured_states
             ]
-            pose_errors_by_model = {
-                name: errors.final_pose_errors((errors.window_starts + n_steps)[reaches_horizon])
-                for name, errors in self.errors.items()
-            }
-            integration_errors = {
-                "floor": compute_integration_errors(np.stack(measured_states), self.dof, dt)
-            }
-            (floor,) = _summarize_pose_errors(integration_errors, log_indices).values()
             entries.append(
-                HorizonRow(
+                HorizonErrors(
+                    n_steps=n_steps,
                     seconds=n_steps * dt,
-                    windows=len(measured_states),
-                    logs=len(set(log_indices.tolist())),
-                    slowest=float(mean_speeds[reaches_horizon].min()),
-                    fastest=float(mean_speeds[reaches_horizon].max()),
-                    sailed=float(np.mean(distances)),
-                    floor=floor,
-                    models=_summarize_pose_errors(pose_errors_by_model, log_indices),
-                    change_from_constant_velocity=_compare_pose_errors(
-                        pose_errors_by_model, log_indices
+                    log_indices=self.log_indices[reaches_horizon],
+                    mean_speeds=mean_speeds[reaches_horizon],
+                    distance=float(np.mean(distances)),
+                    integration_errors=compute_integration_errors(
+                        np.stack(measured_states), self.dof, dt
                     ),
+                    pose_errors={
+                        name: errors.final_pose_errors(
+                            (errors.window_starts + n_steps)[reaches_horizon]
+                        )
+                        for name, errors in self.errors.items()
+                    },
                 )
             )
+        self._horizon_errors = entries
         return entries
 
     def evaluate_kinematics(self, dt: float) -> KinematicErrors:
@@ -668,14 +871,18 @@ class ProtocolEvaluation:
 
 
 def _summarize_pose_errors(
-    pose_errors: Mapping[str, Mapping[str, np.ndarray]], log_indices: np.ndarray
+    pose_errors: Mapping[str, Mapping[str, np.ndarray]],
+    log_indices: np.ndarray,
+    other_splits: Sequence[WindowErrors] = (),
 ) -> dict[str, PoseErrors]:
     """Return means and intervals of the magnitudes [W] of pose errors, by model and name."""
     values = np.column_stack(
         [sizes for sizes_by_name in pose_errors.values() for sizes in sizes_by_name.values()]
     )
     means_and_intervals = zip(
-        values.mean(0).tolist(), prediction_intervals(values, log_indices), strict=True
+        values.mean(0).tolist(),
+        prediction_intervals(WindowErrors(values, log_indices), other_splits),
+        strict=True,
     )
     summary: dict[str, PoseErrors] = {}
     for model, sizes_by_name in pose_errors.items():

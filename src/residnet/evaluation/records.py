@@ -270,6 +270,9 @@ class HorizonRow(Record):
         seconds: the horizon in s.
         windows: number of windows that reach it.
         logs: number of logs that these windows come from.
+        logs_of_spread: number of logs that estimate the spread between logs of the prediction
+            intervals, with those of other splits; 0 without intervals and in runs of earlier
+            versions.
         slowest: smallest mean speed of a window in m/s.
         fastest: largest mean speed of a window in m/s.
         sailed: mean distance travelled in m.
@@ -284,6 +287,7 @@ class HorizonRow(Record):
     seconds: float
     windows: int
     logs: int
+    logs_of_spread: int = 0
     slowest: float
     fastest: float
     sailed: float

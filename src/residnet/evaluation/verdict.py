@@ -550,13 +550,19 @@ def describe_references(evidence: VerdictEvidence, main: ProtocolHorizon) -> lis
         if "position" in row.models[evidence.selected].by_name
         else ""
     )
+    spread = (
+        f"; the spread between {row.logs_of_spread} logs of all splits determines the prediction"
+        " intervals"
+        if row.logs_of_spread > row.logs
+        else ""
+    )
     return [
         f"Reference models (95 % prediction intervals): {'; '.join(references)}."
         if references
         else "",
         f"Other horizons: {'; '.join(other_horizons)}." if other_horizons else "",
         f"The errors are means of {format_count(row.windows, 'free run')} ({main.protocol}) of"
-        f" {format_count(row.logs, 'log')}{speeds}.",
+        f" {format_count(row.logs, 'log')}{speeds}{spread}.",
     ]
 
 

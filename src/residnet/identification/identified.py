@@ -114,6 +114,7 @@ def evaluate_splits(
     evaluations = {
         split: SplitEvaluation(split, logs, [], [], {}, bands) for split, logs in splits.items()
     }
+    protocol_evaluations: dict[tuple[str, str], ProtocolEvaluation] = {}
     first_window = 0
     for (split, name), windows in windows_by_split_and_protocol.items():
         if not windows:
@@ -130,7 +131,16 @@ def evaluate_splits(
         evaluation.free_runs.append(free_run)
         protocol_evaluation = ProtocolEvaluation(free_run, models, logs, scales)
         evaluation.rows.extend(protocol_evaluation.build_rows(config.groups))
-        evaluation.limits_by_protocol[name] = protocol_evaluation.build_limits(dt)
+        protocol_evaluations[split, name] = protocol_evaluation
+    for (split, name), protocol_evaluation in protocol_evaluations.items():
+        # all splits estimate the spread between logs
+        other_splits = [
+            other
+            for (other_split, other_name), other in protocol_evaluations.items()
+            if other_name == name and other_split != split
+        ]
+        limits = protocol_evaluation.build_limits(dt, other_splits)
+        evaluations[split].limits_by_protocol[name] = limits
     return evaluations
 
 
