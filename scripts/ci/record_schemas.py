@@ -15,7 +15,12 @@ from pathlib import Path
 
 from pydantic import BaseModel, RootModel
 
-from residnet.autopilot.records import AutopilotMetricsFile, ControllersFile, CourseMetricsFile
+from residnet.autopilot.records import (
+    AutopilotMetricsFile,
+    ControllersFile,
+    CourseMetricsFile,
+    RollMetricsFile,
+)
 from residnet.core.records import StoredFile
 from residnet.core.run_records import ExportsFile, ProvenanceFile, SummaryFile
 from residnet.evaluation.derivatives import DerivativesFile
@@ -73,6 +78,7 @@ RECORDS: dict[str, type[StoredFile]] = {
     "metrics.json of the task `autopilot`": AutopilotMetricsFile,
     "controllers.json": ControllersFile,
     "metrics.json of the task `course`": CourseMetricsFile,
+    "metrics.json of the task `roll`": RollMetricsFile,
 }
 """Files of a run folder with the class of their contents."""
 _SCHEMA_KEY = "Name and version of the format."

@@ -100,8 +100,10 @@ def shorten_parts(content: Mapping[str, Any]) -> list[str]:
     overrides += COARSE if data.get("kind") == "measured" else ()
     overrides += ["refit={}"] if "refit" in content else []
     overrides += ["bands=null"] if "refit" in content or data.get("kind") == "measured" else []
-    for head in content.get("training", ()):
-        overrides += override_keys(f"training.{head}", EPOCH)
+    for head, settings in content.get("training", {}).items():
+        # the training of task `roll` has no heads
+        if isinstance(settings, Mapping):
+            overrides += override_keys(f"training.{head}", EPOCH)
     if "conditions" in content:
         overrides += [*FLIGHTS, *[BEYOND] * ("beyond" in content["conditions"])]
     for name, policy in (content.get("policies") or {}).items():
@@ -169,6 +171,10 @@ SPECIFIC_OVERRIDES: dict[str, tuple[str, ...]] = {
         "effort=0.01",
     ),
     **dict.fromkeys(("autopilot_remus", "autopilot_remus_depth"), TORPEDO),
+    "roll_patrol": (
+        *("sea_states=[4]", "duration=30 s", "transient=10 s", "tuning.generations=2"),
+        *("training.epochs=1", "training.steps=2", "judging={duration: 40 s, realisations: 3}"),
+    ),
     "autopilot_conditions_patrol": (
         *set_durations(12, "learned", "constants"),
         "test.sea_time=10 s",

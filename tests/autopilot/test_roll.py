@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 import torch
 
-from residnet.autopilot.roll import (
+from residnet.autopilot.roll import RollPolicy, RollSimulation, sample_wave_loads
+from residnet.autopilot.roll_config import (
     GAIN_NAMES,
-    PATROL_BOX,
-    RollPolicy,
-    RollSimulation,
+    EquivalentBoxConfig,
+    RollTraining,
+    RollTuning,
     RollWeights,
     Sea,
-    equivalent_box,
-    sample_wave_loads,
 )
-from residnet.autopilot.training.roll import RollTraining, train_roll_policy, tune_roll_law
+from residnet.autopilot.training.roll import train_roll_policy, tune_roll_law
 from residnet.core.errors import ConfigError
 from residnet.physics.vessel import load_vessel
 
+PATROL_BOX = EquivalentBoxConfig(volume=355.88, breadth=7.726, metacentric_radius=3.34).build_box()
 LIMITS = math.radians(20.0), math.radians(25.0)
 NO_GAINS: Mapping[str, float] = {}
 HEADING_ONLY = {
@@ -81,7 +81,7 @@ def test_fins_follow_the_equations_of_the_document() -> None:
 
 def test_long_waves_incline_the_vessel_like_its_hydrostatics() -> None:
     """The roll moment of a box in long beam seas is rho g V (BM - depth of buoyancy) per slope."""
-    box = equivalent_box(355.88, 7.726, 3.34)
+    box = PATROL_BOX
     assert box.length * box.breadth * box.draught == pytest.approx(355.88)
     waves = Sea(3, 90.0).waves(box).model_copy(update={"peak_period": 40.0})
     sea = waves.build(1, np.random.default_rng(0))
@@ -148,7 +148,9 @@ def test_training_starts_from_the_law_and_improves_it(simulation: RollSimulation
 
 def test_tuning_finds_a_better_law(simulation: RollSimulation) -> None:
     inputs, heights = simulation.sample_inputs(BEAM_SEAS, 1, 11)
-    gains, cost = tune_roll_law(simulation, BEAM_SEAS, LIMITS, generations=2, population=2)
+    gains, cost = tune_roll_law(
+        simulation, BEAM_SEAS, LIMITS, settings=RollTuning(generations=2, population=2)
+    )
     assert set(gains) == set(GAIN_NAMES)
     with torch.no_grad():
         tuned = simulation.simulate(make_policy(gains=gains), inputs).costs(heights, RollWeights())

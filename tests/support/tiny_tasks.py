@@ -190,6 +190,27 @@ COURSE: dict[str, Any] = {
 """Two way-points; the config of the autopilot lies beside it."""
 
 
+def roll(folder: Path) -> dict[str, Any]:
+    """Roll reduction in two directions of one sea state."""
+    return {
+        "task": "roll",
+        "name": "roll",
+        "vessel": "patrol_fins",
+        "hull": {"volume": 355.88, "breadth": 7.726, "metacentric_radius": 3.34},
+        "rudder": "20 deg",
+        "fins": "25 deg",
+        "sea_states": [4],
+        "directions": ["0 deg", "90 deg"],
+        "dt": "0.2 s",
+        "transient": "10 s",
+        "duration": "30 s",
+        "tuning": {"generations": 2, "population": 2},
+        "units": 2,
+        "training": {"epochs": 1, "steps": 2, "rows_per_sea": 2, "validation_rows": 2},
+        "judging": {"duration": "40 s", "realisations": 3},
+    }
+
+
 def imported(folder: Path) -> dict[str, Any]:
     """Tables brought into the canonical form."""
     if not (folder / "logs").is_dir():
@@ -225,6 +246,7 @@ TINY_TASKS: dict[str, Callable[[Path], dict[str, Any]]] = {
     "simulated": simulated,
     "flown": flown,
     "autopilot": autopilot,
+    "roll": roll,
     "imported": imported,
     "actuators": actuators,
 }

@@ -1,4 +1,4 @@
-"""Typed contents of the JSON files that the tasks `autopilot` and `course` write.
+"""Typed contents of the JSON files that the tasks `autopilot`, `course` and `roll` write.
 
 The keys are a contract with other programs; values are in SI units and rad.
 """
@@ -331,6 +331,145 @@ class CourseMetricsFile(FileRecord):
     smallest: SmallestTurn
     feasibility: tuple[BuoyFeasibility, ...]
     rows: tuple[AnyCourseRow, ...] = Field(min_length=1)
+
+
+# metrics.json of the task `roll`
+
+
+class RollRow(Record):
+    """Metrics of one controller in one sea state and direction of the waves.
+
+    Attributes:
+        model: name of the controller.
+        kind: role of the controller.
+        split: `simulated`.
+        sea_state: sea state.
+        direction: direction to which the waves travel relative to the course, in rad.
+        height: significant wave height in m.
+        period: peak period in s.
+        n: number of realisations.
+        roll_rms: root mean square of the roll angle in rad.
+        roll_reduction: relative reduction of this value against heading control alone.
+        heading_rms: root mean square of the heading error in rad.
+        rudder_rms: root mean square of the rudder angle in rad.
+        fin_rms: root mean square of the fin angle in rad.
+        is_judged: whether the vessel rolls more than the sensor noise without roll reduction.
+    """
+
+    model: str
+    kind: ControllerKind
+    split: Literal["simulated"]
+    sea_state: int
+    direction: float
+    height: float
+    period: float
+    n: int
+    roll_rms: float
+    roll_reduction: float
+    heading_rms: float
+    rudder_rms: float
+    fin_rms: float
+    is_judged: bool
+
+
+class RollTotal(Record):
+    """Metrics of one controller over all directions of one sea state, or over all seas.
+
+    Attributes:
+        model: name of the controller.
+        sea_state: sea state; null for all.
+        roll_rms: root mean square of the roll angle in rad.
+        roll_reduction: relative reduction of this value against heading control alone.
+        heading_rms: root mean square of the heading error in rad.
+    """
+
+    model: str
+    sea_state: int | None
+    roll_rms: float
+    roll_reduction: float
+    heading_rms: float
+
+
+class RollController(Record):
+    """A controller of roll and heading.
+
+    Attributes:
+        model: name of the controller.
+        kind: role of the controller.
+        gains: constants of its law by name; angles in rad, rates in rad/s.
+        tuning_cost: mean cost in the seas of the tuning, or of the validation for a trained one, in
+            deg^2/m^2.
+        start_cost: mean cost in the validation seas before the training; null for a tuned law.
+        judged_cost: mean cost in the judging seas in deg^2/m^2.
+        seconds: duration of the tuning or training in s.
+    """
+
+    model: str
+    kind: ControllerKind
+    gains: dict[str, float]
+    tuning_cost: float
+    start_cost: float | None
+    judged_cost: float
+    seconds: float
+
+
+class RelativeChange(Record):
+    """Relative difference of a pooled RMS value of the policy from that of the classical law.
+
+    Attributes:
+        value: the relative difference.
+        interval: 95 % confidence interval by bootstrap over the realisations of every sea.
+    """
+
+    value: float
+    interval: tuple[float, float]
+
+
+class RollComparison(Record):
+    """Comparison of the policy with the best classical combination in the same waves.
+
+    Attributes:
+        policy: name of the policy.
+        classical: name of the classical combination with the lowest cost in the judging seas.
+        roll: relative difference of the RMS roll angle over all seas.
+        heading: relative difference of the RMS heading error over all seas.
+        tolerance: relative increase of the heading error that counts as the same.
+        is_as_good: whether the policy rolls at most as much with the same heading error.
+        n_seas: number of judged seas.
+        n_less_roll: number of judged seas in which the policy rolls less.
+    """
+
+    policy: str
+    classical: str
+    roll: RelativeChange
+    heading: RelativeChange
+    tolerance: float
+    is_as_good: bool
+    n_seas: int
+    n_less_roll: int
+
+
+class RollMetricsFile(FileRecord):
+    """metrics.json of the task `roll`: metrics of all controllers in all seas.
+
+    Attributes:
+        run: name of the run.
+        channels: unit of each metric.
+        speed: speed of the vessel in m/s.
+        comparison: comparison of the policy with the best classical combination.
+        controllers: the controllers with their constants.
+        totals: metrics by sea state and over all seas.
+        rows: metrics of one controller in one sea each.
+    """
+
+    schema_name: Literal["residnet.metrics/1"] = Field(alias="schema")
+    run: str
+    channels: dict[str, str]
+    speed: float
+    comparison: RollComparison
+    controllers: tuple[RollController, ...] = Field(min_length=1)
+    totals: tuple[RollTotal, ...] = Field(min_length=1)
+    rows: tuple[RollRow, ...] = Field(min_length=1)
 
 
 # model card of an exported controller

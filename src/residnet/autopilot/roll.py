@@ -10,7 +10,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final, NamedTuple, final
 
 import numpy as np
@@ -18,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.autopilot.heading.policies import OddGRUCell
+from residnet.autopilot.roll_config import GAIN_NAMES, SEA_STATES, RollWeights, Sea
 from residnet.core.errors import ConfigError
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.engine.compiled import CompiledRollout
@@ -25,26 +25,6 @@ from residnet.engine.rollout import Rollout, Source
 from residnet.physics.environment_config import HullBoxConfig, WavesConfig
 from residnet.physics.plant import HullPlant, Plant
 
-SEA_STATES: Final[Mapping[int, tuple[float, float]]] = {
-    3: (0.88, 7.5),
-    4: (1.88, 8.8),
-    5: (3.25, 9.7),
-}
-"""Significant wave height in m and most probable peak period in s (open North Atlantic; NATO STANAG
-4194, S. L. Bales, 1983).
-"""
-HEADINGS_DEG: Final = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
-"""Directions of propagation relative to the course: 0 deg following, 180 deg head seas."""
-GAIN_NAMES: Final = (
-    "heading_gain",
-    "yaw_rate_gain",
-    "filter_share",
-    "rudder_roll_rate_gain",
-    "rudder_roll_gain",
-    "fin_roll_rate_gain",
-    "fin_roll_gain",
-)
-"""Constants of the classical law: heading PD with a low-pass filter, rudder and fin PD in roll."""
 _MEASURED: Final = ("psi", "r", "phi", "p")
 """Measured states, in the order of the inputs of a policy."""
 _FEATURE_SCALES: Final = (0.05, 0.02, 0.1, 0.1)
@@ -53,70 +33,6 @@ _N_COMMANDS: Final = 2
 """Commands of a policy: rudder and fins."""
 _MAX_NETWORK_SHARE: Final = 0.5
 """Largest contribution of the network as a share of the limits of rudder and fins."""
-
-
-class RollWeights(NamedTuple):
-    """Weights of the cost relative to the mean square roll angle.
-
-    Attributes:
-        heading: weight of the mean square heading error.
-        effort: weight of the mean square angles of rudder and fins.
-    """
-
-    heading: float = 4.0
-    effort: float = 0.01
-
-
-def equivalent_box(volume: float, breadth: float, metacentric_radius: float) -> HullBoxConfig:
-    """Return the box with the volume and metacentric radius of a hull.
-
-    In waves much longer than the hull, the Froude-Krylov loads depend only on volume, metacentric
-    radius and depth of the centre of buoyancy. A box with breadth B and draught T has the
-    metacentric radius L B^3 / (12 volume), so that L follows, and T from the volume.
-
-    Args:
-        volume: displaced volume in m^3.
-        breadth: breadth of the waterline in m.
-        metacentric_radius: distance BM of the transverse metacentre from the centre of buoyancy
-            in m.
-    """
-    length = 12.0 * volume * metacentric_radius / breadth**3
-    return HullBoxConfig(length=length, breadth=breadth, draught=volume / (length * breadth))
-
-
-PATROL_BOX: Final = equivalent_box(355.88, 7.726, 3.34)
-"""Box of the patrol vessel: volume, breadth of the waterline and BM of Gouletas 2020, Table 5.2.
-
-Its centre of buoyancy is 0.75 m below the waterline, that of the table 0.74 m.
-"""
-
-
-@dataclass(frozen=True)
-class Sea:
-    """One condition of the evaluation.
-
-    Attributes:
-        state: sea state.
-        heading_deg: direction of propagation relative to the course.
-    """
-
-    state: int
-    heading_deg: float
-
-    def waves(self, hull: HullBoxConfig) -> WavesConfig:
-        """Return the waves of this condition on a northerly course."""
-        height, period = SEA_STATES[self.state]
-        return WavesConfig(
-            significant_height=height,
-            peak_period=period,
-            direction=math.radians(self.heading_deg),
-            hull=hull,
-        )
-
-
-def list_seas(states: Sequence[int] = tuple(SEA_STATES)) -> list[Sea]:
-    """Return all conditions of the sea states, headings every 45 deg."""
-    return [Sea(state, heading) for state in states for heading in HEADINGS_DEG]
 
 
 def sample_wave_loads(
@@ -287,7 +203,7 @@ class RollSimulation:
         dt: time step in s.
         duration: duration of a simulation in s.
         transient: initial interval in s that is not evaluated.
-        noise_deg: standard deviation of the white noise of angles in deg and rates in deg/s.
+        noise: standard deviation of the white noise of angles in rad and rates in rad/s.
 
     Raises:
         ConfigError: if the vessel has no fins.
@@ -301,7 +217,7 @@ class RollSimulation:
         dt: float = 0.1,
         duration: float = 80.0,
         transient: float = 20.0,
-        noise_deg: float = 0.1,
+        noise: float = math.radians(0.1),
     ) -> None:
         if not isinstance(plant, HullPlant) or tuple(plant.input_names[:2]) != (
             "cmd_delta",
@@ -316,7 +232,7 @@ class RollSimulation:
         self.dt = dt
         self.n_steps = round(duration / dt)
         self.n_transient = round(transient / dt)
-        self.noise = math.radians(noise_deg)
+        self.noise = noise
         self.speed = float(plant.make_initial_state(1)[0, plant.state_names.index("u")])
         # a copy, because the simulations are in single precision
         self._model = PlantDynamics(copy.deepcopy(plant), dt).float()

@@ -9,22 +9,22 @@ from typing import Any, Final, final
 
 import numpy as np
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
-from residnet.autopilot.roll import (
+from residnet.autopilot.roll import RollPolicy, RollSimulation
+from residnet.autopilot.roll_config import (
     GAIN_NAMES,
-    RollPolicy,
-    RollSimulation,
+    RollTraining,
+    RollTuning,
     RollWeights,
     Sea,
 )
 from residnet.core.progress import report_progress
 from residnet.preprocessing.data_module import EpochDataModule
-from residnet.training.config import OneStage
 from residnet.training.trainer import EpochTraining, run_epochs
 
 _DEFAULT_WEIGHTS: Final = RollWeights()
+_DEFAULT_TUNING: Final = RollTuning()
 _DIVERGED_COST: Final = 1e6
 """Cost of a simulation that is not finite."""
 SEARCH_RANGES: Final[Mapping[str, tuple[float, float]]] = {
@@ -37,22 +37,6 @@ SEARCH_RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "fin_roll_gain": (0.01, 10.0),
 }
 """Ranges of the search of each constant; the search is over logarithms."""
-
-
-class RollTraining(OneStage):
-    """Settings of the training of a roll policy by gradients through the closed loop.
-
-    Attributes:
-        steps: number of batches per epoch.
-        rows_per_sea: number of realisations of each sea in a batch.
-        validation_rows: number of realisations of each sea for the selection of the epoch.
-    """
-
-    epochs: int = Field(default=10, ge=1, le=100_000)
-    learning_rate: float = Field(default=3e-3, gt=0)
-    steps: int = Field(default=12, ge=1, le=100_000)
-    rows_per_sea: int = Field(default=3, ge=1, le=10_000)
-    validation_rows: int = Field(default=6, ge=1, le=10_000)
 
 
 @final
@@ -180,8 +164,7 @@ def tune_roll_law(
     tuned: Sequence[str] = GAIN_NAMES,
     *,
     weights: RollWeights = _DEFAULT_WEIGHTS,
-    generations: int = 14,
-    population: int = 4,
+    settings: RollTuning = _DEFAULT_TUNING,
     seed: int = 0,
 ) -> tuple[dict[str, float], float]:
     """Tune constants of the classical law by differential evolution; the others are zero.
@@ -192,8 +175,7 @@ def tune_roll_law(
         limits: limits of rudder and fins in rad.
         tuned: names of the tuned constants.
         weights: weights of the cost.
-        generations: largest number of generations.
-        population: candidates per generation and constant.
+        settings: size of the search.
         seed: seed of the search.
 
     Returns:
@@ -222,7 +204,8 @@ def tune_roll_law(
             runs = simulation.simulate(policy, inputs.repeat(n_candidates, 1, 1))
             costs = runs.costs(heights.repeat(n_candidates), weights)
         n_generations += 1
-        report_progress("tuning the roll law", min(n_generations, generations + 1), generations + 1)
+        n_expected = settings.generations + 1
+        report_progress("tuning the roll law", min(n_generations, n_expected), n_expected)
         finite_costs = costs.nan_to_num(_DIVERGED_COST, _DIVERGED_COST)
         return finite_costs.reshape(n_candidates, n_seas).mean(1).double().numpy()
 
@@ -234,8 +217,8 @@ def tune_roll_law(
         bounds,
         vectorized=True,
         updating="deferred",
-        popsize=population,
-        maxiter=generations,
+        popsize=settings.population,
+        maxiter=settings.generations,
         init="sobol",
         polish=False,
         rng=seed,
