@@ -39,6 +39,8 @@ _JERK_LEVELS = 10.0 ** (0.5 * np.arange(-8, 5))
 """Candidate jerk intensities, in noise over the cube of the median position interval."""
 _MAX_TUNING_SAMPLES = 4000
 """Largest number of samples for the estimate of the jerk intensity."""
+_PRODUCT_BLOCK = 1000
+"""Number of samples whose transition matrices are computed at once."""
 
 
 class Antenna(Config):
@@ -672,7 +674,7 @@ def smooth_track(t: np.ndarray, measurements: np.ndarray, noise_std: ArrayLike) 
         @ np.linalg.pinv(predicted_covariances[1:])
     )
     for k in range(len(t) - 2, -1, -1):
-        smoothed_states[k] += gains[k] @ (smoothed_states[k + 1] - predicted_states[k + 1])
+        smoothed_states[k] += gains[k].dot(smoothed_states[k + 1] - predicted_states[k + 1])
     return smoothed_states
 
 
@@ -689,52 +691,72 @@ def _filter_track(
         [T, 3, A] and covariances [T, 3, 3] of the first intensity.
     """
     n_samples = t.size
+    n_levels = jerk_intensities.size
     n_axes = measurements.shape[2]
+    width = 3 + n_axes
     dt = np.diff(t, prepend=t[0])
     is_measured = np.isfinite(measurements).all(axis=2)
     first_derivative_order = int(np.argmax(is_measured.any(axis=0)))
+    # A step of this loop costs as much as its calls of NumPy. The covariance and the states of all
+    # intensities are therefore one array [3, 3 + A, K], predicted by one product.
     transitions = _transition_matrices(dt)
-    process_covariances = jerk_intensities[:, None, None] ** 2 * _jerk_covariances(dt)[:, None]
+    column_transitions = np.tile(np.eye(width), (n_samples, 1, 1))
+    column_transitions[:, :3, :3] = transitions
+    process_covariances = np.zeros((n_samples, 3, width, 1))
+    process_covariances[:, :, :3, 0] = _jerk_covariances(dt)
+    process_covariances = process_covariances * jerk_intensities**2
+    targets = np.zeros((n_samples, measurements.shape[1], width, 1))
+    targets[:, :, 3:, 0] = measurements
     first_measurements = measurements[
         is_measured[:, first_derivative_order], first_derivative_order
     ]
-    state = np.zeros((jerk_intensities.size, 3, n_axes))
-    state[:, first_derivative_order] = first_measurements[0]
+    columns = np.zeros((3, width, n_levels))
+    columns[first_derivative_order, 3:] = first_measurements[0][:, None]
     # the initial covariance is large, because unmeasured states are unknown
     initial_std = float(np.ptp(first_measurements, axis=0).max(initial=0.0)) + 1.0
-    covariance = np.tile(initial_std**2 * np.eye(3), (jerk_intensities.size, 1, 1))
-    predicted = np.empty((n_samples, 3, n_axes)), np.empty((n_samples, 3, 3))
-    filtered = np.empty((n_samples, 3, n_axes)), np.empty((n_samples, 3, 3))
-    normalized_squares = np.zeros(jerk_intensities.size)
-    log_determinant = np.zeros(jerk_intensities.size)
-    variance = noise**2
+    columns[range(3), range(3)] = initial_std**2
+    predicted = np.empty((n_samples, 3, width))
+    filtered = np.empty((n_samples, 3, width))
+    innovation_variances = np.empty((int(is_measured.sum()), n_levels))
+    innovations = np.empty((len(innovation_variances), width, n_levels))
+    variance = (noise**2).tolist()
+    measured_orders = [
+        [order for order, is_present in enumerate(row) if is_present]
+        for row in is_measured.tolist()
+    ]
+    n_updates = 0
     for k in range(n_samples):
-        if k:
-            state = transitions[k] @ state
-            covariance = transitions[k] @ covariance @ transitions[k].T + process_covariances[k]
-        predicted[0][k] = state[0]
-        predicted[1][k] = covariance[0]
-        for derivative_order in np.flatnonzero(is_measured[k]):
-            # rounding may make a variance negative
-            innovation_variance = (
-                np.maximum(covariance[:, derivative_order, derivative_order], 0.0)
-                + variance[derivative_order]
+        if k % _PRODUCT_BLOCK == 0:
+            # F P F' of the covariance and F x of the states as one matrix per step
+            block = slice(k, k + _PRODUCT_BLOCK)
+            products = (
+                transitions[block, :, None, :, None] * column_transitions[block, None, :, None]
             )
-            gain = covariance[:, :, derivative_order] / innovation_variance[:, None]
-            innovation = measurements[k, derivative_order] - state[:, derivative_order]
-            state = state + gain[:, :, None] * innovation[:, None, :]
-            covariance = covariance - gain[:, :, None] * covariance[:, derivative_order, None, :]
-            normalized_squares += (innovation**2).sum(axis=1) / innovation_variance
-            log_determinant += n_axes * np.log(innovation_variance)
-        filtered[0][k] = state[0]
-        filtered[1][k] = covariance[0]
+            products = products.reshape(-1, 3 * width, 3 * width)
+        if k:
+            columns = products[k % _PRODUCT_BLOCK].dot(columns.reshape(3 * width, n_levels))
+            columns = columns.reshape(3, width, n_levels)
+            columns += process_covariances[k]
+        predicted[k] = columns[:, :, 0]
+        for order in measured_orders[k]:
+            row = np.subtract(columns[order], targets[k, order], out=innovations[n_updates])
+            # rounding may make a variance negative
+            innovation_variance = np.maximum(row[order], 0.0, out=innovation_variances[n_updates])
+            innovation_variance += variance[order]
+            gain = columns[:, order] / innovation_variance
+            columns -= gain[:, None] * row
+            n_updates += 1
+        filtered[k] = columns[:, :, 0]
+    normalized_squares = (innovations[:, 3:] ** 2).sum(axis=1) / innovation_variances
+    log_determinant = n_axes * np.log(innovation_variances).sum(axis=0)
     # the noise level is the maximum-likelihood estimate for each intensity
-    n_measurements = n_axes * int(is_measured.sum())
-    cost = (
-        n_measurements * np.log(np.maximum(normalized_squares / max(n_measurements, 1), 1e-60))
-        + log_determinant
+    n_measurements = n_axes * n_updates
+    mean_square = normalized_squares.sum(axis=0) / max(n_measurements, 1)
+    cost = n_measurements * np.log(np.maximum(mean_square, 1e-60)) + log_determinant
+    return cost, (
+        (predicted[:, :, 3:], predicted[:, :, :3]),
+        (filtered[:, :, 3:], filtered[:, :, :3]),
     )
-    return cost, (predicted, filtered)
 
 
 def _transition_matrices(dt: np.ndarray) -> np.ndarray:
