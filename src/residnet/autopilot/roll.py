@@ -40,7 +40,7 @@ def sample_wave_loads(
 ) -> Tensor:
     """Return wave loads X, Y [N], K, N [N m] on a straight northerly course, [B, T, 4].
 
-    The loads are first-order Froude-Krylov loads of a box (closed form, see `IrregularWaves`) at
+    The loads are first-order loads of a box or a table (see `IrregularWaves`) at
     the encounter frequency (Gouletas 2020, eq. (5.31)). Changes of speed and heading by the motion
     are neglected; they are a few per cent and a few degrees.
 
@@ -52,9 +52,15 @@ def sample_wave_loads(
         random: random generator.
     """
     sea = waves.build(rows, random)
-    quadrature, yaw = sea.force_response(torch.zeros(rows, dtype=torch.float64))
+    course = torch.zeros(rows, dtype=torch.float64)
     encounter = sea.omega - sea.wave_number * speed * torch.cos(sea.direction)
     phase = encounter[:, None, :] * t[None, :, None] + sea.phase[:, None, :]
+    if sea.rao_coefficients:
+        in_phase, table_quadrature = sea.table_response(course)
+        return torch.einsum(
+            "btk,bk,bkj->btj", torch.cos(phase), sea.amplitude, in_phase
+        ) + torch.einsum("btk,bk,bkj->btj", torch.sin(phase), sea.amplitude, table_quadrature)
+    quadrature, yaw = sea.force_response(course)
     in_quadrature = torch.einsum("btk,bk,bkj->btj", torch.sin(phase), sea.amplitude, quadrature)
     yaw_moment = torch.einsum("btk,bk,bk->bt", torch.cos(phase), sea.amplitude, yaw)
     return torch.cat((in_quadrature, yaw_moment[..., None]), dim=-1)

@@ -27,8 +27,9 @@ class IrregularWaves(nn.Module):
     short-crested sea inhomogeneous. Amplitudes (5.33) are normalised to the exact m0. The phase
     omega t - k . (x, y) depends on the position of the vessel, which yields the encounter frequency
     (5.31) at any speed and course. The response H_i is the Froude-Krylov force of a box, from the
-    pressure of the undisturbed wave on its walls and bottom. Diffraction, radiation and drift
-    forces are neglected.
+    pressure of the undisturbed wave on its walls and bottom; diffraction is neglected. With a
+    table of first-order loads, H_i is the value of the table, which includes diffraction.
+    Radiation and drift forces are neglected.
     """
 
     def __init__(self, config: WavesConfig, n_rows: int, random: np.random.Generator) -> None:
@@ -64,9 +65,19 @@ class IrregularWaves(nn.Module):
         # dispersion relation in deep water
         self.wave_number = self.omega**2 / GRAVITY
         self.specific_weight = config.water_density * GRAVITY
-        self.length = config.hull.length
-        self.breadth = config.hull.breadth
-        self.draught = config.hull.draught
+        self.rao_coefficients: tuple[Tensor, ...] = ()
+        if config.hull is not None:
+            self.length = config.hull.length
+            self.breadth = config.hull.breadth
+            self.draught = config.hull.draught
+        if config.force_rao is not None:
+            table = config.load_force_rao(config.force_rao)
+            cosine, sine = table.fourier_coefficients(self.omega.numpy())
+            # the load Re(H a exp(i phase)) has the factors Re(H) of cos and -Im(H) of sin
+            self.rao_coefficients = tuple(
+                torch.from_numpy(np.ascontiguousarray(part))
+                for part in (cosine.real, sine.real, -cosine.imag, -sine.imag)
+            )
 
     def component_phases(self, north: Tensor, east: Tensor, t: float) -> Tensor:
         """Return the phase [B, K] in rad of every component at a position and time.
@@ -117,6 +128,22 @@ class IrregularWaves(nn.Module):
             sin_chi * breadth * sinc_breadth * moment_x - cos_chi * length * sinc_length * moment_y
         )
 
+    def table_response(self, psi: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the loads per wave amplitude from the table, factors of cos and sin [B, K, 4].
+
+        Args:
+            psi: heading [B] in rad.
+        """
+        cosine_in_phase, sine_in_phase, cosine_quadrature, sine_quadrature = self.rao_coefficients
+        orders = torch.arange(cosine_in_phase.shape[-1], dtype=psi.dtype)
+        angles = ((self.direction - psi.unsqueeze(-1)).unsqueeze(-1) * orders).unsqueeze(-2)
+        cosine = torch.cos(angles)
+        sine = torch.sin(angles)
+        return (
+            (cosine_in_phase * cosine + sine_in_phase * sine).sum(-1),
+            (cosine_quadrature * cosine + sine_quadrature * sine).sum(-1),
+        )
+
     def forward(self, north: Tensor, east: Tensor, psi: Tensor, t: float) -> Tensor:
         """Compute the wave loads X, Y [N], K, N [N m], stacked [B, 4], at a position and time.
 
@@ -127,6 +154,11 @@ class IrregularWaves(nn.Module):
             t: time in s.
         """
         phase = self.component_phases(north, east, t)
+        if self.rao_coefficients:
+            cosine_amplitude = (self.amplitude * torch.cos(phase)).unsqueeze(-1)
+            sine_amplitude = (self.amplitude * torch.sin(phase)).unsqueeze(-1)
+            in_phase, in_quadrature = self.table_response(psi)
+            return (in_phase * cosine_amplitude + in_quadrature * sine_amplitude).sum(-2)
         quadrature, yaw = self.force_response(psi)
         in_quadrature = (quadrature * (self.amplitude * torch.sin(phase)).unsqueeze(-1)).sum(-2)
         yaw_moment = (yaw * self.amplitude * torch.cos(phase)).sum(-1, keepdim=True)

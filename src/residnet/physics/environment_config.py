@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Literal, final
 import numpy as np
 from pydantic import Field, model_validator
 
-from residnet.core.config import Config, Metres, Radians, Seconds
-from residnet.physics.parameters import Density, SquareMetres
+from residnet.core.config import Config, ExistingPath, Metres, Radians, Seconds
+from residnet.core.errors import ConfigError
+from residnet.physics.force_rao import ForceRao, read_wamit_excitation
+from residnet.physics.parameters import GRAVITY, Density, SquareMetres
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -227,6 +229,23 @@ class HullBoxConfig(Config):
     draught: Metres = Field(gt=0)
 
 
+class ForceRaoConfig(Config):
+    """First-order wave loads from a WAMIT file, see `residnet.physics.force_rao`.
+
+    The origin of WAMIT's axes is the body origin, at the waterline amidships. The table is for a
+    hull at rest; speed changes the frequency of encounter only.
+
+    Attributes:
+        file: WAMIT file .2 (Haskind) or .3 (diffraction), with the columns PER in s, BETA in deg,
+            I, MOD, PHA in deg, RE and IM; dimensionless by rho g L^2 (forces) and rho g L^3
+            (moments).
+        unit_length: length L of the table, ULEN in WAMIT's geometry file.
+    """
+
+    file: ExistingPath
+    unit_length: Metres = Field(gt=0)
+
+
 class WavesConfig(Config):
     """Irregular waves and the hull on which they act.
 
@@ -236,7 +255,8 @@ class WavesConfig(Config):
         peak_period: peak period, 2 pi / omega_p.
         direction: direction TO which the waves travel, clockwise from north (Gouletas 2020, section
             5.2.2.4); 0 deg are following seas on a northerly course.
-        hull: dimensions of the underwater hull.
+        hull: box whose Froude-Krylov loads are computed; null with `force_rao`.
+        force_rao: table of the wave loads from WAMIT; null with `hull`.
         frequencies: number N of frequency intervals between 0.5 and 4 omega_p.
         directions: number M of direction intervals; 1 for long-crested waves, otherwise cos^2
             spreading over +-90 deg.
@@ -247,10 +267,35 @@ class WavesConfig(Config):
     significant_height: Metres = Field(gt=0)
     peak_period: Seconds = Field(gt=0)
     direction: Radians
-    hull: HullBoxConfig
+    hull: HullBoxConfig | None = None
+    force_rao: ForceRaoConfig | None = None
     frequencies: int = Field(default=60, ge=10, le=2000)
     directions: int = Field(default=1, ge=1, le=72)
     water_density: Density = Field(default=1025.0, gt=0)
+
+    @model_validator(mode="after")
+    def _require_one_hull(self) -> WavesConfig:
+        if (self.hull is None) == (self.force_rao is None):
+            raise ValueError("expected either hull (a box) or force_rao (a table of WAMIT)")
+        return self
+
+    def load_force_rao(self, config: ForceRaoConfig) -> ForceRao:
+        """Read the table of wave loads.
+
+        Raises:
+            ConfigError: if the file is invalid or does not cover the energetic frequencies.
+        """
+        table = read_wamit_excitation(config.file, config.unit_length, self.water_density * GRAVITY)
+        longest_period = self.peak_period / 0.7
+        shortest_period = self.peak_period / 2.0
+        table_periods = 2.0 * np.pi / table.omega
+        if table_periods[0] < longest_period or table_periods[-1] > shortest_period:
+            raise ConfigError(
+                f"{config.file}: periods {table_periods[-1]:.3g} to {table_periods[0]:.3g} s;"
+                f" expected {shortest_period:.3g} to {longest_period:.3g} s for a peak period of"
+                f" {self.peak_period:.3g} s; extend the table or change the peak period"
+            )
+        return table
 
     def build(self, n_rows: int, random: np.random.Generator) -> IrregularWaves:
         """Build independent realisations of the waves, one per row."""
