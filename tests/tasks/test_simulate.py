@@ -13,6 +13,7 @@ from read_page import plain
 from tiny import TINY, Command, call, read_json, write_yaml
 
 from residnet.core.log import Log
+from residnet.core.progress import on_progress
 from residnet.io.readers.base import CanonicalConfig
 from residnet.manoeuvres.trials import simulate_trial_logs
 from residnet.manoeuvres.trials_config import SimulatedTrials
@@ -122,6 +123,15 @@ def test_a_model_flies_beside_its_vessel_and_alone(tiny_run: Path, tmp_path: Pat
         np.testing.assert_array_equal(log["cmd_port"], true["cmd_port"])
         np.testing.assert_allclose(log["n_port"], true["n_port"], atol=1e-9)
         assert 0 < np.abs(log["u"] - true["u"]).max() < 0.5
+    # the model has no input for wave loads: its motion is the same, and a message says so
+    hull = {"length": 4.9, "breadth": 1.0, "draught": 0.2}
+    waves = {"significant_height": 0.3, "peak_period": 3.0, "direction": "90 deg", "hull": hull}
+    messages: list[str] = []
+    with on_progress(lambda progress: messages.append(progress.message)):
+        rough = flown(tmp_path / "rough", programme=programme | {"disturbance": {"waves": waves}})
+    for name, log in rough.items():
+        np.testing.assert_array_equal(log["r"], alone[name]["r"])
+    assert any("'ridge' has no input for wave loads" in message for message in messages)
     inputs = read_json(tmp_path / "both" / "provenance.json")["inputs"]
     assert {Path(path).name for path in inputs} == {"model.json", "model.safetensors"}
     share = {"drive": "2380 rpm", "limit": "2380 rpm", "rate": "600 rpm/s"}

@@ -22,7 +22,7 @@ import functools
 import importlib
 import importlib.metadata
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -157,19 +157,29 @@ def find_part_packages(config: Any) -> dict[str, str]:
         config: config, or a mapping or sequence of configs, which is searched recursively.
     """
     versions: dict[str, str] = {}
+    for part in iterate_configs(config):
+        if (package := get_part_package(type(part))) is not None:
+            name, _, version = package.rpartition(" ")
+            versions[name] = version
+    return dict(sorted(versions.items()))
+
+
+def iterate_configs(config: Any) -> Iterator[BaseModel]:
+    """Yield all configs within a config, itself included.
+
+    Args:
+        config: config, or a mapping or sequence of configs, which is searched recursively.
+    """
     pending_values = [config]
     while pending_values:
         value = pending_values.pop()
         if isinstance(value, BaseModel):
-            if (package := get_part_package(type(value))) is not None:
-                name, _, version = package.rpartition(" ")
-                versions[name] = version
+            yield value
             pending_values += [getattr(value, name) for name in type(value).model_fields]
         elif isinstance(value, Mapping):
             pending_values += value.values()
         elif isinstance(value, list | tuple):
             pending_values += value
-    return dict(sorted(versions.items()))
 
 
 @functools.cache

@@ -56,6 +56,10 @@ _BAD_INPUT_RULES = (
     " then"
     " true"
 )
+_WAVE_LOADS_TEXT = (
+    "none: the model has no input for wave loads and computes none; it is the mean of the logs,"
+    " whatever their waves"
+)
 _BAND_TEXT = (
     "half widths of the errors of a free run so many steps after a measured state, whatever the run"
     " is like; between the steps they are interpolated, and beyond the last they grow in proportion"
@@ -320,6 +324,7 @@ class ExportedVessel(Exportable):
                 }
                 for name in spec.signals.input_columns
             ],
+            "wave_loads": _WAVE_LOADS_TEXT,
             "inputs_held": {
                 "start": "the sample at the step's start",
                 "mean": "the mean of the samples at the step's start and end",

@@ -149,7 +149,8 @@ class DisturbanceConfig(Config):
         """Check that a plant has the inputs of this disturbance.
 
         Raises:
-            ConfigError: if an input is missing; names the first one.
+            ConfigError: if an input is missing (names the first one), or the table of wave loads is
+                invalid.
         """
         for name, key in self.required_plant_inputs().items():
             if name not in plant.input_names:
@@ -163,6 +164,8 @@ class DisturbanceConfig(Config):
                 f"disturbance.waves: vessel '{vessel}' has no position in its state; waves need x,"
                 " y, psi"
             )
+        if self.waves is not None and self.waves.force_rao is not None:
+            self.waves.load_force_rao(self.waves.force_rao)
 
     def draw_plant_inputs(
         self,

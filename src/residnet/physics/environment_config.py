@@ -19,6 +19,12 @@ if TYPE_CHECKING:
 
     from residnet.physics.environment import IrregularWaves
 
+_MAX_UNRESOLVED_SHARE = 0.05
+"""Largest share of the wave loads in the two highest orders of the directions of a table.
+
+The error between the directions is .2 to 2 times this share for a box in directions of 5 to 30 deg.
+"""
+
 
 class WindLoadConfig(Config, ABC):
     """Wind loads of a vessel.
@@ -283,7 +289,8 @@ class WavesConfig(Config):
         """Read the table of wave loads.
 
         Raises:
-            ConfigError: if the file is invalid or does not cover the energetic frequencies.
+            ConfigError: if the file is invalid, does not cover the energetic frequencies, or does
+                not resolve the dependence on the direction.
         """
         table = read_wamit_excitation(config.file, config.unit_length, self.water_density * GRAVITY)
         longest_period = self.peak_period / 0.7
@@ -294,6 +301,18 @@ class WavesConfig(Config):
                 f"{config.file}: periods {table_periods[-1]:.3g} to {table_periods[0]:.3g} s;"
                 f" expected {shortest_period:.3g} to {longest_period:.3g} s for a peak period of"
                 f" {self.peak_period:.3g} s; extend the table or change the peak period"
+            )
+        omega = np.linspace(0.5, 4.0, 200) * 2.0 * np.pi / self.peak_period
+        density = self.spectrum.spectral_density(omega, self.significant_height, self.peak_period)
+        share = table.unresolved_share(omega, density)
+        if share > _MAX_UNRESOLVED_SHARE:
+            step_deg = 360.0 / table.response.shape[1]
+            raise ConfigError(
+                f"{config.file}: wave directions in steps of {step_deg:.3g} deg do not resolve the"
+                f" loads at a peak period of {self.peak_period:.3g} s: the two highest orders of"
+                f" their Fourier series hold {share:.0%} of the load, expected at most"
+                f" {_MAX_UNRESOLVED_SHARE:.0%}; compute directions in steps of {step_deg / 2:.3g}"
+                " deg"
             )
         return table
 

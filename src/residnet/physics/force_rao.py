@@ -53,7 +53,7 @@ class ForceRao:
         lower = upper - 1
         step = self.omega[upper] - self.omega[lower]
         share = np.clip((omega - self.omega[lower]) / step, 0.0, 1.0)[..., None, None]
-        values = (1.0 - share) * self.response[lower] + share * self.response[upper]
+        values: np.ndarray = (1.0 - share) * self.response[lower] + share * self.response[upper]
         values[omega > self.omega[-1]] = 0.0
         return values
 
@@ -75,6 +75,27 @@ class ForceRao:
             # the highest order of an even number of directions occurs once
             scale[-1] = 1.0 / n_directions
         return values @ (np.cos(angles) * scale), values @ (np.sin(angles) * scale)
+
+    def unresolved_share(self, omega: np.ndarray, weights: np.ndarray) -> float:
+        """Return the share of the load in the two highest orders of the directions.
+
+        The response of a hull of length L has orders up to about k L / 2. A table with fewer orders
+        shows it: its coefficients do not decrease towards the highest order, and values between
+        its directions are wrong. Orders 0 and 1 are not counted, which every hull has.
+
+        Args:
+            omega: wave frequencies in rad/s [F].
+            weights: energy of the waves at these frequencies, any unit [F].
+
+        Returns:
+            The largest ratio of root mean squares among surge, sway, roll and yaw.
+        """
+        cosine, sine = self.fourier_coefficients(omega)
+        energy = np.einsum("f,fkm->km", weights, np.abs(cosine) ** 2 + np.abs(sine) ** 2)
+        highest = energy[:, max(2, energy.shape[1] - 2) :].sum(axis=1)
+        total = energy.sum(axis=1)
+        # an axis without load is resolved
+        return float(np.sqrt(highest / np.where(total > 0.0, total, 1.0)).max())
 
 
 def read_wamit_excitation(path: Path, unit_length: float, specific_weight: float) -> ForceRao:

@@ -22,8 +22,9 @@ from residnet.core.errors import DataError, ExportError, ResidnetError, UsageErr
 from residnet.core.files import stage_files
 from residnet.core.names import suggest_name
 from residnet.core.processes import retain_freed_memory
-from residnet.core.registry import find_part_packages
+from residnet.core.registry import find_part_packages, iterate_configs
 from residnet.core.run_records import ExportRow, ExportsFile, MainFigure
+from residnet.physics.environment_config import ForceRaoConfig
 from residnet.runs.folder import Provenance, RunFolder, require_apart, write_checksums
 
 if TYPE_CHECKING:
@@ -234,6 +235,12 @@ class Task(Config):
         """Return the files whose contents determine the results."""
         return ()
 
+    @final
+    def recorded_files(self) -> list[Path]:
+        """Return the files whose checksums the provenance records: inputs and tables of waves."""
+        tables = [part.file for part in iterate_configs(self) if isinstance(part, ForceRaoConfig)]
+        return [*self.input_files(), *dict.fromkeys(tables)]
+
     def provenance_seed(self) -> int:
         """Return the seed that the provenance records."""
         return 0
@@ -270,7 +277,7 @@ class Task(Config):
         RunFolder(folder_path).require_usable(resolved_yaml, resume=resume, overwrite=overwrite)
         self.check()
         provenance = Provenance(
-            source, overrides, self.provenance_seed(), self.input_files(), time.time()
+            source, overrides, self.provenance_seed(), self.recorded_files(), time.time()
         )
         if resume:
             provenance.require_same_inputs(RunFolder(folder_path))

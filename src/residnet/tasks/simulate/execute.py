@@ -54,6 +54,11 @@ def execute(config: SimulateConfig, folder: RunFolder) -> TaskOutcome:
     """
     programme = config.programme
     if programme is not None:
+        if programme.model is not None and programme.disturbance.waves is not None:
+            log_message(
+                f"model '{programme.model.model_folder.name}' has no input for wave loads; it is"
+                " simulated in calm water"
+            )
         flights_by_craft = [
             (craft, simulate_all(programme, craft, sea)) for craft, sea in build_crafts(programme)
         ]

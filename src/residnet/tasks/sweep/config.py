@@ -570,7 +570,7 @@ class SweepConfig(PackageTask):
     def input_files(self) -> list[Path]:
         """Return the base and its input files."""
         base = load_config(self.base, self.common, SweepableConfig)
-        return [self.base, *base.input_files()]
+        return [self.base, *base.recorded_files()]
 
     def provenance_seed(self) -> int:
         if isinstance(self.search, VariantSearch):
