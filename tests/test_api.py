@@ -22,8 +22,11 @@ from residnet.evaluation.metrics import build_metrics_table
 from residnet.evaluation.protocol import EvaluationConfig
 from residnet.evaluation.records import MetricsFile
 from residnet.export import vessel
+from residnet.manoeuvres.trials import simulate_trial_logs
+from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.prepare import PrepareConfig
+from residnet.training.current_config import CurrentConfig
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "fifteen_lines.py"
 CHANNELS = {
@@ -267,6 +270,41 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> No
     loaded = residnet.load(tiny_run, "ridge")
     assert loaded.coefficients.empty
     assert loaded.notes["validation"] == pytest.approx(models["ridge"].notes["validation"])
+
+
+def test_currents_are_estimated_as_by_the_key_of_a_config() -> None:
+    config = copy.deepcopy(TINY)
+    config["data"]["disturbance"] = {"current_each": [0.2, 0.4]}
+    config |= {"heads": {}, "ensembles": {}, "training": {}, "current": {}, "bands": None}
+    config["baseline"] = {"kind": "regressors", "sets": ["linear"]}
+    simulated = validate_config(config["data"], SimulatedTrials, "data")
+    names = [log.name for log in simulate_trial_logs(simulated.draw_manoeuvres(), simulated)]
+    truth = simulated.disturbance.draw_currents(len(names), simulated.seed)
+    prepared = config["prepare"]
+    data = residnet.prepare(
+        config["data"],
+        config["signals"]["inputs"],
+        forces=config["signals"]["forces"],
+        step=prepared["grid"]["step"],
+        derivative=prepared["derivative"],
+        hold="start",
+        held_channels=(),
+    )
+    models = residnet.fit(data, config["baseline"], current={}, bands=None)
+    currents = models.currents.set_index("log")
+    assert set(currents.index) == {log.log.name for logs in data.splits.values() for log in logs}
+    components = ["current_north", "current_east"]
+    error = currents[components] - pd.DataFrame(truth, names, components)
+    assert error.abs().median().max() < 0.1
+    still = residnet.fit(data, config["baseline"], bands=None)
+    assert still.currents.empty
+    assert list(still.currents.columns) == ["log", *currents.columns]
+    # the baseline is that of the motion through the water
+    assert not models["baseline"].coefficients.equals(still["baseline"].coefficients)
+    again = residnet.fit(data, config["baseline"], current=CurrentConfig(), bands=None)
+    pd.testing.assert_frame_equal(again.currents, models.currents)
+    with pytest.raises(ResidnetError, match=r"current\.spread"):
+        residnet.fit(data, config["baseline"], current={"spread": -1.0})
 
 
 # 3 s; tasks/test_simulate.py simulates by config

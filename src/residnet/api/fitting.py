@@ -58,6 +58,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from residnet.training.current_config import CurrentConfig
+    from residnet.training.records import CurrentRow
     from residnet.training.trainer import Callback, Logger
 
 
@@ -303,18 +305,43 @@ class Models(dict[str, Model]):
 
     Attributes:
         identified: results of the identification.
-        data: dataset of the fit and of the evaluation.
+        data: dataset of the fit and of the evaluation; with `current` the motion through the water.
         settings: settings of the fit.
 
     Example:
         models["lstm"].step(x, w)
     """
 
-    def __init__(self, identified: IdentifiedModels, data: Dataset) -> None:
+    def __init__(
+        self, identified: IdentifiedModels, data: Dataset, currents: Sequence[CurrentRow] = ()
+    ) -> None:
+        self._currents = tuple(currents)
         super().__init__({name: Model(fitted_model) for name, fitted_model in identified.items()})
         self.identified = identified
         self.data = data
         self.settings: FitSettings = identified.settings
+
+    @property
+    def currents(self) -> pd.DataFrame:
+        """The estimated current of each log, as in `currents.json`; no rows without `current`.
+
+        Columns: log; fitted, whether the log is of training or validation; current_north and
+            current_east, velocity of the water in m/s; standard_error_north, standard_error_east
+            in m/s; p_value, probability of such an estimate without a current, NaN if not tested.
+        """
+        import pandas as pd
+
+        columns = ("log", "fitted", "current_north", "current_east")
+        errors = ("standard_error_north", "standard_error_east")
+        rows = [
+            {
+                **{name: getattr(row, name) for name in columns},
+                **dict(zip(errors, row.standard_error, strict=True)),
+                "p_value": np.nan if row.p_value is None else row.p_value,
+            }
+            for row in self._currents
+        ]
+        return pd.DataFrame(rows, columns=[*columns, *errors, "p_value"])
 
     @cached_property
     def runs(self) -> dict[str, FreeRuns]:
@@ -408,6 +435,7 @@ def fit(
     heads: PartLike | Sequence[str] | Mapping[str, PartLike] = (),
     *,
     baselines: Mapping[str, PartLike] | None = None,
+    current: Mapping[str, Any] | CurrentConfig | bool | None = None,
     threads: int = 1,
     workers: int = 1,
     trust: bool = False,
@@ -432,6 +460,11 @@ def fit(
             `n_state`. It receives the channels z [B, nz], standardised over the training samples,
             and returns residual accelerations rho [B, n] in units of their standard deviations.
         baselines: further baselines by name.
+        current: estimation of a constant current for each log, as the key `current` of a config: a
+            mapping such as `{"baseline": "baseline", "spread": 0.5}`; `{}` or True take the
+            defaults, None or False stand for still water. All models, the hull and the baselines
+            among them, are then fitted to the motion through the water. The estimates are
+            `models.currents`. The named baseline has regressors.
         threads: number of PyTorch threads; one is fastest for the small matrix products.
         workers: number of models fitted in parallel processes; the results do not change. With more
             than one worker, a script must call `fit` under `if __name__ == "__main__":`, since each
@@ -443,12 +476,12 @@ def fit(
             process one after another.
         logger: Lightning logger for these trainings; None for none.
         settings: further keys of a fit, as in YAML: recipe, effort, base_of, forces, ensembles,
-            means, training, refit, current, bands, seed, and integrator (default for the recipe:
-            as `residnet new` chooses it).
+            means, training, refit, bands, seed, and integrator (default for the recipe: as
+            `residnet new` chooses it).
 
     Raises:
         ConfigError: if a setting is wrong.
-        FitError: if the data do not determine the coefficients of a model.
+        FitError: if the data do not determine the coefficients of a model, or their currents.
         DataError: if a split contains no sample or no window.
 
     Example:
@@ -461,6 +494,8 @@ def fit(
             data = prepare(data)
         if baselines:
             settings["baselines"] = parse_named_parts(baselines, "baseline", BaselineConfig)
+        if current is not None and current is not False:
+            settings["current"] = {} if current is True else current
         config = make_fit_settings(data, baseline, heads, settings)
         extensions = None
         if callbacks or logger is not None:
@@ -472,9 +507,9 @@ def fit(
             for split in ("validation", "test"):
                 for log in data.logs(split):
                     check_window_fits(log, config)
-            splits, _ = convert_to_motion_through_water(data.splits, config)
+            splits, currents = convert_to_motion_through_water(data.splits, config)
             identified = identify(splits, config, extensions=extensions)
-            return Models(identified, replace(data, splits=splits))
+            return Models(identified, replace(data, splits=splits), currents)
 
 
 def make_fit_settings(
