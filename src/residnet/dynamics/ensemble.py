@@ -115,13 +115,19 @@ class MeanOfTrajectories(HybridDynamics):
     integrated with the mean velocities.
 
     Args:
-        members: models with the same signals and time step, equally weighted.
+        members: models with the same signals and time step.
         low: smallest dynamic states in the training data [n].
         high: largest dynamic states in the training data [n].
+        weights: weight of each member in each dynamic state [M, n], with a sum of 1 over the
+            members; empty for equal weights.
     """
 
     def __init__(
-        self, members: Sequence[HybridDynamics], low: Sequence[float], high: Sequence[float]
+        self,
+        members: Sequence[HybridDynamics],
+        low: Sequence[float],
+        high: Sequence[float],
+        weights: Sequence[Sequence[float]] = (),
     ) -> None:
         first = members[0]
         super().__init__(
@@ -135,6 +141,11 @@ class MeanOfTrajectories(HybridDynamics):
         for member in self.members:
             # the pose is integrated with the mean velocities
             member.has_position = False
+        equal_weights = [[1.0 / len(members)] * self.dof] * len(members)
+        self.weights = nn.Buffer(
+            torch.tensor(weights or equal_weights, dtype=torch.float64), persistent=False
+        )
+        self.has_equal_weights = not weights
         self.copies = [member.head.batch_ensemble_size for member in members]
         self.memory_sizes = [self.dof + member.n_state for member in members]
         # memory of the mean: a flag whether there is a prediction, and the predicted velocities;
@@ -189,6 +200,18 @@ class MeanOfTrajectories(HybridDynamics):
         memory = part[..., self.dof :].reshape(copies * n_rows, size - self.dof)
         return states.reshape(copies * n_rows, -1), memory
 
+    def _weighted_mean(self, values: Sequence[Tensor]) -> Tensor:
+        """Return the weighted mean of values [..., n] of the members."""
+        total = torch.zeros_like(values[0])
+        if self.has_equal_weights:
+            # one division keeps the rounding of a plain mean
+            for member_values in values:
+                total = total + member_values
+            return total / len(values)
+        for i, member_values in enumerate(values):
+            total = total + self.weights[i].to(total.dtype) * member_values
+        return total
+
     def _average(
         self, x: Tensor, states: list[Tensor], memories: list[Tensor]
     ) -> tuple[Tensor, Tensor]:
@@ -205,10 +228,7 @@ class MeanOfTrajectories(HybridDynamics):
             dynamic_states(state, self.dof).reshape(copies, n_rows, self.dof)
             for state, copies in zip(states, self.copies, strict=True)
         ]
-        total = torch.zeros_like(nu)
-        for velocities in member_velocities:
-            total = total + velocities.mean(dim=0)
-        mean = total / len(self.members)
+        mean = self._weighted_mean([velocities.mean(dim=0) for velocities in member_velocities])
 
         parts = [torch.ones_like(mean[:, :1]), mean]
         for i, velocities in enumerate(member_velocities):
@@ -238,16 +258,11 @@ class MeanOfTrajectories(HybridDynamics):
         return any(member.has_innovation for member in self.members)
 
     def baseline_acceleration(self, z: Tensor) -> Tensor:
-        total = zero_acceleration(z, self.dof)
-        for member in self.members:
-            total = total + member.baseline(z)
-        return total / len(self.members)
+        zero = zero_acceleration(z, self.dof)
+        return self._weighted_mean([zero + member.baseline(z) for member in self.members])
 
     def one_step_accelerations(self, z: Tensor) -> Tensor:
-        total = zero_acceleration(z, self.dof)
-        for member in self.members:
-            total = total + member.one_step_accelerations(z)
-        return total / len(self.members)
+        return self._weighted_mean([member.one_step_accelerations(z) for member in self.members])
 
     def acceleration(self, x: Tensor, w: Tensor, s: Tensor) -> Tensor:
         """Return the mean rate of change of the dynamic states [B, n] over a step."""

@@ -137,6 +137,8 @@ class ModelSpec(Stored):
         members: members of an ensemble, whose baseline and head are then empty.
         of: quantity that an ensemble averages: accelerations within one free run, or trajectories
             of independent free runs of the members.
+        weights: weight of each member of an ensemble of trajectories in each dynamic state [M, n];
+            empty for equal weights.
     """
 
     schema_name: Literal["residnet.model/1"] = Field(default="residnet.model/1", alias="schema")
@@ -155,6 +157,7 @@ class ModelSpec(Stored):
     domain: OperatingDomain | None = None
     members: tuple[ModelSpec, ...] = ()
     of: Literal["accelerations", "trajectories"] = "accelerations"
+    weights: tuple[tuple[float, ...], ...] = ()
 
     def build(self) -> HybridDynamics:
         if self.of == "trajectories":
@@ -170,7 +173,7 @@ class ModelSpec(Stored):
     def average_trajectories(self, members: Sequence[HybridDynamics]) -> MeanOfTrajectories:
         """Return the model of the mean trajectory of several models with this description."""
         n = self.signals.dof.n_dynamic
-        return MeanOfTrajectories(members, self.low[:n], self.high[:n])
+        return MeanOfTrajectories(members, self.low[:n], self.high[:n], self.weights)
 
     def build_single_model(self) -> HybridDynamics:
         """Build the model without averaging.

@@ -23,6 +23,7 @@ from residnet.core.layout import (
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.domain import log_domain_distance
 from residnet.dynamics.domain_config import OperatingDomain
+from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
@@ -262,7 +263,7 @@ def run_free_runs(
         predictions[ensemble.name] = []
         for i, predictions_of_window in enumerate(member_predictions):
             states = [entry.states for entry in predictions_of_window]
-            nu = np.mean(states, axis=0)
+            nu = _average_members(ensemble.model, states)
             nu = nu if logs[0].dof.is_six_dof else nu[:, logs[0].dof.dynamic_columns]
             prediction = (
                 next(rerun_predictions)
@@ -320,6 +321,15 @@ def _mean_log_distance(
     if distance is None:
         return None
     return np.asarray(np.cumsum(distance) / np.arange(1, len(distance) + 1))
+def _average_members(ensemble: Dynamics, states: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the mean [L, 3 + n] of the states of the members, with the ensemble's weights."""
+    if not isinstance(ensemble, MeanOfTrajectories) or ensemble.has_equal_weights:
+        return np.asarray(np.mean(states, axis=0))
+    # the pose is integrated again from the mean velocities
+    n_pose = states[0].shape[1] - ensemble.dof
+    pose_weights = np.full((len(states), n_pose), 1.0 / len(states))
+    weights = np.concatenate((pose_weights, ensemble.weights.numpy()), axis=1)
+    return np.einsum("mk,mtk->tk", weights, np.stack(states))
 
 
 def standard_deviation_between_models(states: Sequence[np.ndarray]) -> np.ndarray:

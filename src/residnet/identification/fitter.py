@@ -30,10 +30,11 @@ from residnet.dynamics.ensemble import MeanOfTrajectories, mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, rebuild_module
 from residnet.evaluation.band import Band
-from residnet.evaluation.freerun import Candidate, FreeRunErrors, run_free_runs
+from residnet.evaluation.freerun import Candidate, FreeRunErrors, Prediction, run_free_runs
 from residnet.evaluation.protocol import EvaluationConfig, make_windows
 from residnet.heads.base import ClosedFormHead
 from residnet.identification.domain import estimate_domain
+from residnet.identification.member_evidence import MemberSelection, group_windows, select_members
 from residnet.identification.prepared import compute_velocity_limits
 from residnet.identification.recipe import TrainingDataSummary, has_enough_logs_for_networks
 from residnet.identification.settings import FitSettings
@@ -182,20 +183,23 @@ class ValidationScorer:
             protocol, logs, dt, config.selection, is_overlapping=use_overlapping_windows
         )
 
-    def __call__(self, model: HybridDynamics) -> Score:
-        """Return the divergences and the mean NRMSE of the validation windows, run in float32."""
-        # placeholder name, under which the predictions are returned
+    def run(self, model: HybridDynamics) -> tuple[list[Prediction], FreeRunErrors]:
+        """Return the free runs of a model over the validation windows, in float32, and errors."""
         candidate = Candidate("validated", "head", model)
         predictions = run_free_runs(
             [candidate], self.windows, self.logs, self.dt, self.velocity_limits, dtype=torch.float32
-        )
-        errors = FreeRunErrors.from_predictions(self.windows, predictions["validated"], self.logs)
-        n_diverged = sum(prediction.has_diverged for prediction in predictions["validated"])
+        )["validated"]
+        return predictions, FreeRunErrors.from_predictions(self.windows, predictions, self.logs)
+
+    def __call__(self, model: HybridDynamics) -> Score:
+        """Return the divergences and the mean NRMSE of the validation windows, run in float32."""
+        predictions, errors = self.run(model)
+        n_diverged = sum(prediction.has_diverged for prediction in predictions)
         dof = errors.dof
         # states that are constant zero have no error and would reduce the mean
         normalized_rmse = (errors.rmse.mean(0) / self.state_scales)[dof.active_indices]
         window = self.windows[0]
-        predicted_states = predictions["validated"][0].states
+        predicted_states = predictions[0].states
         measured = self.logs[window.log_index].y[
             window.start : window.start + len(predicted_states)
         ]
@@ -210,24 +214,6 @@ class ValidationScorer:
         example = ExampleRun(self.dt * torch.arange(len(predicted_states)), columns)
         nrmse_by_channel = dict(zip(dof.active_states, normalized_rmse.tolist(), strict=True))
         return Score(n_diverged, float(normalized_rmse.mean()), nrmse_by_channel, example)
-
-
-def find_harmful_member(members: Sequence[FittedModel]) -> FittedModel | None:
-    """Return the member with the largest error, if it degrades a mean of independent errors.
-
-    The error variance of a mean of K members is the sum of their variances over K**2. Removing the
-    largest one reduces it if that is larger than (2 K - 1) / (K - 1)**2 times the sum of the
-    others.
-    """
-    if len(members) < 2:
-        return None
-    worst_member = max(members, key=lambda member: member.notes["validation"])
-    sum_of_squares_of_others = sum(
-        member.notes["validation"] ** 2 for member in members if member is not worst_member
-    )
-    n_members = len(members)
-    max_square = (2 * n_members - 1) / (n_members - 1) ** 2 * sum_of_squares_of_others
-    return worst_member if worst_member.notes["validation"] ** 2 > max_square else None
 
 
 def select_by_free_run(
@@ -595,10 +581,10 @@ class Fitter:
     ) -> FittedModel:
         """Return the ensemble of fitted models: the mean of their trajectories.
 
-        Members that diverge on a validation window are removed. A member with so large an error
-        that it degrades the mean even of independent errors is removed if the mean of the others
-        has a smaller validation error. Candidates join if the validation error then decreases, in
-        the order of their own errors. Logs used in training do not count as evidence.
+        Members that diverge on a validation window are removed. Candidates join if the validation
+        error then decreases, in the order of their own errors. Validation windows decide which of
+        the members are used for which velocities (`member_evidence`). Logs used in training do not
+        count as evidence, except against members that are worse than constant velocity.
 
         Raises:
             FitError: if fewer than two members remain.
@@ -611,65 +597,91 @@ class Fitter:
             log_message(
                 f"  {name}: {', '.join(excluded_names)} diverged on validation logs and is excluded"
             )
-        ensemble = (
-            self._build_ensemble(name, retained_members) if len(retained_members) > 1 else None
-        )
-        while (
-            ensemble is not None
-            and not self.validation_in_training
-            and (worst_member := find_harmful_member(retained_members)) is not None
-        ):
-            remaining_members = [
-                member for member in retained_members if member is not worst_member
-            ]
-            reduced_ensemble = (
-                self._build_ensemble(name, remaining_members)
-                if len(remaining_members) > 1
-                else remaining_members[0]
-            )
-            if reduced_ensemble.notes["validation"] >= ensemble.notes["validation"]:
-                break
-            log_message(
-                f"  {name}: excluding {worst_member.name} reduces its error on validation logs"
-            )
-            excluded_names = [*excluded_names, worst_member.name]
-            retained_members = remaining_members
-            ensemble = reduced_ensemble if len(retained_members) > 1 else None
-        if ensemble is None:
-            raise FitError("no mean has a smaller error on validation logs than one of its members")
+        if len(retained_members) < 2:
+            raise FitError("fewer than two members did not diverge on validation logs")
         if not self.validation_in_training:
-            ensemble = self._extend_ensemble(name, ensemble, retained_members, candidates)
+            retained_members = self._add_candidates(name, retained_members, candidates)
+        selection = self._select_by_evidence(name, retained_members)
+        is_member = selection.is_used.any(axis=1)
+        excluded_names += [
+            member.name
+            for member, is_retained in zip(retained_members, is_member, strict=True)
+            if not is_retained
+        ]
+        retained_members = [
+            member
+            for member, is_retained in zip(retained_members, is_member, strict=True)
+            if is_retained
+        ]
+        if len(retained_members) < 2:
+            raise FitError(
+                f"on validation logs no mean has a smaller error than {retained_members[0].name}"
+            )
+        is_used = selection.is_used[is_member]
+        weights = () if is_used.all() else tuple(map(tuple, selection.weights[is_member].tolist()))
+        ensemble = self._build_ensemble(name, retained_members, weights=weights)
         ensemble.notes["left_out"] = excluded_names
         return self._save_and_reload(ensemble)
 
-    def _extend_ensemble(
-        self,
-        name: str,
-        ensemble: FittedModel,
-        members: Sequence[FittedModel],
-        candidates: Sequence[FittedModel],
-    ) -> FittedModel:
-        """Return the ensemble with the candidates that reduce its validation error."""
+    def _add_candidates(
+        self, name: str, members: Sequence[FittedModel], candidates: Sequence[FittedModel]
+    ) -> list[FittedModel]:
+        """Return the members and the candidates that reduce the validation error of their mean."""
         sound_candidates = [
             candidate for candidate in candidates if not candidate.notes["validation_diverged"]
         ]
+        extended_members = list(members)
+        if not sound_candidates:
+            return extended_members
+        smallest_error = self._build_ensemble(name, extended_members).notes["validation"]
         for candidate in sorted(sound_candidates, key=lambda one: one.notes["validation"]):
-            extended_ensemble = self._build_ensemble(name, [*members, candidate])
-            error = extended_ensemble.notes["validation"]
-            if error < (1.0 - _MIN_GAIN_OF_CANDIDATE) * ensemble.notes["validation"]:
+            error = self._build_ensemble(name, [*extended_members, candidate]).notes["validation"]
+            if error < (1.0 - _MIN_GAIN_OF_CANDIDATE) * smallest_error:
                 log_message(
                     f"  {name}: with {candidate.name} the validation error is {error:.4f} instead"
-                    f" of {ensemble.notes['validation']:.4f}"
+                    f" of {smallest_error:.4f}"
                 )
-                members = [*members, candidate]
-                ensemble = extended_ensemble
-        return ensemble
+                extended_members.append(candidate)
+                smallest_error = error
+        return extended_members
+
+    def _select_by_evidence(self, name: str, members: Sequence[FittedModel]) -> MemberSelection:
+        """Return which members are used for which velocities, and log the exclusions."""
+        scorer = self.score_on_validation
+        errors_by_member = [scorer.run(member.model)[1] for member in members]
+        reference_spec = self.build_spec(CONSTANT_VELOCITY, CONSTANT_VELOCITY, ZeroBaselineConfig())
+        constant_velocity = scorer.run(reference_spec.build())[1]
+        dof = constant_velocity.dof
+        selection = select_members(
+            [errors.velocity_errors for errors in errors_by_member],
+            constant_velocity.velocity_errors,
+            lambda errors: np.sqrt(constant_velocity.mean_by_window(errors**2)),
+            group_windows(scorer.windows),
+            dof.active_indices,
+            compares_members=not self.validation_in_training,
+        )
+        for exclusion in selection.exclusions:
+            log_message(
+                f"  {name}: {members[exclusion.member].name} is not used for"
+                f" {dof.dynamic_states[exclusion.velocity]}: on validation logs its error is"
+                f" significantly larger than that of {exclusion.reference}"
+                f" (p = {exclusion.p_value:.2g})"
+            )
+        return selection
 
     def _build_ensemble(
-        self, name: str, members: Sequence[FittedModel], averaged_quantity: str = "trajectories"
+        self,
+        name: str,
+        members: Sequence[FittedModel],
+        averaged_quantity: str = "trajectories",
+        weights: tuple[tuple[float, ...], ...] = (),
     ) -> FittedModel:
         spec = self.build_spec(name, "ensemble", ZeroBaselineConfig()).model_copy(
-            update={"members": tuple(member.spec for member in members), "of": averaged_quantity}
+            update={
+                "members": tuple(member.spec for member in members),
+                "of": averaged_quantity,
+                "weights": weights,
+            }
         )
         member_models = [copy.deepcopy(member.model).to(torch.float64) for member in members]
         trajectory_models = [
