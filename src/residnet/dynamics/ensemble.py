@@ -142,7 +142,7 @@ class MeanOfTrajectories(HybridDynamics):
             # the pose is integrated with the mean velocities
             member.has_position = False
         equal_weights = [[1.0 / len(members)] * self.dof] * len(members)
-        self.weights = nn.Buffer(
+        self.member_weights = nn.Buffer(
             torch.tensor(weights or equal_weights, dtype=torch.float64), persistent=False
         )
         self.has_equal_weights = not weights
@@ -209,7 +209,7 @@ class MeanOfTrajectories(HybridDynamics):
                 total = total + member_values
             return total / len(values)
         for i, member_values in enumerate(values):
-            total = total + self.weights[i].to(total.dtype) * member_values
+            total = total + self.member_weights[i].to(total.dtype) * member_values
         return total
 
     def _average(

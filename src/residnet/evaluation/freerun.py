@@ -328,7 +328,7 @@ def _average_members(ensemble: Dynamics, states: Sequence[np.ndarray]) -> np.nda
     # the pose is integrated again from the mean velocities
     n_pose = states[0].shape[1] - ensemble.dof
     pose_weights = np.full((len(states), n_pose), 1.0 / len(states))
-    weights = np.concatenate((pose_weights, ensemble.weights.numpy()), axis=1)
+    weights = np.concatenate((pose_weights, ensemble.member_weights.numpy()), axis=1)
     return np.einsum("mk,mtk->tk", weights, np.stack(states))
 
 
