@@ -19,7 +19,9 @@ tests (`identification.member_evidence`).
 | measured | stretches of measured logs of a model tanker |
 
 Members are a hull, ridge regression on it, and partial least squares and ridge regression on the
-linear baseline, which take seconds; `--networks` adds recurrent networks on the hull.
+linear baseline, which take seconds. With `--networks` the members are the hull, recurrent networks
+on it and recurrent networks with an encoder of the measured past, which are those of the recipe and
+of `recurrent.py`; each mean has the hull.
 """  # noqa: E501
 
 from __future__ import annotations
@@ -87,11 +89,22 @@ def draw_slow_velocity(log: Log, random: np.random.Generator) -> np.ndarray:
 def make_plan(summary: Any, has_networks: bool) -> dict[str, Any]:
     """Return the plan of the recipe with members that are fitted quickly."""
     plan = recipe.make_portfolio(summary)
-    heads = {"plsr": {"kind": "plsr"}, "ridge": {"kind": "ridge"}, "hull_ridge": {"kind": "ridge"}}
     if has_networks:
-        heads["hull_network"] = plan["heads"]["hull_network"]
+        network = plan["heads"]["hull_network"]
+        heads = {
+            "hull_network": network,
+            "encoder": {**network, "encoder": "measurements", "margin": 0.5},
+        }
+    else:
+        heads = {
+            "plsr": {"kind": "plsr"},
+            "ridge": {"kind": "ridge"},
+            "hull_ridge": {"kind": "ridge"},
+        }
     plan["heads"] = heads
     plan["base_of"] = {name: "hull" for name in heads if name.startswith("hull_")}
+    if has_networks:
+        plan["base_of"]["encoder"] = "constant_velocity"
     plan["means"] = {}
     plan["training"] = {}
     return plan
@@ -123,12 +136,16 @@ def compare_rules(case: str, seed: int, has_networks: bool) -> dict[str, Any]:
         "test": logs[N_FITTED:],
     }
     with (
-        mock.patch.object(settings, "make_portfolio", lambda s: make_plan(s, has_networks)),
+        mock.patch.object(settings, "make_portfolio", lambda s, **_: make_plan(s, has_networks)),
         # validation logs are evidence only if no member is trained on them
         mock.patch.object(fit, "should_include_validation", return_value=False),
     ):
         models = residnet.fit(splits, bands=None, effort=0.4)
-    names = ["hull", "hull_ridge", "plsr", "ridge", *(["hull_network"] if has_networks else [])]
+    names = (
+        ["hull", "hull_network", "encoder"]
+        if has_networks
+        else ["hull", "hull_ridge", "plsr", "ridge"]
+    )
     evaluation = models.data.evaluation
     scales = evaluation.scales.to_array()
     errors: dict[str, dict[str, FreeRunErrors]] = {}

@@ -140,6 +140,7 @@ def test_an_ensemble_does_not_use_the_sway_of_a_member_that_drifts(
     assert ensemble.spec.weights[0][1] == 1.0
     assert ensemble.spec.weights[1][1] == 0.0
     assert ensemble.notes["members"] == ["baseline", "drifting"]
+    assert ensemble.notes["excluded_velocities"]["drifting"] == ["v"]
 
     # the stored model is the same, and its sway is that of the first member
     save_model(tmp_path / "ensemble", ensemble.spec, model)

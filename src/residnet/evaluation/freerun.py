@@ -321,6 +321,8 @@ def _mean_log_distance(
     if distance is None:
         return None
     return np.asarray(np.cumsum(distance) / np.arange(1, len(distance) + 1))
+
+
 def _average_members(ensemble: Dynamics, states: Sequence[np.ndarray]) -> np.ndarray:
     """Return the mean [L, 3 + n] of the states of the members, with the ensemble's weights."""
     if not isinstance(ensemble, MeanOfTrajectories) or ensemble.has_equal_weights:

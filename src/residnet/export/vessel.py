@@ -352,6 +352,7 @@ class ExportedVessel(Exportable):
                 member.model_dump(mode="json", include={"name", "baseline", "head"})
                 for member in spec.members
             ],
+            "member_weights": [list(weights) for weights in spec.weights],
             "band": band_entry,
             "metrics": [row.model_dump(mode="json", exclude_unset=True) for row in self.metrics],
             "versions": {"residnet": __version__, "torch": torch.__version__},

@@ -621,6 +621,18 @@ class Fitter:
         weights = () if is_used.all() else tuple(map(tuple, selection.weights[is_member].tolist()))
         ensemble = self._build_ensemble(name, retained_members, weights=weights)
         ensemble.notes["left_out"] = excluded_names
+        dynamic_states = ensemble.model.signals.dof.dynamic_states
+        excluded_velocities = {
+            member.name: [
+                state
+                for state, is_used_for_state in zip(dynamic_states, row, strict=True)
+                if not is_used_for_state
+            ]
+            for member, row in zip(retained_members, is_used, strict=True)
+            if not row.all()
+        }
+        if excluded_velocities:
+            ensemble.notes["excluded_velocities"] = excluded_velocities
         return self._save_and_reload(ensemble)
 
     def _add_candidates(

@@ -171,6 +171,7 @@ class FitNotes(FileRecord):
         validation_diverged: number of diverged validation windows.
         baseline: name of the baseline to which a head adds its residual.
         members: members of an ensemble.
+        excluded_velocities: velocities for which a member of an ensemble is not used.
         parameters: number of fitted parameters.
         n_terms: number of basis functions; one number per axis if the axes differ.
         order: number of latent variables; one number per axis if the axes differ.
@@ -202,6 +203,7 @@ class FitNotes(FileRecord):
     validation_diverged: int = 0
     baseline: str = "baseline"
     members: tuple[str, ...] = ()
+    excluded_velocities: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     parameters: float | None = None
     n_terms: Hyperparameter | None = Field(default=None, alias="terms")
     order: Hyperparameter | None = None

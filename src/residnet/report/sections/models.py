@@ -235,7 +235,12 @@ def _head_section(run: RunFiles) -> Section | None:
 def _inputs_text(settings: ModelSettings, notes: FitNotes) -> str:
     """Return the inputs and the baseline of a head, or the members of an ensemble."""
     if notes.members:
-        return "mean of " + ", ".join(notes.members)
+        return "mean of " + ", ".join(
+            f"{name} (not for {', '.join(notes.excluded_velocities[name])})"
+            if name in notes.excluded_velocities
+            else name
+            for name in notes.members
+        )
     if settings.head is None:
         return "refitted through rollouts" if notes.refit is not None else "least squares"
     inputs = ", ".join(settings.head.features or ()) or "all channels"
