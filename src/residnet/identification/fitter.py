@@ -621,7 +621,7 @@ class Fitter:
         weights = () if is_used.all() else tuple(map(tuple, selection.weights[is_member].tolist()))
         ensemble = self._build_ensemble(name, retained_members, weights=weights)
         ensemble.notes["left_out"] = excluded_names
-        dynamic_states = ensemble.model.signals.dof.dynamic_states
+        dynamic_states = self.training_logs[0].dof.dynamic_states
         excluded_velocities = {
             member.name: [
                 state
