@@ -331,7 +331,7 @@ def _average_members(ensemble: Dynamics, states: Sequence[np.ndarray]) -> np.nda
     n_pose = states[0].shape[1] - ensemble.dof
     pose_weights = np.full((len(states), n_pose), 1.0 / len(states))
     weights = np.concatenate((pose_weights, ensemble.member_weights.numpy()), axis=1)
-    return np.einsum("mk,mtk->tk", weights, np.stack(states))
+    return np.asarray(np.einsum("mk,mtk->tk", weights, np.stack(states)))
 
 
 def standard_deviation_between_models(states: Sequence[np.ndarray]) -> np.ndarray:

@@ -602,7 +602,7 @@ class Fitter:
         if not self.validation_in_training:
             retained_members = self._add_candidates(name, retained_members, candidates)
         selection = self._select_by_evidence(name, retained_members)
-        is_member = selection.is_used.any(axis=1)
+        is_member = np.asarray(selection.is_used.any(axis=1))
         excluded_names += [
             member.name
             for member, is_retained in zip(retained_members, is_member, strict=True)

@@ -100,14 +100,16 @@ def select_members(
                     Exclusion(member, velocity, p_values[member], "constant velocity")
                 )
         while compares_members and is_used[:, velocity].sum() > 1:
-            used = np.flatnonzero(is_used[:, velocity])
-            mean_rmse = compute_rmse(sum(errors[m] for m in used) / len(used))
+            used: list[int] = np.flatnonzero(is_used[:, velocity]).tolist()
+            mean_rmse = compute_rmse(np.asarray(np.mean([errors[m] for m in used], axis=0)))
             candidates = []
             for member in used:
                 others = [m for m in used if m != member]
-                rmse_without = compute_rmse(sum(errors[m] for m in others) / len(others))
+                rmse_without = compute_rmse(
+                    np.asarray(np.mean([errors[m] for m in others], axis=0))
+                )
                 difference = (mean_rmse - rmse_without)[:, velocity]
-                candidates.append((compute_p_value(difference, blocks), int(member)))
+                candidates.append((compute_p_value(difference, blocks), member))
             p_value, worst = min(candidates)
             if p_value >= SIGNIFICANCE_LEVEL:
                 break
