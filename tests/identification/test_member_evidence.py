@@ -147,9 +147,14 @@ def test_an_ensemble_does_not_use_the_sway_of_a_member_that_drifts(
     spec, loaded = load_model(tmp_path / "ensemble")
     assert spec.weights == ensemble.spec.weights
     scorer = fitter.score_on_validation
+    # parameters are stored in float32, those of the members too
+    stored_members = []
+    for member in members:
+        save_model(tmp_path / member.name, member.spec, member.model)
+        stored_members.append(load_model(tmp_path / member.name)[1])
     candidates = [
-        Candidate("baseline", "baseline", members[0].model),
-        Candidate("drifting", "baseline", members[1].model),
+        Candidate("baseline", "baseline", stored_members[0]),
+        Candidate("drifting", "baseline", stored_members[1]),
         Candidate("from_members", "ensemble", model, members=("baseline", "drifting")),
         Candidate("from_steps", "ensemble", loaded),
     ]
@@ -158,5 +163,4 @@ def test_an_ensemble_does_not_use_the_sway_of_a_member_that_drifts(
         runs["baseline"], runs["from_members"], runs["from_steps"], strict=True
     ):
         np.testing.assert_allclose(mean.states[:, 4], first.states[:, 4], atol=1e-9)
-        # stored parameters are in float32
         np.testing.assert_allclose(mean.states[:, 3:], stepped.states[:, 3:], atol=1e-6)
