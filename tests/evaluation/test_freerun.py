@@ -226,6 +226,25 @@ def test_a_mean_is_that_of_the_trajectories_of_its_members() -> None:
         np.testing.assert_allclose(one.states, other.states, atol=1e-9)
 
 
+def test_members_start_from_a_measured_state_that_equals_the_prediction() -> None:
+    """The state after a warm-up is measured, even if the innovation is zero by chance."""
+    theta = np.zeros((2, 3, 6))
+    theta[0, 1, 0] = 0.5
+    theta[1, 1, 0] = -0.5
+    models = [hybrid(coefficients).double() for coefficients in theta]
+    mean = MeanOfTrajectories(models, (-1.0,) * 3, (1.0,) * 3)
+    past = torch.tensor([[[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]]] * 2, dtype=torch.float64)
+    inputs = torch.zeros(2, 1, mean.signals.n_inputs, dtype=torch.float64)
+    predicted, memory = mean.step(past[:, 0], inputs[:, 0], mean.initial_state(2).double())
+    warmed_up = mean.warmup(past, inputs)
+    torch.testing.assert_close(warmed_up[:, 1:], memory[:, 1:])
+    # the members deviate from each other after the step, and no longer after the measurement
+    for s, deviates in ((memory, True), (warmed_up, False)):
+        next_memory = mean.step(predicted, inputs[:, 0], s)[1]
+        deviation = next_memory[:, 4:7] - mean.step(predicted, inputs[:, 0], 0.0 * s)[1][:, 4:7]
+        assert (float(deviation.abs().max()) > 1e-3) == deviates
+
+
 def test_a_window_beyond_short_training_logs_is_no_divergence() -> None:
     """A vessel that does more than it did in training exceeds the limit itself, and so does
     `constant_velocity` that holds its velocities.

@@ -109,10 +109,11 @@ class MeanOfTrajectories(HybridDynamics):
 
     The memory holds the prediction of the mean, and for every member the deviation of its
     velocities from the mean and its own memory. If the next state is the prediction, each member
-    continues from its own velocities; if the next state is measured, all members start from it. In
-    between, the deviations decrease with the square of the ratio of the innovation to a small
-    velocity, so that the step is differentiable. Members share heading and position, which are
-    integrated with the mean velocities.
+    continues from its own velocities; if the next state is measured, all members start from it.
+    After a warm-up the next state is known to be measured. After a step, the innovation
+    distinguishes them: the deviations decrease with the square of its ratio to a small velocity, so
+    that the step is differentiable. Members share heading and position, which are integrated with
+    the mean velocities.
 
     Args:
         members: models with the same signals and time step.
@@ -250,8 +251,17 @@ class MeanOfTrajectories(HybridDynamics):
         # no training uses this model, and the autograd graph of a long past would need much memory
         with torch.no_grad():
             for k in range(y_history.shape[1]):
-                s = self.step(y_history[:, k], w_history[:, k], s)[1]
+                s = self.mark_measured(self.step(y_history[:, k], w_history[:, k], s)[1])
         return s
+
+    def mark_measured(self, s: Tensor) -> Tensor:
+        # a measured state that equals the prediction by chance would otherwise pass for it, and the
+        # members would start with their deviations
+        return torch.cat((torch.zeros_like(s[:, :1]), s[:, 1:]), dim=-1)
+
+    @property
+    def has_prediction_flag(self) -> bool:
+        return True
 
     @property
     def has_innovation(self) -> bool:

@@ -388,6 +388,15 @@ class HybridDynamics(Dynamics):
             s = self.step(y_history[:, k], w_history[:, k], s)[1]
         return s
 
+    def mark_measured(self, s: Tensor) -> Tensor:
+        """Return the memory [B, n_state] after a step that is followed by a measured state."""
+        return s
+
+    @property
+    def has_prediction_flag(self) -> bool:
+        """Whether the first entry of the memory says that the next state is predicted."""
+        return False
+
     @property
     def has_innovation(self) -> bool:
         """Whether the memory holds the innovation of the measured past."""

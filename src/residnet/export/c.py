@@ -555,6 +555,12 @@ def _render_vessel_functions(prefix: str, exported: ExportedVessel) -> list[tupl
     real_type = f"{prefix}_real"
     has_memory = exported.model.n_state > 0
     zero_loop = f"    size_t k;\n    for (k = 0; k < {prefix_upper}_MEMORY; k++) s[k] = 0;\n"
+    warmup_body = render_template(
+        "c_warmup.c",
+        p=prefix,
+        P=prefix_upper,
+        has_prediction_flag=exported.model.has_prediction_flag,
+    )
     unused_casts = "    (void)x;\n    (void)w;\n    (void)count;\n    (void)s;\n"
     band_table: BandTable | None = exported.spec.band
     steps = (1,) if band_table is None else band_table.steps
@@ -576,7 +582,7 @@ def _render_vessel_functions(prefix: str, exported: ExportedVessel) -> list[tupl
             "memory that a measured past leaves: count states and inputs, oldest first",
             f"void {prefix}_warmup(const {real_type} *x, const {real_type} *w, size_t count,"
             f" {real_type} *s)",
-            render_template("c_warmup.c", p=prefix, P=prefix_upper) if has_memory else unused_casts,
+            warmup_body if has_memory else unused_casts,
         ),
         (
             f"half widths of {', '.join(band_channels)} k steps after a measured state: between"

@@ -117,7 +117,9 @@ class GuardedVesselModule(nn.Module):
         examples = tuple(torch.zeros(2, size) for size in sizes)
         what = f"model {spec.name}"
         self.guarded_step = trace_function(guard.flagged_step, examples, what)
-        self.next_memory = trace_function(lambda x, w, s: model.step(x, w, s)[1], examples, what)
+        self.next_memory = trace_function(
+            lambda x, w, s: model.mark_measured(model.step(x, w, s)[1]), examples, what
+        )
         self.ranges = guard.ranges
         self.of_state = guard.state_ranges
         band_table = spec.band
@@ -330,6 +332,12 @@ class ExportedVessel(Exportable):
                 "mean": "the mean of the samples at the step's start and end",
             }[spec.hold],
             "memory": self.model.n_state,
+            # only for ensembles, whose members otherwise continue from their own velocities
+            **(
+                {"measured_state": "set memory entry 0 to 0 before a step from a measured state"}
+                if self.model.has_prediction_flag
+                else {}
+            ),
             "dt": spec.dt,
             "integrator": spec.integrator,
             "frame": _FRAME_TEXT,
@@ -479,8 +487,9 @@ class ExportedVessel(Exportable):
     def warm_up_memory(self, loaded: LoadedExport, y: NumberArray, w: NumberArray) -> NumberArray:
         """Return the memory after states [T, 3 + n] and inputs [T, m] of a measured past.
 
-        Formats without `warmup` use steps. An invalid sample is replaced by the last valid sample
-        before it, or by the first valid sample after it.
+        Formats without `warmup` use steps, after each of which the memory is marked for a measured
+        state. An invalid sample is replaced by the last valid sample before it, or by the first
+        valid sample after it.
         """
         loaded_memory = loaded.initial_memory(y, w)
         if loaded_memory is not None:
@@ -492,6 +501,7 @@ class ExportedVessel(Exportable):
         for k in range(len(y) if any(is_good) else 0):
             sample_index = k if is_good[k] else sample_index
             s = loaded.step(y[sample_index], w[sample_index], s)[1]
+            s = self.model.mark_measured(torch.from_numpy(s[None]))[0].numpy()
         return s
 
     def check_tracks(
