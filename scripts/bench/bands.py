@@ -15,7 +15,7 @@ of coverage among single logs indicate the accuracy of the coverage.
     python scripts/bench/bands.py RUN [--model physics]
     python scripts/bench/bands.py --cross CONFIG [--model physics] [--alone] [--kinds] [-s K=V]
     python scripts/bench/bands.py --draws 12 [--seed 0] [--logs 40] [--test 25] [--others]
-        [--calibrated 2]
+        [--calibrated 2] [--level 0.95]
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ FAMILY_SETTINGS: dict[str, dict[str, Any]] = {
 MAX_FORCE_STD = {"wam_v_cal": (20, 20, 20), "example_rudder_boat": (40, 40, 80)}
 """Largest standard deviations of the random forces on each vessel in N and N m."""
 _COVERAGE_TOLERANCE = 0.02
-"""Accepted difference of the mean coverage from 0.9."""
+"""Accepted difference of the mean coverage from its level."""
 
 
 def add_runs(
@@ -202,7 +202,7 @@ def simulate_drawn_logs(
 
 
 def evaluate_drawn_vessel(
-    runs_by_model: RunsByModel, vessel: str, number: int, logs: dict[str, list[Log]]
+    runs_by_model: RunsByModel, vessel: str, number: int, logs: dict[str, list[Log]], level: float
 ) -> None:
     """Fit models to the logs of a drawn vessel, and add their free runs over the test logs."""
     training_values = {
@@ -214,6 +214,7 @@ def evaluate_drawn_vessel(
         baselines={"hull": {"kind": "regressors", "sets": ["fossen"], "ridge": 1e-6}},
         refit={"hull": {"horizon": 10.0, "every": 10.0, "iterations": 4}},
         heads={"ridge": {"kind": "ridge"}},
+        bands={"level": level},
         evaluation={
             "protocols": {
                 "T30": {"kind": "windows", "length": 29.0},
@@ -323,12 +324,13 @@ def print_tables(runs_by_model: RunsByModel) -> None:
             print(f"score over that of {name:15s}{cells}")
 
 
-def print_single_models(runs_by_model: RunsByModel, n_calibration_logs: int) -> None:
+def print_single_models(runs_by_model: RunsByModel, n_calibration_logs: int, level: float) -> None:
     """Print how single models fare, and how much so few logs let a mean coverage scatter."""
     overall = np.array([compute_coverage(runs)[-2] for runs in runs_by_model.values()])
-    share_within = np.mean(np.abs(overall - 0.9) <= _COVERAGE_TOLERANCE)
+    share_within = np.mean(np.abs(overall - level) <= _COVERAGE_TOLERANCE)
     print(
-        f"\nmean coverage of single models within .88 and .92: {share_within:.2f} of {len(overall)}"
+        f"\nmean coverage of single models within {_COVERAGE_TOLERANCE} of {level}:"
+        f" {share_within:.2f} of {len(overall)}"
     )
     rows = []
     scatters = []
@@ -358,7 +360,7 @@ def print_single_models(runs_by_model: RunsByModel, n_calibration_logs: int) -> 
         "\nstandard deviation of the mean coverage:"
         f" {np.sqrt(np.square(scatters).mean()):.3f} (rms over models)"
         f" for {n_calibration_logs} calibration logs and these test logs: correct intervals have a"
-        f" share of {expected_share:.2f} within {_COVERAGE_TOLERANCE} of 0.9"
+        f" share of {expected_share:.2f} within {_COVERAGE_TOLERANCE} of {level}"
     )
 
 
@@ -367,6 +369,7 @@ def main() -> None:
     options = bench.options(
         __doc__, run=("runs/esso_osaka",), cross=None, model=None, alone=False, kinds=False, s=[],
         draws=0, seed=0, logs=40, test=25, others=False, calibrated=2,
+        level=0.95,
     )  # fmt: skip
     if options.draws:
         runs_by_model = RunsByModel()
@@ -377,7 +380,7 @@ def main() -> None:
             logs = simulate_drawn_logs(
                 vessel, random, options.logs, options.test, options.others, options.calibrated
             )
-            evaluate_drawn_vessel(runs_by_model, vessel, number, logs)
+            evaluate_drawn_vessel(runs_by_model, vessel, number, logs, options.level)
             seconds = time.process_time() - start_time
             print(f"draw {number + 1}: {vessel}, {seconds:.0f} s", flush=True)
     elif options.cross:
@@ -394,7 +397,7 @@ def main() -> None:
         runs_by_model = read_stored_run(Path(options.run[0]), options.model)
     print_tables(runs_by_model)
     if options.draws:
-        print_single_models(runs_by_model, options.logs)
+        print_single_models(runs_by_model, options.logs, options.level)
 
 
 if __name__ == "__main__":

@@ -42,13 +42,14 @@ class BandsConfig(Config):
     are fitted again; a refit through rollouts takes one Gauss-Newton step per fold.
 
     Attributes:
-        level: nominal coverage by sample.
+        level: nominal coverage by sample of each channel; two channels are both covered with a
+            probability of at least 2 `level` - 1 (Bonferroni).
         folds: number of folds of the training logs.
         every: time between the starts of the calibration runs of window protocols, in s.
         seed: seed of the division into folds.
     """
 
-    level: float = Field(default=0.9, gt=0.5, lt=1)
+    level: float = Field(default=0.95, gt=0.5, lt=1)
     folds: int = Field(default=5, ge=2)
     every: Seconds = Field(default=10.0, gt=0)
     seed: int = Field(default=0, ge=0)

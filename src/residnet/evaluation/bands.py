@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -223,8 +224,6 @@ def band_limits(states: np.ndarray, half_width: np.ndarray) -> tuple[np.ndarray,
     return states - half_widths_of_states, states + half_widths_of_states
 
 
-MIN_LOGS = 9
-"""Smallest number of logs that can guarantee 90 % coverage for any error distribution."""
 _MAX_HORIZONS = 100
 """Largest number of horizons at which half widths are tabulated."""
 _SMOOTHING_SHARE = 0.11
@@ -371,7 +370,9 @@ def calibrate_band(
         weighted_quantile(largest_ratios, weights, corrected_level), nan=1.0
     )
     return replace(
-        band, simultaneous_factor=simultaneous_factor, cautions=describe_few_logs(band.n_logs)
+        band,
+        simultaneous_factor=simultaneous_factor,
+        cautions=describe_few_logs(band.n_logs, coverage_level),
     )
 
 
@@ -477,13 +478,18 @@ def _cross_fitted_scales(runs: _CalibrationRuns) -> np.ndarray:
     return scales
 
 
-def describe_few_logs(n_logs: int) -> tuple[str, ...]:
-    """Return a caution if there are too few logs for a guaranteed coverage; else nothing."""
-    if n_logs >= MIN_LOGS:
+def describe_few_logs(n_logs: int, coverage_level: float) -> tuple[str, ...]:
+    """Return a caution if there are too few logs for a guaranteed coverage; else nothing.
+
+    The largest of n exchangeable scores covers a new one with probability n / (n + 1).
+    """
+    min_logs = math.ceil(coverage_level / (1.0 - coverage_level) - 1e-9)
+    if n_logs >= min_logs:
         return ()
     subject = f"{n_logs} logs calibrate" if n_logs > 1 else "One log calibrates"
     return (
-        f"{subject} this band; with fewer than {MIN_LOGS}, 90 % coverage cannot be"
+        f"{subject} this band; with fewer than {min_logs}, {100.0 * coverage_level:.3g} % coverage"
+        " cannot be"
         " guaranteed for every distribution of errors.",
     )
 

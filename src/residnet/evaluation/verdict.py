@@ -727,8 +727,8 @@ def describe_extrapolation(evidence: VerdictEvidence) -> str:
     )
 
 
-_NOMINAL_MISS_RATE = 0.1
-"""Share of samples outside of 90 % prediction intervals."""
+_NOMINAL_MISS_RATE = 0.05
+"""Share of samples outside of 95 % prediction intervals."""
 
 
 def describe_distance(evidence: VerdictEvidence) -> str:

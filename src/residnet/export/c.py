@@ -565,6 +565,7 @@ def _render_vessel_functions(prefix: str, exported: ExportedVessel) -> list[tupl
     band_table: BandTable | None = exported.spec.band
     steps = (1,) if band_table is None else band_table.steps
     band_channels = exported.spec.signals.dof.layout.band_channels
+    level_text = "" if band_table is None else f"{100.0 * band_table.level:.3g} % "
     width_rows = (
         [(math.inf,) * len(band_channels)]
         if band_table is None
@@ -585,9 +586,10 @@ def _render_vessel_functions(prefix: str, exported: ExportedVessel) -> list[tupl
             warmup_body if has_memory else unused_casts,
         ),
         (
-            f"half widths of {', '.join(band_channels)} k steps after a measured state: between"
-            "\n * steps of the table interpolated, beyond the last in proportion to time, infinite"
-            "\n * without a table",
+            f"half widths of the {level_text}prediction intervals of"
+            f"\n * {', '.join(band_channels)} k steps after a measured state: between steps of"
+            "\n * the table interpolated, beyond the last in proportion to time, infinite without a"
+            "\n * table",
             f"void {prefix}_band(int k, {real_type} *half)",
             band_body,
         ),

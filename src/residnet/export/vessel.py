@@ -61,9 +61,10 @@ _WAVE_LOADS_TEXT = (
     " whatever their waves"
 )
 _BAND_TEXT = (
-    "half widths of the errors of a free run so many steps after a measured state, whatever the run"
-    " is like; between the steps they are interpolated, and beyond the last they grow in proportion"
-    " to time, without any promise; the position's is the radius about the predicted one"
+    "half widths of the {:.3g} % prediction intervals of the errors of a free run so many steps"
+    " after a measured state, whatever the run is like; the level is that of each channel; between"
+    " the steps they are interpolated, and beyond the last they grow in proportion to time, without"
+    " any promise; the position's is the radius about the predicted one"
 )
 
 
@@ -313,7 +314,11 @@ class ExportedVessel(Exportable):
         if band is not None:
             horizon = band.steps[-1] * spec.dt
             widths = band.model_dump(mode="json", exclude_none=True)
-            band_entry = {"about": _BAND_TEXT, "horizon": horizon, **widths}
+            band_entry = {
+                "about": _BAND_TEXT.format(100.0 * band.level),
+                "horizon": horizon,
+                **widths,
+            }
         return {
             "schema": "residnet.card/1",
             "model": spec.name,

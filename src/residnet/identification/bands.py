@@ -428,7 +428,7 @@ class _ProtocolCalibration:
                 band,
                 cautions=(
                     _VALIDATION_ONLY_CAUTION.format(n_logs, reason_text),
-                    *describe_few_logs(n_logs),
+                    *describe_few_logs(n_logs, self.config.level),
                 ),
             )
         reference_band = known_bands[reference_name]
@@ -444,7 +444,10 @@ class _ProtocolCalibration:
             unconditional_width=reference_band.unconditional_width * width_ratios,
             constant_width=reference_band.constant_width * width_ratios,
             n_logs=n_logs,
-            cautions=(_SCALED_CAUTION.format(reference_name, n_logs), *describe_few_logs(n_logs)),
+            cautions=(
+                _SCALED_CAUTION.format(reference_name, n_logs),
+                *describe_few_logs(n_logs, self.config.level),
+            ),
         )
 
 

@@ -463,10 +463,11 @@ def bands_section(run: RunFiles) -> Section | None:
     band = next(iter(next(iter(run.bands.values())).values()))
     level = f"{100 * band.level:.0f} %"
     introduction = [
-        f"A band contains {level} of the errors of free runs on new logs. Its width grows with the"
-        " horizon, with the variation of the predicted run, and with the differences between the"
-        " models. It is calibrated on logs that the model was not fitted to: training logs in"
-        " leave-one-log-out cross-validation, and validation logs.",
+        f"A band is the {level} prediction interval of the errors of free runs on new logs. The"
+        " level is that of each channel. Its width grows with the horizon, with the variation of"
+        " the predicted run, and with the differences between the models. It is calibrated on logs"
+        " that the model was not fitted to: training logs in leave-one-log-out cross-validation,"
+        " and validation logs.",
         f"The tables have the coverage on the {run.report_split} data. Whole: share of runs that"
         f" are within the band from beginning to end, for the band of each channel widened to"
         f" contain {level} of them. Score: interval score, the mean width plus"
