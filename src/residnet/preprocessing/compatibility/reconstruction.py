@@ -243,6 +243,17 @@ class _Residuals:
         exponent = (_STUDENT_DOF + self.dimension) / self.dimension
         return float(exponent * np.log1p(self.squares / _STUDENT_DOF).sum())
 
+    def scale(self, factor: float, sensor: Sensor | None) -> _Residuals:
+        """Return the residuals of a sensor, or of a dynamic equation, times a factor."""
+        return replace(
+            self,
+            values=factor * self.values,
+            by_state={key: factor * derivative for key, derivative in self.by_state.items()},
+            by_error={key: factor * derivative for key, derivative in self.by_error.items()},
+            sensor=sensor,
+            squares=None if self.squares is None else factor**2 * self.squares,
+        )
+
 
 @dataclass
 class _Solver:
@@ -322,7 +333,8 @@ class _Problem:
                     states + share * state_step, errors + share * error_step
                 )
                 new_cost = self._compute_cost(candidate, errors + share * error_step)
-                if new_cost < cost + 1e-6 * abs(cost) + 1e-3:
+                is_accepted = new_cost < cost + 1e-6 * abs(cost) + 1e-3
+                if is_accepted:
                     break
                 share *= 0.4
             states = states + share * state_step
@@ -330,8 +342,12 @@ class _Problem:
             residuals = candidate
             noise_change = 0.0
             if iteration:
+                inverse_noise = self._compute_inverse_noise()
                 noise_change = self._update_noise(residuals, solver)
-                residuals = self._linearize(states, errors)
+                if is_accepted:
+                    residuals = self._whiten_again(residuals, inverse_noise)
+                else:
+                    residuals = self._linearize(states, errors)
             is_calm = abs(cost - new_cost) < 0.3 + 1e-5 * abs(cost) and noise_change < 0.03
             n_calm = n_calm + 1 if is_calm and share == 1.0 else 0
             if n_calm >= 2:
@@ -479,7 +495,7 @@ class _Problem:
         )
         groups.append(
             _Residuals(
-                "pose",
+                "heading",
                 nodes,
                 heading_error * heading_weight,
                 {
@@ -511,7 +527,7 @@ class _Problem:
             )
             groups.append(
                 _Residuals(
-                    "pose",
+                    "position",
                     nodes,
                     position_errors[axis] * position_weight,
                     derivatives_by_axis[axis],
@@ -519,6 +535,29 @@ class _Problem:
                 )
             )
         return groups
+
+    def _compute_inverse_noise(self) -> dict[str, float]:
+        """Return the factor of each group of residuals that is inverse to its noise level."""
+        factors = {f"jerk {k}": q**-0.5 for k, q in enumerate(self.jerk_intensity.tolist())}
+        factors["heading"], factors["position"] = self._pose_weights
+        factors |= {f"sensor {k}": 1.0 / s.noise_std for k, s in enumerate(self.sensors)}
+        return factors
+
+    def _whiten_again(
+        self, residuals: Sequence[_Residuals], inverse_noise: Mapping[str, float]
+    ) -> list[_Residuals]:
+        """Return residuals at the present noise levels.
+
+        Args:
+            residuals: residuals at earlier noise levels.
+            inverse_noise: group -> factor at these levels.
+        """
+        factors = self._compute_inverse_noise()
+        sensors = {f"sensor {k}": sensor for k, sensor in enumerate(self.sensors)}
+        return [
+            group.scale(factors[group.group] / inverse_noise[group.group], sensors.get(group.group))
+            for group in residuals
+        ]
 
     @property
     def _pose_weights(self) -> tuple[float, float]:
