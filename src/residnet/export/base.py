@@ -27,13 +27,14 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template, select_autoescape
 from torch import nn
 
 from residnet.core.errors import ExportError, WithheldError
@@ -288,6 +289,12 @@ def get_dtype_name(dtype: torch.dtype) -> str:
 
 def render_template(template: str, **values: Any) -> str:
     """Return a text file of a format, filled in; values are escaped in XML."""
+    return _load_template(template).render(values)
+
+
+@cache
+def _load_template(template: str) -> Template:
+    """Compile a template once per process."""
     environment = Environment(
         loader=PackageLoader("residnet", "export"),
         undefined=StrictUndefined,
@@ -295,7 +302,7 @@ def render_template(template: str, **values: Any) -> str:
         trim_blocks=True,
         keep_trailing_newline=True,
     )
-    return environment.get_template(f"{template}.jinja").render(values)
+    return environment.get_template(f"{template}.jinja")
 
 
 def write_card(file: Path, card: Mapping[str, Any]) -> None:

@@ -6,9 +6,10 @@ import base64
 import re
 import zlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import final
+from typing import TYPE_CHECKING, final
 
 from markupsafe import Markup, escape
 
@@ -32,6 +33,9 @@ from residnet.report.browser import InteractiveFigures, render_bokeh
 from residnet.report.figure import Figure
 from residnet.report.run_reader import RunFiles
 from residnet.report.still import draw_svg
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 _UNIT_SPACE = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
 """Matches the space between a number and its unit."""
@@ -80,30 +84,11 @@ def write_page(
     Raises:
         OSError: if a figure cannot be read or the page cannot be written.
     """
-    # jinja2 is only needed where a page is written, not where a config is checked
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     files = RunFiles(run)
     provenance = files.provenance
-    environment = Environment(
-        loader=PackageLoader("residnet.report", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     glossary = Glossary()
-    environment.filters |= {
-        "breakable": _break_long_names,
-        "embedded": lambda path: base64.b64encode(path.read_bytes()).decode("ascii"),
-        "pixels": _image_size_attributes,
-        "drawn": lambda figure: Markup(draw_svg(figure)),
-        "deflated": lambda text: base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii"),
-        "anchor": lambda title: re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-"),
-        "linked": lambda text: glossary.link_words(_break_long_names(str(text))),
-    }
     all_sections = [*sections, *_provenance_sections(run, provenance)]
-    text = environment.get_template("page.html.j2").render(
+    text = _load_template().render(
         title=title or files.title,
         description=description or files.description,
         version="" if provenance is None else provenance.residnet,
@@ -119,6 +104,38 @@ def write_page(
     with atomic_write(path) as file:
         file.write_text(text, encoding="utf-8")
     return path
+
+
+@cache
+def _load_template() -> Template:
+    """Compile the template of a page once per process."""
+    # jinja2 is only needed where a page is written, not where a config is checked
+    from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context
+    from jinja2.runtime import Context
+
+    environment = Environment(
+        loader=PackageLoader("residnet.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+    @pass_context
+    def link_words(context: Context, text: object) -> Markup:
+        glossary: Glossary = context["glossary"]
+        return glossary.link_words(_break_long_names(str(text)))
+
+    environment.filters |= {
+        "breakable": _break_long_names,
+        "embedded": lambda path: base64.b64encode(path.read_bytes()).decode("ascii"),
+        "pixels": _image_size_attributes,
+        "drawn": lambda figure: Markup(draw_svg(figure)),
+        "deflated": lambda text: base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii"),
+        "anchor": lambda title: re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-"),
+        "linked": link_words,
+    }
+    return environment.get_template("page.html.j2")
 
 
 def _collect_figures(blocks: Sequence[Block]) -> list[Figure]:

@@ -119,13 +119,16 @@ class StoredWindow:
         """
         import pandas as pd
 
-        names = state_column_names(self.dof)
-        error = pd.DataFrame(self.predicted[model] - self.measured, columns=names)
-        for angle in {"psi", "phi"}.intersection(names):
-            error[angle] = wrap_angle_array(error[angle].to_numpy())
-        error["x"] = np.hypot(error["x"], error.pop("y"))
-        error.loc[~self.usable, ["u", "v", "x"]] = np.nan
-        return error
+        differences = self.predicted[model] - self.measured
+        columns = dict(zip(state_column_names(self.dof), differences.T, strict=True))
+        for angle in {"psi", "phi"} & columns.keys():
+            columns[angle] = wrap_angle_array(columns[angle])
+        # a report needs the errors of thousands of windows, for which assignments to a data frame
+        # take too long
+        columns["x"] = np.hypot(columns["x"], columns.pop("y"))
+        for name in ("u", "v", "x"):
+            columns[name] = np.where(self.usable, columns[name], np.nan)
+        return pd.DataFrame(columns)
 
     def rmse_by_channel(self, model: str) -> np.ndarray:
         """Return the root mean square errors of the dynamic states [n], over the scored samples."""
