@@ -6,7 +6,8 @@ blocks of windows, since windows of one log are correlated.
 
 1. A member whose error is significantly larger than that of constant velocity is not used.
 2. A member without which the error of the mean is significantly smaller is removed, the most
-   significant first, and the test is repeated (backward elimination).
+   significant first, and the test is repeated (backward elimination, as in the model confidence
+   set of Hansen, Lunde and Nason, Econometrica 79, 2011, but with t-tests).
 """
 
 from __future__ import annotations
