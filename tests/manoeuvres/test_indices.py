@@ -23,7 +23,7 @@ from residnet.manoeuvres.indices import (
     SmoothTrack,
     first_crossing,
     identify_zigzag,
-    turning,
+    turning_circle_indices,
     zigzag_indices,
 )
 
@@ -63,7 +63,9 @@ def test_circle(side: float, psi0: float) -> None:
     r = np.where(turning_now, rate, 0.0)
     u = np.where(turning_now, speed * math.cos(drift), 2.0)
     v = np.where(turning_now, -side * speed * math.sin(drift), 0.0)
-    found = turning(thinned(motion(t, psi, r, u, v), 500), start, side, 3 * math.pi, 5.0)
+    found = turning_circle_indices(
+        thinned(motion(t, psi, r, u, v), 500), start, side, 3 * math.pi, 5.0
+    )
     radius = speed / abs(rate)
 
     # the course is drift behind the heading: integrate the velocity direction from -drift on
@@ -84,7 +86,7 @@ def test_circle(side: float, psi0: float) -> None:
     assert found["advance_lengths"] == pytest.approx(found["advance"] / 5.0)
     # half a circle has no steady turn
     half = motion(*(part[:80000] for part in (t, psi, r, u, v)))
-    short = turning(thinned(half, 500), start, side, 3 * math.pi, None)
+    short = turning_circle_indices(thinned(half, 500), start, side, 3 * math.pi, None)
     whole = "approach_speed advance transfer time_90 tactical_diameter time_180"
     assert set(short) == set(whole.split())
 

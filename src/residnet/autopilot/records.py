@@ -22,7 +22,15 @@ ControllerKind = Literal[
     "predictive",
     "floor",
 ]
-"""Roles of controllers in a comparison."""
+"""Roles of controllers in a comparison.
+
+Trained policies: a `policy` adds a network to a classical law, a `network` contains no law, and
+`constants` is a law whose constants were trained. A `law` is a classical law that is exported as a
+policy without training. Ablations of a policy: `untrained` is the policy before its training,
+`network_off` the trained policy without its network. References: `classical` laws with tuned
+constants, the `predictive` autopilot of Gouletas 2020, and the `floor`, a law that knows the
+nominal vessel exactly.
+"""
 CardSchema = Literal["residnet.policy_card/1", "residnet.course_card/1"]
 """Formats of the model card of a controller."""
 
@@ -56,18 +64,18 @@ class HeadingRow(Record):
         split: `simulated`.
         protocol: name of the test: nominal, corners, random, bias, wind, sea, quiet, conditions, or
             `beyond_` and the name of further conditions.
-        cost: cost of a change under the conditions in s.
+        cost: cost in s of a change of the reference, for tests with random conditions.
         time_outside: part of the cost for the time outside the band in s.
-        settling: time in s of the last entry into the band.
-        overshoot: overshoot.
-        iae: integral of the absolute error.
+        settling: time in s of the last entry into the band around the new reference.
+        overshoot: largest error beyond the new reference, in rad or m.
+        iae: integral of the absolute error in rad s or m s.
         travel: travel of the rudder command in rad.
         energy: integral of the square of the rudder command in rad^2 s.
         heading_rms: root mean square of the heading error in waves.
-        rudder_rms: root mean square of the rudder in waves.
-        heel_rms: root mean square of the roll angle in waves, for vessels that roll.
+        rudder_rms: root mean square of the rudder angle in waves, in rad.
+        heel_rms: root mean square of the roll angle in waves in rad, for vessels that roll.
         heading_swing: peak-to-peak error at the end of noise-free simulations.
-        rudder_swing: peak-to-peak rudder command at the end of noise-free simulations.
+        rudder_swing: peak-to-peak rudder command in rad at the end of noise-free simulations.
         unsettled: number of simulations that end outside the band.
         cycling: number of noise-free simulations with a limit cycle.
         n: number of simulations.
@@ -99,13 +107,13 @@ class HeadingRow(Record):
 
     @property
     def mean_cost(self) -> float:
-        """Mean cost of a change in s, for a row of simulations under conditions."""
+        """Mean of `cost`, for a row of a test that has it."""
         assert self.cost is not None
         return self.cost.mean
 
     @property
     def max_settling(self) -> float:
-        """Longest settling time in s, for a row of a step test."""
+        """Largest of `settling`, for a row of a test that has it."""
         assert self.settling is not None
         return self.settling.max
 
@@ -115,7 +123,7 @@ class AutopilotMetricsFile(FileRecord):
 
     Attributes:
         run: name of the run.
-        channels: unit of each metric.
+        channels: metric -> its unit.
         floor: name of the controller that knows the vessel exactly; None without one.
         flown: settings `test` and `conditions` of the config as simulated, with all times scaled by
             `pace`.
@@ -134,12 +142,12 @@ class AutopilotMetricsFile(FileRecord):
 
 
 class TurningParameters(Record):
-    """Parameters of Nomoto's model of the vessel.
+    """Parameters of Nomoto's model T r_dot + r = K delta, as in controllers.json.
 
     Attributes:
         gain: K in 1/s.
         time: T in s.
-        speed: speed in m/s at which they hold.
+        speed: speed in m/s at which K and T hold.
         righting: restoring of the pitch angle for vessels that dive, in 1/s^2.
     """
 
@@ -155,7 +163,7 @@ class ControllerNotes(Record):
     Attributes:
         config: config of a classical law with its tuned constants.
         cost: mean cost of the tuned law in s.
-        tried: number of candidates that the tuning simulated.
+        tried: number of sets of constants that the tuning simulated.
         seconds: duration of the tuning or training in s.
     """
 
@@ -196,7 +204,8 @@ class CourseRow(Record):
         course_time: duration of the course in s.
         reference_time: duration in s of the reference course at the service speed.
         ratio: course time divided by the reference time.
-        ratio_turning: the same with the speed in the tightest turn, for vessels that slow down.
+        ratio_turning: course time divided by the duration of the reference course at the speed in
+            the tightest turn, which is lower for vessels that lose speed in turns.
         cross_track_rms: root mean square of the cross-track error in m.
         cross_track_max: largest absolute cross-track error in m.
         travel: travel of the rudder command in rad.
@@ -209,7 +218,7 @@ class CourseRow(Record):
         passed: whether all buoys were passed according to the rule.
         margin: smallest depth in m inside a circle that was entered, or smallest distance in m
             outside a circle that was passed.
-        n: number of buoys.
+        n: number of buoys of the course.
     """
 
     model: str
@@ -252,9 +261,9 @@ class CourseEnsembleRow(Record):
         passed: fraction of the simulations that passed all buoys according to the rule.
         finished: fraction of the simulations that reached the end of the course.
         ratio: median of the course time divided by the reference time.
-        ratio_worst: largest of these ratios.
-        margin: median of the margins in m.
-        margin_worst: smallest margin in m.
+        ratio_worst: largest ratio of the course time to the reference time.
+        margin: median of `CourseRow.margin` over the simulations in m.
+        margin_worst: smallest of these margins in m.
         cross_track_rms: median of the root mean square cross-track errors in m.
     """
 
@@ -315,7 +324,7 @@ class CourseMetricsFile(FileRecord):
 
     Attributes:
         run: name of the run.
-        channels: unit of each metric.
+        channels: metric -> its unit.
         speed: service speed of the vessel in m/s.
         rudder: rudder limit in rad.
         smallest: the smallest steady turn.
@@ -532,12 +541,12 @@ class CourseStart(Record):
 
 
 class SteeringParameters(Record):
-    """Nomoto's model of the vessel for which a controller was designed.
+    """Parameters of Nomoto's model T r_dot + r = K delta, as in the model card of a controller.
 
     Attributes:
         K: gain in 1/s.
         T: time constant in s.
-        speed: speed in m/s at which they hold.
+        speed: speed in m/s at which K and T hold.
     """
 
     K: float
@@ -558,7 +567,7 @@ class ControllerCard(Record):
         length: length of the course in m; absent for a policy.
         lookahead: look-ahead distance of the guidance in m; absent for a policy.
         memory: names of the entries of the memory s.
-        fault: meaning of the flag.
+        fault: condition under which the policy returns the fault flag, and its command then.
         command: the command and its limits.
         dt: time step in s.
         turning: Nomoto's model of the vessel.

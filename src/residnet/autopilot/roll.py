@@ -70,16 +70,18 @@ class RollPolicy(nn.Module):
     """Heading PD with rudder roll damping and fin PD, and an optional recurrent network.
 
     The law is delta = -K_psi psi_f - K_r r_f - K_p p - K_phi phi and alpha = -F_p p - F_phi phi.
-    psi_f and r_f are low-pass filtered, because the rudder cannot reduce the yaw of the waves. The
-    network adds to both angles. It is an odd function of the measurements, so that the policy is
-    the same to port and starboard.
+    psi_f and r_f are heading error and yaw rate after a low-pass filter, so that the rudder does
+    not respond to the yaw motion at wave frequency, which it cannot reduce. The network adds to
+    both angles. It is an odd function of the measurements, so that the policy acts alike to port
+    and to starboard.
 
     Args:
         gains: constants by name, `GAIN_NAMES`; tensors [B, 1] for a constant of each row.
         limits: limits of rudder and fins in rad.
-        units: recurrent units for each of rudder and fins; 0 for the law alone.
+        units: number of recurrent units of each network, one network for the rudder and one for
+            the fins; 0 for the law alone.
         dt: time step in s.
-        is_trained: whether the constants of the law have gradients.
+        is_trained: whether the constants of the law are trainable parameters.
     """
 
     def __init__(
@@ -114,7 +116,7 @@ class RollPolicy(nn.Module):
         self.n_state = 2 + _N_COMMANDS * units
 
     def gain_values(self) -> dict[str, float]:
-        """Return the constants of the law."""
+        """Return the constants of the law by name (`GAIN_NAMES`), of the first row of a batch."""
         return {name: float(getattr(self, name)[0, 0]) for name in GAIN_NAMES}
 
     def forward(self, measured: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
@@ -273,7 +275,7 @@ class RollSimulation:
         return w, heights.repeat_interleave(rows_per_sea)
 
     def simulate(self, policy: RollPolicy, w: Tensor) -> RollRuns:
-        """Simulate a policy, float32; with gradients if its parameters have some."""
+        """Simulate a policy in float32, with gradients if its parameters require them."""
         source = RollControlledCourse(policy, self.plant)
         rollout = Rollout(self._model, source)
         x0 = self.plant.make_initial_state(1).float().expand(len(w), -1)

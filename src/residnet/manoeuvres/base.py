@@ -3,12 +3,13 @@
 A manoeuvre demands a normalised propulsion command (`drive`: mean thrust or revolutions) and a
 normalised steering command (`steer`: difference of these, or rudder) over time, in open loop or as
 a function of the motion. The vessel converts the two into its own commands, so that one manoeuvre
-works with any plant and any learned model that has actuators. A manoeuvre with a stop condition
-ends its row of the rollout there.
+works with any plant and any learned model that has actuators. Several manoeuvres are simulated as
+the rows of one batch; a row whose manoeuvre has a stop condition ends when the condition is met.
 """
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -31,8 +32,8 @@ if TYPE_CHECKING:
 
     DemandFunction = Callable[[Tensor, Tensor], Tensor]
     """Converts propulsion and steering command [...] to commands [..., c] of the vessel."""
-    BatchParameters = dict[str, Tensor]
-    """Parameters, or the observed motion, of the rows of a batch by name, [B] or [B, n] each."""
+    BatchValues = dict[str, Tensor]
+    """Quantities of the rows of a batch by name, [B] or [B, n] each."""
 
 Range = tuple[float, float]
 """Lower and upper bound of a uniform distribution."""
@@ -69,10 +70,11 @@ class Helm:
             UsageError: if dive is demanded of a vessel that cannot dive.
         """
         commands = self.demand(drive, steer)
-        for share in dive:
+        for dive_demand in dive:
             require_dive(can_dive=self.dive_commands is not None)
             assert self.dive_commands is not None
-            commands = commands + share.unsqueeze(-1) * self.dive_commands.to(commands.dtype)
+            dive_commands = self.dive_commands.to(commands.dtype)
+            commands = commands + dive_demand.unsqueeze(-1) * dive_commands
         return commands
 
     @classmethod
@@ -126,7 +128,7 @@ class Helm:
         return float(full_commands[0, self.inputs.index(name)])
 
 
-class RudderRange(Protocol):
+class SupportsMaxRudder(Protocol):
     """A vessel whose largest rudder angle is known: a `Helm`, or the channels of a plant."""
 
     @property
@@ -230,7 +232,7 @@ class Manoeuvre(Config, ABC):
         return {}
 
     def imo_limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
-        """Return the largest values of indices that IMO resolution MSC.137(76) allows, by index.
+        """Return the upper limits of indices by IMO resolution MSC.137(76); empty without limits.
 
         Args:
             helm: properties of the vessel.
@@ -267,43 +269,43 @@ class ScheduledManoeuvre(Manoeuvre):
 class ClosedLoopManoeuvre(Manoeuvre):
     """A manoeuvre that computes propulsion and steering commands from the motion.
 
-    Its class methods evaluate all rows of a batch at once. `motion` contains the `observed_states`
-    of the kind, [B] each; `parameters` are those of the rows, and the time step `dt` in s.
+    Its class methods evaluate all manoeuvres of a batch at once. Their argument `motion` has the
+    states of `observed_states` by name, [B] each. Their argument `parameters` has the values of
+    `law_parameters` by name, [B] or [B, n] each, and the time step `dt` in s.
     """
 
     observed_states: ClassVar[tuple[str, ...]]
     parameter_names: ClassVar[tuple[str, ...]] = ("drive", "start")
-    """Attributes that are parameters of the control law without conversion."""
+    """Attributes of the config that `law_parameters` returns unchanged."""
 
     def check_vessel(self, channels: PlantChannels) -> None:
         for name in self.observed_states:
             require_state(name, channels.state_names)
         self.law_parameters(channels)
 
-    def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
+    def law_parameters(self, helm: SupportsMaxRudder) -> dict[str, Any]:
         """Return the parameters of the control law, numbers or lists of numbers."""
         return {name: getattr(self, name) for name in self.parameter_names}
 
     @classmethod
     @abstractmethod
-    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
-        """Return the memory [B, k] at the start."""
+    def initial_memory(cls, motion: BatchValues, parameters: BatchValues) -> Tensor:
+        """Return the memory [B, k] of the control law at the start, of k numbers for each row."""
 
     @classmethod
     @abstractmethod
     def step_law(
-        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+        cls, motion: BatchValues, parameters: BatchValues, time: float, memory: Tensor
     ) -> tuple[Tensor, ...]:
-        """Return propulsion and steering commands [B], and the memory [B, k].
+        """Return propulsion and steering commands [B], and the memory [B, k] after the step.
 
-        They are those of the step that begins at `time`.
-
-        For a diving vessel, the dive command [B] precedes the memory.
+        The commands hold during the step that begins at `time` in s. A diving manoeuvre returns
+        the dive command [B] before the memory.
         """
 
     @classmethod
     def has_ended(
-        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+        cls, motion: BatchValues, parameters: BatchValues, time: float, memory: Tensor
     ) -> Tensor:
         """Return whether each row has reached its goal, [B] bool."""
         import torch
@@ -333,7 +335,7 @@ class ManoeuvreFamily(Config, ABC):
         """Draw a manoeuvre of at most `duration` seconds with a random generator."""
 
     def sample_all(self, generator: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """Draw `count` manoeuvres of `duration` seconds with a random generator."""
+        """Draw `count` manoeuvres of at most `duration` seconds each with a random generator."""
         return [self.sample_one(generator, duration) for _ in range(self.count)]
 
 
@@ -371,7 +373,7 @@ class SteeringConfig(Config):
         """Sign of the demanded steering command or rudder angle, +1 or -1."""
         return -1.0 if (self.steer if self.steer is not None else self.rudder or 0.0) < 0 else 1.0
 
-    def steer_share(self, helm: RudderRange) -> float:
+    def steer_share(self, helm: SupportsMaxRudder) -> float:
         """Return the fraction of the full steering command on a vessel.
 
         Raises:
@@ -381,7 +383,7 @@ class SteeringConfig(Config):
         return self.steer if self.steer is not None else rudder_share(self.rudder or 0.0, helm)
 
 
-def rudder_share(angle: float, helm: RudderRange) -> float:
+def rudder_share(angle: float, helm: SupportsMaxRudder) -> float:
     """Return the fraction of the full steering command that corresponds to a rudder angle [rad].
 
     Raises:
@@ -397,7 +399,7 @@ def rudder_share(angle: float, helm: RudderRange) -> float:
     # the margin accepts an angle equal to the limit after its conversion from degrees
     if abs(share) > 1.0 + 1e-9:
         raise UsageError(
-            f"the manoeuvre demands {abs(angle) * 57.29578:.4g} deg of rudder, the limit of the"
-            f" vessel is {max_rudder * 57.29578:.4g} deg"
+            f"the manoeuvre demands {math.degrees(abs(angle)):.4g} deg of rudder, the limit of the"
+            f" vessel is {math.degrees(max_rudder):.4g} deg"
         )
     return share

@@ -23,9 +23,9 @@ from residnet.manoeuvres.base import (
     Manoeuvre,
     ManoeuvreFamily,
     Range,
-    RudderRange,
     ScheduledManoeuvre,
     SteeringConfig,
+    SupportsMaxRudder,
     require_dive,
     rudder_share,
     sample_uniform,
@@ -35,7 +35,7 @@ from residnet.physics.plant_channels import PlantChannels
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from residnet.manoeuvres.base import BatchParameters
+    from residnet.manoeuvres.base import BatchValues
 
 _FULL_RUDDER_DEG = 34.9
 """Rudder angle in deg above which the IMO limits of a turning circle apply (35 deg or maximum)."""
@@ -95,7 +95,7 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
                 return indices.zigzag_limits(nominal, length, speed)
         return {}
 
-    def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
+    def law_parameters(self, helm: SupportsMaxRudder) -> dict[str, Any]:
         return super().law_parameters(helm) | {
             "steer": self.steer_share(helm),
             "reversal_angle": self.heading,
@@ -105,7 +105,7 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
         }
 
     @classmethod
-    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
+    def initial_memory(cls, motion: BatchValues, parameters: BatchValues) -> Tensor:
         """Return the side of the first execute, the current heading and zero reversals, [B, 3]."""
         import torch
 
@@ -114,7 +114,7 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
 
     @classmethod
     def step_law(
-        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+        cls, motion: BatchValues, parameters: BatchValues, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Reverse the steering if the heading has reached its bound."""
         import torch
@@ -133,7 +133,7 @@ class Zigzag(SteeringConfig, ClosedLoopManoeuvre):
 
     @classmethod
     def has_ended(
-        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+        cls, motion: BatchValues, parameters: BatchValues, time: float, memory: Tensor
     ) -> Tensor:
         """Return whether the heading has returned to the initial course after the last reversal."""
         command_sign, origin, count = memory.unbind(-1)
@@ -196,7 +196,7 @@ def initial_steadiness(r: Tensor) -> Tensor:
     return torch.stack((r, r.abs(), torch.zeros_like(r)), dim=-1)
 
 
-def update_steadiness(r: Tensor, parameters: BatchParameters, memory: Tensor) -> Tensor:
+def update_steadiness(r: Tensor, parameters: BatchValues, memory: Tensor) -> Tensor:
     """Return the memory [B, 3] of a steady turn one step later, with yaw rate r [B]."""
     import torch
 
@@ -210,7 +210,7 @@ def update_steadiness(r: Tensor, parameters: BatchParameters, memory: Tensor) ->
     )
 
 
-def is_steady(parameters: BatchParameters, memory: Tensor) -> Tensor:
+def is_steady(parameters: BatchValues, memory: Tensor) -> Tensor:
     """Return whether the turn of each row is steady, [B] bool."""
     # the tolerance allows for rounding in the sum of time steps
     return memory[:, 2] >= parameters["window"] - 1e-9
@@ -252,7 +252,9 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
         return f"{turn_text} and a steady pull-out" if self.pull_out else turn_text
 
     def compute_indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        turning_indices = indices.turning(log, self.start, self.side, self.until, length)
+        turning_indices = indices.turning_circle_indices(
+            log, self.start, self.side, self.until, length
+        )
         if self.pull_out and "advance" in turning_indices:
             turning_indices["pull_out_yaw_rate"] = self.side * float(
                 log["r"][np.isfinite(log["r"])][-1]
@@ -267,7 +269,7 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
         is_full_rudder = share > 0.999 or angle > _FULL_RUDDER_DEG
         return indices.turning_limits(length) if is_full_rudder else {}
 
-    def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
+    def law_parameters(self, helm: SupportsMaxRudder) -> dict[str, Any]:
         phase_parameters = {
             "steer": self.steer_share(helm),
             "phase_after_turn": 1.0 if self.pull_out else 2.0,
@@ -275,7 +277,7 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
         return super().law_parameters(helm) | phase_parameters | dict(self.steady)
 
     @classmethod
-    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
+    def initial_memory(cls, motion: BatchValues, parameters: BatchValues) -> Tensor:
         """Return the memory [B, 5] at the current heading, in the approach."""
         import torch
 
@@ -286,7 +288,7 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
 
     @classmethod
     def step_law(
-        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+        cls, motion: BatchValues, parameters: BatchValues, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Command the helm until the heading has changed, then amidships until r is steady."""
         import torch
@@ -313,7 +315,7 @@ class TurningCircle(SteeringConfig, ClosedLoopManoeuvre):
 
     @classmethod
     def has_ended(
-        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+        cls, motion: BatchValues, parameters: BatchValues, time: float, memory: Tensor
     ) -> Tensor:
         return memory[:, 1] == 2
 
@@ -365,12 +367,12 @@ class Stopping(ClosedLoopManoeuvre):
         return indices.stopping_limits(length) if self.astern <= -0.999 else {}
 
     @classmethod
-    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
+    def initial_memory(cls, motion: BatchValues, parameters: BatchValues) -> Tensor:
         return motion["u"].new_zeros(len(motion["u"]), 0)
 
     @classmethod
     def step_law(
-        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+        cls, motion: BatchValues, parameters: BatchValues, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Command the astern propulsion command after the order."""
         import torch
@@ -381,7 +383,7 @@ class Stopping(ClosedLoopManoeuvre):
 
     @classmethod
     def has_ended(
-        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+        cls, motion: BatchValues, parameters: BatchValues, time: float, memory: Tensor
     ) -> Tensor:
         """Return whether each row has stopped, [B] bool."""
         return (time > parameters["start"]) & (motion["u"] <= 0)
@@ -458,14 +460,14 @@ class Spiral(ClosedLoopManoeuvre):
             spiral_indices["loop_height"] = max(amidships_rates) - min(amidships_rates)
         return spiral_indices
 
-    def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
+    def law_parameters(self, helm: SupportsMaxRudder) -> dict[str, Any]:
         shares = [rudder_share(a, helm) if self.rudders else a for a in self.helm_angles]
         # after the last angle the helm goes amidships
         spiral_parameters = {"shares": [*shares, 0.0], "count": float(len(shares))}
         return super().law_parameters(helm) | spiral_parameters | dict(self.steady)
 
     @classmethod
-    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
+    def initial_memory(cls, motion: BatchValues, parameters: BatchValues) -> Tensor:
         import torch
 
         return torch.cat(
@@ -474,7 +476,7 @@ class Spiral(ClosedLoopManoeuvre):
 
     @classmethod
     def step_law(
-        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+        cls, motion: BatchValues, parameters: BatchValues, time: float, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Advance to the next angle if the turn is steady."""
         import torch
@@ -493,7 +495,7 @@ class Spiral(ClosedLoopManoeuvre):
 
     @classmethod
     def has_ended(
-        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+        cls, motion: BatchValues, parameters: BatchValues, time: float, memory: Tensor
     ) -> Tensor:
         return memory[:, 0] >= parameters["count"]
 
@@ -585,7 +587,7 @@ class VerticalZigzag(ClosedLoopManoeuvre):
         super().check_vessel(channels)
         require_dive(can_dive=channels.can_dive)
 
-    def law_parameters(self, helm: RudderRange) -> dict[str, Any]:
+    def law_parameters(self, helm: SupportsMaxRudder) -> dict[str, Any]:
         first_sign = -1.0 if self.dive < 0 else 1.0
         dive_parameters = {
             "dive": abs(self.dive),
@@ -595,7 +597,7 @@ class VerticalZigzag(ClosedLoopManoeuvre):
         return super().law_parameters(helm) | dive_parameters
 
     @classmethod
-    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
+    def initial_memory(cls, motion: BatchValues, parameters: BatchValues) -> Tensor:
         """Return the sign of the first dive and the current depth, [B, 2]."""
         import torch
 
@@ -603,7 +605,7 @@ class VerticalZigzag(ClosedLoopManoeuvre):
 
     @classmethod
     def step_law(
-        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+        cls, motion: BatchValues, parameters: BatchValues, time: float, memory: Tensor
     ) -> tuple[Tensor, ...]:
         """Reverse the dive if the depth has reached its bound."""
         import torch
@@ -668,13 +670,13 @@ class DepthStep(ClosedLoopManoeuvre):
         require_dive(can_dive=channels.can_dive)
 
     @classmethod
-    def initial_memory(cls, motion: BatchParameters, parameters: BatchParameters) -> Tensor:
+    def initial_memory(cls, motion: BatchValues, parameters: BatchValues) -> Tensor:
         """Return the current depth, [B, 1]."""
         return motion["z"].unsqueeze(-1)
 
     @classmethod
     def step_law(
-        cls, motion: BatchParameters, parameters: BatchParameters, time: float, memory: Tensor
+        cls, motion: BatchValues, parameters: BatchValues, time: float, memory: Tensor
     ) -> tuple[Tensor, ...]:
         """Return the dive demand: proportional to the depth error, damped by the depth rate."""
         import torch

@@ -123,15 +123,17 @@ class SmoothTrack:
         )
         return time, float(sign * self.psi(time))
 
-    def relative_position(self, time: float, origin: float) -> tuple[float, float]:
-        """Return the position at `time` relative to that at `origin`, in m ahead and to starboard.
+    def relative_position(self, time: float, start_time: float) -> tuple[float, float]:
+        """Return the displacement since `start_time`, in m ahead and to starboard.
 
-        Ahead is the direction of the heading at `origin`. Both times are in s.
+        Ahead is the direction of the heading at `start_time`. Both times are in s.
         """
-        north = float(self.x(time) - self.x(origin))
-        east = float(self.y(time) - self.y(origin))
-        c, s = math.cos(float(self.psi(origin))), math.sin(float(self.psi(origin)))
-        return north * c + east * s, east * c - north * s
+        north = float(self.x(time) - self.x(start_time))
+        east = float(self.y(time) - self.y(start_time))
+        start_heading = float(self.psi(start_time))
+        cos_psi = math.cos(start_heading)
+        sin_psi = math.sin(start_heading)
+        return north * cos_psi + east * sin_psi, east * cos_psi - north * sin_psi
 
 
 def first_crossing(
@@ -164,33 +166,33 @@ def add_values_in_lengths(indices: dict[str, Any], length: float | None) -> dict
     }
 
 
-def turning(
-    log: Log, start: float, turn_sign: float, until: float, length: float | None
+def turning_circle_indices(
+    log: Log, start: float, turn_sign: float, final_heading_change: float, length: float | None
 ) -> dict[str, Any]:
     """Return the indices of a turning circle.
 
     Advance is the distance along the heading at `start`; transfer and tactical diameter are the
-    distances across it, positive towards the turn. The steady turn is the last half turn before the
-    heading has changed by `until`, if `until` is at least a full turn. The drift angle is positive
-    with the bow inside the turn.
+    distances across it, positive towards the turn. The steady turn is the last half turn up to
+    `final_heading_change`, which must be at least a full turn; otherwise the indices of the steady
+    turn are omitted. The drift angle is positive with the bow inside the turn.
 
     Args:
         log: t, x, y, psi, u, v, r.
         start: time of the helm order in s.
         turn_sign: +1 to starboard, -1 to port.
-        until: heading change that ends the steady turn, rad.
+        final_heading_change: magnitude of the change of heading at the end of the trial in rad.
         length: length of the hull in m; None if unknown.
     """
     track = SmoothTrack(log)
     if track.end_time <= start:
         return {}
-    origin = float(track.psi(start))
+    initial_heading = float(track.psi(start))
     indices: dict[str, Any] = {
         "approach_speed": track.approach_speed(start),
         **track.max_roll_angle(start),
     }
     quarter_time, half_time = (
-        track.first_heading_crossing(origin + turn_sign * angle, start, turn_sign)
+        track.first_heading_crossing(initial_heading + turn_sign * angle, start, turn_sign)
         for angle in (_QUARTER_TURN, 2 * _QUARTER_TURN)
     )
     if quarter_time is not None:
@@ -206,11 +208,11 @@ def turning(
             "time_180": half_time - start,
         }
     steady_start, steady_end = (
-        track.first_heading_crossing(origin + turn_sign * angle, start, turn_sign)
+        track.first_heading_crossing(initial_heading + turn_sign * angle, start, turn_sign)
         # the last half turn: by then the speed has become steady
-        for angle in (until - math.pi, until)
+        for angle in (final_heading_change - math.pi, final_heading_change)
     )
-    if until < 2 * math.pi - 1e-9 or steady_start is None:
+    if final_heading_change < 2 * math.pi - 1e-9 or steady_start is None:
         return add_values_in_lengths(indices, length)
     is_steady = (track.t >= steady_start) & (
         track.t <= (track.end_time if steady_end is None else steady_end)
@@ -221,7 +223,7 @@ def turning(
         # v is towards the outside of the turn, so that the sign makes the angle positive
         drift = np.arctan2(-turn_sign * track.v[is_steady], track.u[is_steady])
         indices |= {
-            # U = r R in a steady turn
+            # U = r R in a steady turn of radius R
             "steady_diameter": 2 * speed / rate,
             "steady_speed": speed,
             "steady_yaw_rate": rate,
@@ -254,23 +256,24 @@ def zigzag_indices(
     track = SmoothTrack(log)
     if track.end_time <= start:
         return {}
-    origin = float(track.heading[0])
+    initial_course = float(track.heading[0])
     reversals: list[float] = []
     overshoots: list[tuple[float, float]] = []
     current_time = start
     current_sign = turn_sign
     while (
         reversal := track.first_heading_crossing(
-            origin + current_sign * heading, current_time, current_sign
+            initial_course + current_sign * heading, current_time, current_sign
         )
     ) is not None:
         reversals.append(reversal)
+        # the offset excludes the crossing at the reversal itself
         return_time = track.first_heading_crossing(
-            origin + current_sign * heading, reversal + 1e-9, -current_sign
+            initial_course + current_sign * heading, reversal + 1e-9, -current_sign
         )
         if return_time is not None:
             time, value = track.heading_peak(reversal, return_time, current_sign)
-            overshoots.append((time, value - current_sign * origin - heading))
+            overshoots.append((time, value - current_sign * initial_course - heading))
         current_time = reversal
         current_sign = -current_sign
     indices: dict[str, Any] = {
@@ -286,8 +289,9 @@ def zigzag_indices(
             "initial_turning_time": reversals[0] - start,
             "initial_turning_distance": float(distance_to_reversal),
         }
-        return_time = track.first_heading_crossing(origin, reversals[0], -turn_sign)
-        indices |= {} if return_time is None else {"reach": return_time - start}
+        return_time = track.first_heading_crossing(initial_course, reversals[0], -turn_sign)
+        if return_time is not None:
+            indices["reach"] = return_time - start
     names = ("first_overshoot", "second_overshoot")
     indices |= {name: value for name, (_, value) in zip(names, overshoots, strict=False)}
     if overshoots:
@@ -388,9 +392,9 @@ class SteeredZigzag(NamedTuple):
 def identify_zigzag(log: Log, rudder: str) -> SteeredZigzag:
     """Identify the parameters of a zigzag from heading and rudder angle.
 
-    The order is assumed at the last sample before the rudder moves faster than a tenth of its
-    largest rate. The departure of the rudder is extrapolated from its rate between the sides to a
-    fraction of a sample, because the heading can change by half a degree within a coarse sample.
+    The time of an order is the last sample before the rudder moves faster than a tenth of its
+    largest rate. The departure of the rudder from one side is interpolated between samples, because
+    the heading can change by half a degree within a coarse sample.
 
     Args:
         log: log with psi and a rudder angle.
@@ -410,40 +414,32 @@ def identify_zigzag(log: Log, rudder: str) -> SteeredZigzag:
     rudder_side = np.where(
         np.abs(delta - mid_angle) > _SIDE_ANGLE_SHARE * angle, np.sign(delta - mid_angle), 0.0
     )
-    held_samples = np.flatnonzero(rudder_side)
-    has_changed = rudder_side[held_samples[1:]] != rudder_side[held_samples[:-1]]
-    # before the first order the rudder need not be amidships
-    first_moving = int(np.argmax(is_moving))
-    first_arrival = int(np.argmax(~is_moving & (np.arange(delta.size) > first_moving)))
+    # a reversal lies between the last sample on one side and the first sample on the other side
+    side_samples = np.flatnonzero(rudder_side)
+    has_changed = rudder_side[side_samples[1:]] != rudder_side[side_samples[:-1]]
     side_changes = zip(
-        held_samples[:-1][has_changed].tolist(), held_samples[1:][has_changed].tolist(), strict=True
+        side_samples[:-1][has_changed].tolist(), side_samples[1:][has_changed].tolist(), strict=True
     )
-    reversals = [(a, b) for a, b in side_changes if b > first_arrival]
+    # the first motion of the rudder is the first execute; it can also change the side, since the
+    # rudder need not be amidships before
+    first_moving = int(np.argmax(is_moving))
+    first_execute_end = int(np.argmax(~is_moving & (np.arange(delta.size) > first_moving)))
+    reversals = [(last, first) for last, first in side_changes if first > first_execute_end]
     if angle == 0.0 or len(reversals) < 2:
         raise DataError(
             f"log {log.name}: the rudder is reversed {len(reversals)} times; a zigzag needs at"
             " least 2"
         )
-    first_sign = float(np.sign(delta[first_arrival] - delta[first_moving]))
+    first_sign = float(np.sign(delta[first_execute_end] - delta[first_moving]))
     turn_signs = first_sign * (-1.0) ** np.arange(len(reversals))
-    order_samples = [int(np.flatnonzero(~is_moving[:b])[-1]) for _, b in reversals]
-    departure_times = []
-    for a, b in reversals:
-        rudder_travel = np.maximum.accumulate(
-            rudder_side[b] * (delta[a : b + 1] - mid_angle) / angle
+    order_samples = [int(np.flatnonzero(~is_moving[:first])[-1]) for _, first in reversals]
+    departure_times = [
+        _extrapolate_departure_time(
+            log.t[last : first + 1],
+            rudder_side[first] * (delta[last : first + 1] - mid_angle) / angle,
         )
-        # the crossing from -1/2 to +1/2 gives the rate, which extrapolates back to -1
-        start_crossing, end_crossing = np.interp(
-            (-_SIDE_ANGLE_SHARE, _SIDE_ANGLE_SHARE), rudder_travel, log.t[a : b + 1]
-        )
-        departure_times.append(
-            float(
-                start_crossing
-                - (1.0 - _SIDE_ANGLE_SHARE)
-                / (2.0 * _SIDE_ANGLE_SHARE)
-                * (end_crossing - start_crossing)
-            )
-        )
+        for last, first in reversals
+    ]
     heading = float(np.mean(turn_signs * psi[order_samples]))
     if heading <= 0.0:
         raise DataError(
@@ -456,3 +452,25 @@ def identify_zigzag(log: Log, rudder: str) -> SteeredZigzag:
     )
     start = float(log.t[max(first_moving - 1, 0)] - log.t[0])
     return SteeredZigzag(start, first_sign, angle, heading, departure_heading, departure_rate)
+
+
+def _extrapolate_departure_time(t: np.ndarray, rudder_fraction: np.ndarray) -> float:
+    """Return the time in s at which a rudder began to move from one side to the other.
+
+    The rudder is assumed to move at a constant rate.
+
+    Args:
+        t: times [T] in s of the samples of one reversal.
+        rudder_fraction: rudder angle as a fraction of the commanded angle, from -1 on the old side
+            to 1 on the new side [T].
+    """
+    # interpolation needs ascending values, without the noise of the rudder angle
+    ascending_fraction = np.maximum.accumulate(rudder_fraction)
+    # the times at the fractions -1/2 and 1/2 give the rate, which extrapolates back to -1
+    start_crossing, end_crossing = np.interp(
+        (-_SIDE_ANGLE_SHARE, _SIDE_ANGLE_SHARE), ascending_fraction, t
+    )
+    time_per_crossing = end_crossing - start_crossing
+    return float(
+        start_crossing - (1.0 - _SIDE_ANGLE_SHARE) / (2.0 * _SIDE_ANGLE_SHARE) * time_per_crossing
+    )

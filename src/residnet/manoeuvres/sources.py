@@ -13,7 +13,7 @@ from residnet.physics.environment import IrregularWaves
 from residnet.physics.plant import Plant
 
 if TYPE_CHECKING:
-    from residnet.manoeuvres.base import BatchParameters, ClosedLoopManoeuvre, Helm
+    from residnet.manoeuvres.base import BatchValues, ClosedLoopManoeuvre, Helm
 
 
 def replace_commands(command: Tensor, w: Tensor) -> Tensor:
@@ -41,7 +41,7 @@ class ClosedLoopSource(Source):
         super().__init__()
         self.manoeuvre_type = type(manoeuvres[0])
         manoeuvre_parameters = [manoeuvre.law_parameters(helm) for manoeuvre in manoeuvres]
-        self.batch_parameters: BatchParameters = {
+        self.batch_parameters: BatchValues = {
             # lists of different length, such as the angles of spirals, are padded
             name: torch.nn.utils.rnn.pad_sequence(
                 [torch.tensor(row[name], dtype=torch.float64) for row in manoeuvre_parameters],
@@ -72,7 +72,7 @@ class ClosedLoopSource(Source):
         """Return whether the manoeuvre of each row has ended, [B] bool."""
         return self.manoeuvre_type.has_ended(*self._observe(x), self.times[k], memory)
 
-    def _observe(self, x: Tensor) -> tuple[BatchParameters, BatchParameters]:
+    def _observe(self, x: Tensor) -> tuple[BatchValues, BatchValues]:
         """Return the observed states, and the parameters in the precision of the states."""
         motion = {name: x[:, column] for name, column in self.state_columns.items()}
         return motion, {name: value.to(x.dtype) for name, value in self.batch_parameters.items()}

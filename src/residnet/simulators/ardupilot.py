@@ -50,8 +50,8 @@ class Servo:
 
     def command_at(self, pulse: int) -> float:
         """Return the command of a pulse width; the centre command for a missing pulse."""
-        share = 0.5 if pulse == 0 else min(max((pulse - 1000) / 1000, 0.0), 1.0)
-        return self.lower_command + share * (self.upper_command - self.lower_command)
+        fraction = 0.5 if pulse == 0 else min(max((pulse - 1000) / 1000, 0.0), 1.0)
+        return self.lower_command + fraction * (self.upper_command - self.lower_command)
 
 
 def assign_servos(vehicle: Vehicle, servo_texts: Sequence[str] = ()) -> list[Servo]:
@@ -127,7 +127,7 @@ class ArduPilotBackend:
         self.last_frame = -1
         self.reply = b""
         self.time = 0.0
-        self.steps = 0
+        self.n_steps = 0
         x = self.vehicle.initial_state.unsqueeze(0)
         self.previous_state = self.current_state = x
         self.memory = self.vehicle.dynamics.initial_state(1).to(x.dtype)
@@ -150,7 +150,7 @@ class ArduPilotBackend:
                 n_answered += 1
 
     def close(self) -> None:
-        """Close the socket."""
+        """Close the UDP socket; the server cannot be used afterwards."""
         self.socket.close()
 
     def reply_to(self, data: bytes) -> bytes | None:
@@ -175,30 +175,47 @@ class ArduPilotBackend:
             self.n_lost_frames += frame - self.last_frame - 1
         self.last_frame = frame
         self.time += 1.0 / rate
-        dt = self._dt
-        while self.steps * dt < self.time - 1e-9:
-            commands = torch.tensor(
-                [[servo.command_at(pulses[servo.channel - 1]) if servo.channel <= len(pulses) else
-                  servo.command_at(0) for servo in self.servos]],
-                dtype=self.current_state.dtype,
-            )  # fmt: skip
+        self._advance_vehicle(pulses)
+        self.reply = self._encode_motion()
+        return self.reply
+
+    def _advance_vehicle(self, pulses: Sequence[int]) -> None:
+        """Step the vehicle until it has reached the time of the frame.
+
+        Args:
+            pulses: pulse widths of the servo outputs in us.
+        """
+        # a packet of 16 outputs has no pulse for the outputs 17 to 32
+        commands_by_servo = [
+            servo.command_at(pulses[servo.channel - 1] if servo.channel <= len(pulses) else 0)
+            for servo in self.servos
+        ]
+        commands = torch.tensor([commands_by_servo], dtype=self.current_state.dtype)
+        # the tolerance prevents an additional step due to rounding of the accumulated time
+        while self.n_steps * self._dt < self.time - 1e-9:
             self.previous_state = self.current_state
             with torch.no_grad():
                 next_state, memory = self.vehicle.dynamics.step(
                     self.previous_state, self.vehicle.inputs_at(commands), self.memory
                 )
+            # JSON has neither NaN nor infinity: the vehicle stays in its last finite state
             if bool(torch.isfinite(next_state).all()) and bool(torch.isfinite(memory).all()):
                 self.current_state = next_state
                 self.memory = memory
-            self.steps += 1
-        step_fraction = min(max(self.time / self._dt - (self.steps - 1), 0.0), 1.0)
+            self.n_steps += 1
+
+    def _encode_motion(self) -> bytes:
+        """Return the motion at the time of the frame as the line of JSON that ArduPilot expects."""
+        step_fraction = min(max(self.time / self._dt - (self.n_steps - 1), 0.0), 1.0)
         state: Tensor = self.previous_state[0] + step_fraction * (
             self.current_state[0] - self.previous_state[0]
         )
         acceleration = ((self.current_state[0] - self.previous_state[0]) / self._dt).tolist()
         north, east, psi, u, v, r = state[:6].tolist()
         named_states = dict(zip(self.vehicle.states, state.tolist(), strict=True))
-        phi, p = named_states.get("phi", 0.0), named_states.get("p", 0.0)
+        # a planar model has no roll
+        phi = named_states.get("phi", 0.0)
+        p = named_states.get("p", 0.0)
         cos_psi = math.cos(psi)
         sin_psi = math.sin(psi)
         horizontal_sway = v * math.cos(phi)
@@ -222,8 +239,7 @@ class ArduPilotBackend:
                 0.0,
             ],
         }
-        self.reply = b"\n" + json.dumps(reply, separators=(",", ":")).encode() + b"\n"
-        return self.reply
+        return b"\n" + json.dumps(reply, separators=(",", ":")).encode() + b"\n"
 
     @property
     def _dt(self) -> float:
