@@ -53,7 +53,7 @@ class LSTMCell(RenamedStateModule):
             # an initially open forget gate (bias 1) passes gradients over many steps from the first
             # epoch (Jozefowicz et al. 2015)
             self.bias[hidden_size : 2 * hidden_size] = 1.0
-        # the fused kernel of torch expects a second bias
+        # the fused kernel of torch expects a second bias for the recurrent part
         self.zero_bias = nn.Buffer(torch.zeros(4 * hidden_size), persistent=False)
 
     def forward(self, features: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -61,10 +61,15 @@ class LSTMCell(RenamedStateModule):
         return self.step_from_gates(features @ self.input_weight.T + self.bias, s)
 
     def step_from_gates(self, gates: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return output and memory as `forward`, given the input part of the gates [B, 4H]."""
+        """Return output h [B, H] and memory [B, 2H] after one step.
+
+        Args:
+            gates: input weights times features plus bias [B, 4H], without the recurrent part.
+            s: memory before the step [B, 2H].
+        """
         hidden, previous_cell = s.split([self.hidden_size, self.hidden_size], dim=-1)
         gates = gates + hidden @ self.hidden_weight.T
-        # one sigmoid over the contiguous gates is faster than three over separate slices; that of
+        # one sigmoid over all four gates is faster than three over separate slices; the sigmoid of
         # the cell gate is not used
         input_gate, forget_gate, _, output_gate = torch.sigmoid(gates).chunk(4, dim=-1)
         cell_gate = gates[:, 2 * self.hidden_size : 3 * self.hidden_size]
@@ -106,9 +111,17 @@ class LSTMCell(RenamedStateModule):
         # the fused kernel of torch is several times as fast, but has tanh activations only
         if not self.uses_softsign:
             weights = [self.input_weight, self.hidden_weight, self.bias, self.zero_bias]
-            initial = [part.unsqueeze(0).contiguous() for part in s.chunk(2, dim=-1)]
+            initial_h_and_c = [part.unsqueeze(0).contiguous() for part in s.chunk(2, dim=-1)]
             sequence, h, c = torch.lstm(
-                features, initial, weights, True, 1, 0.0, self.training, False, True
+                features,
+                initial_h_and_c,
+                weights,
+                has_biases=True,
+                num_layers=1,
+                dropout=0.0,
+                train=self.training,
+                bidirectional=False,
+                batch_first=True,
             )
             return sequence, torch.cat((h[0], c[0]), dim=-1)
         outputs: list[Tensor] = []
@@ -141,6 +154,7 @@ class LstmNetwork(RenamedStateModule):
         # features are clamped to their training range, widened by `margin` times its width
         self.features = Features(feature_names, channel_names, config.margin)
         lstm_feature_names = config.select_lstm_features(feature_names)
+        # `memory` restricts the features of the LSTM, not those of the readout
         self.has_lstm_feature_subset = len(config.memory) > 0
         self.lstm_feature_index = nn.Buffer(
             torch.tensor(
@@ -167,7 +181,7 @@ class LstmNetwork(RenamedStateModule):
         self.readout = nn.Sequential(*hidden_layers, output_layer)
 
     def lstm_features(self, features: Tensor) -> Tensor:
-        """Return the features that the LSTM receives; the readout receives all of them."""
+        """Return the columns of features [..., F] that are inputs of the LSTM."""
         return (
             features.index_select(-1, self.lstm_feature_index)
             if self.has_lstm_feature_subset
@@ -246,7 +260,7 @@ class LstmHead(ResidualHead):
         Returns:
             Residual accelerations [..., n] and memory [B, n_state].
         """
-        # concatenating a single tensor would copy it
+        # torch.cat of a single tensor would copy it
         residual: Tensor = self.scale(
             residuals[0] if len(residuals) == 1 else torch.cat(residuals, dim=-1)
         )

@@ -316,10 +316,10 @@ class ScoreDistribution:
         on the size of one change, or its small variance on clean logs, is no evidence for another
         one.
         """
-        weighted_scores, weighted_information, redundancy = self.weigh_by_log(groups)
-        weighted_scores = weighted_scores / redundancy
+        weighted_scores, weighted_information, design_effect = self.weigh_by_log(groups)
+        weighted_scores = weighted_scores / design_effect
         weights = (
-            np.diagonal(weighted_information, axis1=1, axis2=2) / redundancy + _TINY_INFORMATION
+            np.diagonal(weighted_information, axis1=1, axis2=2) / design_effect + _TINY_INFORMATION
         )
         sizes, total_weight = _huber_mean(weighted_scores, weights)
         inflation = self.wishart_inflation * self.inflation_factor**2

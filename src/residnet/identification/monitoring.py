@@ -1,10 +1,11 @@
 """Change detection by score tests on the innovations of short free runs.
 
-Windows are free-run as a whole and in parts, each from its measured start. The bias of the model on
-clean logs is subtracted from the innovations, which are whitened by their covariance over clean
-logs. For each possible change the score test evaluates whether a small change of this kind explains
-the recent windows, after wind and current are marginalised. The scatter of the scores over clean
-logs sets the scale of the scores. The joint scores of all changes rank the explanations.
+Windows are free-run as a whole and divided into parts, each from its measured start. The bias of
+the model on clean logs is subtracted from the innovations, which are whitened by their covariance
+over clean logs. For each possible change the score test evaluates whether a small change of this
+kind explains the recent windows, after wind and current are marginalised. Scores are divided by
+their standard deviation over groups of clean windows. The joint scores of all changes rank the
+explanations.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def innovation_columns(dof: DegreesOfFreedom) -> dict[str, int]:
 _WARMUP_DURATION = 5.0
 """Measured time in s before a window from which the memory of a head is initialised."""
 _MAX_BLOCKS = 5
-"""Largest number of blocks of a window; errors are averaged over each, which reduces noise."""
+"""Largest number of blocks of a window; errors are averaged over each block to reduce noise."""
 
 
 @dataclass(frozen=True)
@@ -171,24 +172,26 @@ def _flatten_innovations(states: Tensor, columns: Sequence[int]) -> Tensor:
 
 
 def make_measured_windows(log: PreparedLog, n_steps: int, n_warmup: int) -> list[MeasuredWindow]:
-    """Return back-to-back windows of a log whose samples are all usable.
+    """Return consecutive windows of a log, without the windows that have unusable samples.
 
     Args:
         log: log, prepared as the logs of the fit.
-        n_warmup: samples before a window for the warm-up of a memory; the first windows have none.
+        n_steps: number of steps of a window.
+        n_warmup: number of samples before a window, which must be usable too; they initialise the
+            memory of a head and may be samples of the window before.
     """
     windows = []
     window_start = n_warmup
     while window_start + n_steps < len(log):
         row_slice = slice(window_start - n_warmup, window_start + n_steps + 1)
-        is_trusted = (
+        is_valid = (
             log.usable[row_slice]
             & (log.segment[row_slice] == log.segment[window_start])
             & (log.segment[window_start] >= 0)
         )
-        if not is_trusted.all():
+        if not is_valid.all():
             # the next window starts after the last unusable sample
-            window_start = row_slice.start + int(np.flatnonzero(~is_trusted)[-1]) + 1 + n_warmup
+            window_start = row_slice.start + int(np.flatnonzero(~is_valid)[-1]) + 1 + n_warmup
             continue
         windows.append(
             MeasuredWindow(
@@ -207,10 +210,10 @@ def count_warmup_samples(model: HybridDynamics) -> int:
     return round(_WARMUP_DURATION / model.dt) if model.n_state else 0
 
 
-_LOOKS_PER_STRETCH = 3.0
-"""Equivalent number of independent tests while the sliding tested period moves by its length."""
+_TESTS_PER_PERIOD = 3.0
+"""Effective number of independent tests while the tested period slides by its own length."""
 _N_FOLDS = 5
-"""Number of folds of clean windows for cross-fitted scales."""
+"""Number of folds of the cross-validation by which clean windows are scored."""
 _MIN_GROUPS = 5
 """Smallest number of groups of clean windows from which a false alarm rate can be estimated."""
 _N_WINDOW_PARTS = 5
@@ -225,8 +228,8 @@ _MAX_DIVERGED_SHARE = 0.5
 """Largest share of clean windows with a diverged free run."""
 _CURRENT_STD = 0.5
 """Prior standard deviation of a current in m/s."""
-_PUSH_STD = 0.05
-"""Prior standard deviation of the acceleration by the wind in m/s^2."""
+_WIND_ACCELERATION_STD = 0.05
+"""Prior standard deviation of the acceleration of the vessel by wind in m/s^2."""
 
 
 class MonitorConfig(Config):
@@ -236,7 +239,8 @@ class MonitorConfig(Config):
         window: length of the free runs, in s.
         stretch: length of the recent period that is tested, in s.
         false_alarm: mean time between false alarms, in s.
-        group: length of the stretches of clean logs whose scatter sets the scale, in s.
+        group: length of a group of windows in s. Wind and current count as constant within a group,
+            and the scores of clean groups give the standard deviation of the scores.
     """
 
     window: Seconds = Field(default=10.0, gt=0)
@@ -251,10 +255,12 @@ class FaultHypothesis:
 
     Attributes:
         change: the change.
-        test_statistic: statistic of the score test, in standard deviations of clean logs.
-        estimated_size: size of the change in its unit.
+        test_statistic: magnitude of the estimated size divided by its standard error; this is the
+            score that is compared with the threshold.
+        estimated_size: estimated size of the change in its unit.
         standard_error: standard error of the size.
-        score_reduction: reduction of the joint score statistic by this change alone.
+        score_reduction: part of the joint score statistic of all changes that this change explains
+            alone.
     """
 
     change: SystemChange
@@ -284,7 +290,7 @@ class MonitorVerdict:
 
     @property
     def max_score(self) -> float:
-        """The largest score of any change."""
+        """The largest test statistic of any change."""
         return max(hypothesis.test_statistic for hypothesis in self.hypotheses)
 
 
@@ -294,11 +300,21 @@ _InnovationsAndEffects = tuple[np.ndarray, np.ndarray]
 class ChangeDetector:
     """Statistics of clean logs, and score tests against them.
 
+    Each window is evaluated in one or two divisions: as a whole, and in parts if it is long enough.
+    The innovations of clean logs have two biases. The model bias [Q, c] of a division is a size of
+    each of Q changes for each of c channels; it is subtracted from the innovations. The size bias
+    [Q] is the size of each change that the scores still show on clean logs afterwards.
+
     Args:
         spec: description of the model.
         model: the model.
         clean_windows: windows of clean logs, ordered by log; all of equal length.
         config: settings of the monitor.
+
+    Attributes:
+        part_counts: number of parts of a window in each division; 1 for the window as a whole.
+        bias_by_fold: model bias of each division, and size bias; first those of all clean logs,
+            then those without each fold.
 
     Raises:
         DataError: if there are too few clean logs.
@@ -316,7 +332,7 @@ class ChangeDetector:
         self.hypotheses = make_fault_hypotheses(spec.signals)
         self.innovation_columns = innovation_columns(spec.signals.dof)
         self.nuisance_changes = make_nuisance_changes()
-        nuisance_precisions = [_CURRENT_STD**-2] * 2 + [_PUSH_STD**-2] * 2
+        nuisance_precisions = [_CURRENT_STD**-2] * 2 + [_WIND_ACCELERATION_STD**-2] * 2
         self.nuisance_precision = np.diag(nuisance_precisions)
         prior_precisions = [(PRIOR_STD * item.size) ** -2 for item in self.hypotheses]
         self.prior_precision = np.diag([*prior_precisions, *nuisance_precisions])
@@ -324,8 +340,8 @@ class ChangeDetector:
         self.n_warmup = count_warmup_samples(model)
         indexed_groups = [
             (k, windows_of_group)
-            for k, log_of_group in enumerate(clean_windows)
-            for windows_of_group in self.group_windows(log_of_group)
+            for k, windows_of_log in enumerate(clean_windows)
+            for windows_of_group in self.group_windows(windows_of_log)
         ]
         if len(indexed_groups) < _MIN_GROUPS:
             raise DataError(
@@ -343,6 +359,7 @@ class ChangeDetector:
             [self.compute_innovations(windows_of_group, parts) for parts in self.part_counts]
             for _, windows_of_group in indexed_groups
         ]
+        # windows with a diverged free run have zero innovations, see `compute_innovations`
         has_diverged = np.concatenate(
             [(group[0][0] == 0.0).all(axis=1) for group in innovations_by_group]
         )
@@ -352,6 +369,7 @@ class ChangeDetector:
                 f" {has_diverged.sum()} of {len(has_diverged)} clean windows; use another model or"
                 f" a shorter window"
             )
+        # bias and covariance of the innovations over all clean groups
         model_bias = self._estimate_bias(innovations_by_group)
         self.whitening_matrices = [
             compute_whitening_matrix(
@@ -383,8 +401,8 @@ class ChangeDetector:
             ),
         )
         # two-sided threshold with a Bonferroni correction over tests in time and hypotheses
-        n_looks = config.false_alarm / config.stretch * _LOOKS_PER_STRETCH * len(self.hypotheses)
-        self.threshold = float(scipy.stats.t.isf(0.5 / n_looks, len(innovations_by_group) - 1))
+        n_tests = config.false_alarm / config.stretch * _TESTS_PER_PERIOD * len(self.hypotheses)
+        self.threshold = float(scipy.stats.t.isf(0.5 / n_tests, len(innovations_by_group) - 1))
 
     def _find_divergence_limits(self, clean_windows: Sequence[MeasuredWindow]) -> np.ndarray:
         """Return the innovations above which a free run has diverged, by innovation column."""
@@ -402,8 +420,9 @@ class ChangeDetector:
     ) -> tuple[list[tuple[list[np.ndarray], np.ndarray]], GroupScores]:
         """Estimate biases with all groups and without each fold, and the scores of each fold.
 
-        In service the bias is estimated from other logs than those tested, so that scores scatter
-        more than on the clean logs themselves.
+        In service the bias comes from other logs than those tested, so that the scores vary more
+        than those of the clean logs themselves. The scores of each fold with the bias of the other
+        folds vary as those in service.
 
         Args:
             innovations_by_group: innovations and effects of each group and division of windows.
@@ -413,8 +432,7 @@ class ChangeDetector:
             prior_precision: prior precision of the sizes of the changes [Q, Q].
 
         Returns:
-            Model bias and size bias [Q] of all groups and without each fold; the scores of each
-            group with the biases of the other folds.
+            `bias_by_fold`, and the scores of each group with the biases of the other folds.
         """
 
         def estimate_size_bias(
@@ -447,9 +465,11 @@ class ChangeDetector:
             )
             size_bias, groups = estimate_size_bias(fold_model_bias, fold_of_group != fold)
             biases.append((fold_model_bias, size_bias))
-            held_out_groups.append(vars(groups[fold_of_group == fold]).values())
+            held_out_groups.append(groups[fold_of_group == fold])
         cross_validated_groups = GroupScores(
-            *(np.concatenate(parts) for parts in zip(*held_out_groups, strict=True))
+            np.concatenate([groups.log_index for groups in held_out_groups]),
+            np.concatenate([groups.score for groups in held_out_groups]),
+            np.concatenate([groups.information for groups in held_out_groups]),
         )
         return biases, cross_validated_groups
 
@@ -457,15 +477,15 @@ class ChangeDetector:
         self, innovations_by_group: Sequence[Sequence[_InnovationsAndEffects]]
     ) -> list[np.ndarray]:
         """Return the model bias for each division of windows, from groups of clean windows."""
-        bias_by_look = []
-        for innovations_of_look in zip(*innovations_by_group, strict=True):
-            innovation, effects = map(np.concatenate, zip(*innovations_of_look, strict=True))
-            bias_by_look.append(
+        bias_by_division = []
+        for innovations_of_division in zip(*innovations_by_group, strict=True):
+            innovation, effects = map(np.concatenate, zip(*innovations_of_division, strict=True))
+            bias_by_division.append(
                 estimate_model_bias(
                     innovation, effects, self.hypotheses, len(self.innovation_columns)
                 )
             )
-        return bias_by_look
+        return bias_by_division
 
     @classmethod
     def from_logs(
@@ -519,7 +539,7 @@ class ChangeDetector:
         return detector
 
     def compute_sums(self, windows: Sequence[MeasuredWindow]) -> list[ScoreSums]:
-        """Return the scores of each of several windows."""
+        """Return the score sums of each window alone, with the model bias of all clean logs."""
         innovations_and_effects = [
             self.compute_innovations(windows, n_parts) for n_parts in self.part_counts
         ]
@@ -560,7 +580,8 @@ class ChangeDetector:
         """Return the expected innovations [B, n] of clean logs, given their effects [B, C, n].
 
         Args:
-            model_bias: mean sizes on clean logs for this division of windows [Q, 4].
+            effects: derivatives of the innovations by the size of each change.
+            model_bias: model bias of this division of windows [Q, c].
         """
         bias_by_column = np.tile(model_bias, effects.shape[2] // len(self.innovation_columns))
         return np.asarray((effects[:, : len(self.hypotheses)] * bias_by_column).sum(axis=1))
@@ -568,13 +589,13 @@ class ChangeDetector:
     def _compute_score_sums(
         self,
         innovations_and_effects: Sequence[_InnovationsAndEffects],
-        bias_by_look: Sequence[np.ndarray],
+        bias_by_division: Sequence[np.ndarray],
     ) -> ScoreSums:
         """Return the score sums of windows, evaluated as a whole and in parts."""
         corrected_innovations = [
             (innovation - self.expected_innovations(effects, model_bias), effects)
             for (innovation, effects), model_bias in zip(
-                innovations_and_effects, bias_by_look, strict=True
+                innovations_and_effects, bias_by_division, strict=True
             )
         ]
         return compute_robust_score_sums(
@@ -610,8 +631,14 @@ class ChangeDetector:
             group_scores
         )
         hypotheses = [
-            FaultHypothesis(change, float(abs(a) / b), float(a), float(b), float(c))
-            for change, a, b, c in zip(
+            FaultHypothesis(
+                change,
+                float(abs(estimated_size) / standard_error),
+                float(estimated_size),
+                float(standard_error),
+                float(explained_square),
+            )
+            for change, estimated_size, standard_error, explained_square in zip(
                 self.hypotheses, sizes, standard_errors, explained_squares, strict=True
             )
         ]
@@ -630,7 +657,7 @@ class ChangeDetector:
 
 
 _ALARM_HYSTERESIS = 1.0
-"""Standard deviations by which scores fall below the threshold before an alarm ends."""
+"""Distance in standard deviations of the scores below the threshold at which an alarm ends."""
 
 
 class OnlineChangeDetector:
@@ -690,7 +717,7 @@ class OnlineChangeDetector:
         self.is_group_closed = True
 
     def update_with_sums(self, window_sums: ScoreSums) -> MonitorVerdict:
-        """Take the scores of a window, and return the verdict on the last stretch."""
+        """Add the score sums of a window, and return the verdict on the recent period."""
         if self.is_group_closed or self.recent_groups[-1][1].n_windows >= self.windows_per_group:
             self.recent_groups.append((self.log_index, window_sums))
         else:

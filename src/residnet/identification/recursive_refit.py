@@ -44,10 +44,10 @@ _MAX_CHANGES = 3
 """Largest number of changes in one refit: the sizes of more changes are not identifiable."""
 _DIRECTION_RIDGE = 1e-6
 """Ridge of the least squares for a direction, relative to the information of each parameter."""
-_MIN_EXPRESSED_SHARE = 0.7
-"""Smallest share of the accelerations of a change that the parameters must explain."""
+_MIN_EXPLAINED_SHARE = 0.7
+"""Smallest share of the accelerations due to a change that the parameters must explain."""
 _SHORT_STEP_SHARE = 1e-4
-"""Step of the finite difference that gives the accelerations of a change, in time steps."""
+"""Short time step over which the accelerations due to a change are evaluated, in time steps."""
 _MAX_SAMPLES = 4_000
 """Largest number of samples for the least squares of a direction."""
 
@@ -120,10 +120,10 @@ def refit_recursively(
             verdict, [identified_change.change for identified_change in identified_changes]
         )
         if not stopping_reason:
-            _, expressed_share = _parameter_direction(detector.model, first_change, indexed_groups)
-            if expressed_share < _MIN_EXPRESSED_SHARE:
+            _, explained_share = _parameter_direction(detector.model, first_change, indexed_groups)
+            if explained_share < _MIN_EXPLAINED_SHARE:
                 stopping_reason = (
-                    f"the terms of the baseline explain only {expressed_share:.0%}"
+                    f"the terms of the baseline explain only {explained_share:.0%}"
                     f" of the accelerations due to '{first_change.name}'"
                 )
         if stopping_reason:
@@ -256,8 +256,14 @@ class _InformationFilter:
     """An extended information filter for the sizes of changes.
 
     Args:
-        detector: detector with the statistics of clean logs.
+        detector: detector with the statistics of clean logs; F is its number of biases
+            (`ChangeDetector.bias_by_fold`): that of all clean logs, then those without each fold.
         changes: Q changes whose sizes are estimated.
+
+    Attributes:
+        sizes: current estimates of the sizes [Q].
+        size_steps: steps of the finite differences in the sizes [Q].
+        directions: derivatives of the P free parameters by the sizes [P, Q].
     """
 
     def __init__(self, detector: ChangeDetector, changes: Sequence[SystemChange]) -> None:
@@ -266,7 +272,7 @@ class _InformationFilter:
         self.model = copy.deepcopy(detector.model)
         self.baseline = require_parametric_baseline(self.model)
         self.initial_parameters = self.baseline.get_free()
-        self.small_sizes = np.array([change.size for change in changes])
+        self.size_steps = np.array([change.size for change in changes])
         cause_names = [change.name for change in detector.hypotheses]
         self.cause_indices = [cause_names.index(change.name) for change in changes]
         self.sizes = np.zeros(len(changes))
@@ -283,7 +289,7 @@ class _InformationFilter:
         """
         for is_second_pass in (False, True):
             linearisation_sizes = np.where(
-                np.abs(self.sizes) > self.small_sizes, self.sizes, self.small_sizes
+                np.abs(self.sizes) > self.size_steps, self.sizes, self.size_steps
             )
             self.directions = torch.stack(
                 [
@@ -322,77 +328,87 @@ class _InformationFilter:
         *,
         use_initial_sizes: bool,
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-        """Process the logs in sequence; return sizes after each, their covariance, sizes by fold.
+        """Process the logs in sequence and estimate the sizes.
 
-        Free runs use the current sizes, or the initial sizes with `use_initial_sizes`.
+        Args:
+            indexed_groups: groups of windows with the index of their log.
+            use_initial_sizes: whether all free runs use the sizes at the start of the pass instead
+                of those estimated from the logs before.
+
+        Returns:
+            Sizes [Q] after each log, their covariance [Q, Q] at the end, and the sizes [F - 1, Q]
+            with the bias without each fold.
         """
-        precision = np.diag((PRIOR_STD * self.small_sizes) ** -2.0)
-        weighted_sizes = np.zeros((len(self.detector.bias_by_fold), len(self.sizes)))
+        precision = np.diag((PRIOR_STD * self.size_steps) ** -2.0)
+        information_vectors = np.zeros((len(self.detector.bias_by_fold), len(self.sizes)))
         sizes = self.sizes
         sizes_by_log: list[np.ndarray] = []
-        # information form of the Kalman filter: each log adds its information and scores
+        # information form of the Kalman filter: each log adds its information, and the scores about
+        # the current sizes; one information vector for each bias
         for log_index in dict.fromkeys(log_number for log_number, _ in indexed_groups):
             self._set_sizes(self.sizes)
             scores, log_information = self._process_log(
                 [group for log_number, group in indexed_groups if log_number == log_index]
             )
             precision = precision + log_information
-            weighted_sizes = weighted_sizes + scores + log_information @ self.sizes
-            sizes = np.linalg.solve(precision, weighted_sizes[0])
+            information_vectors = information_vectors + scores + log_information @ self.sizes
+            sizes = np.linalg.solve(precision, information_vectors[0])
             sizes_by_log.append(sizes)
             if not use_initial_sizes:
                 self.sizes = sizes
         self.sizes = sizes
         self._set_sizes(sizes)
         covariance = np.linalg.inv(precision)
-        return sizes_by_log, covariance, weighted_sizes[1:] @ covariance
+        return sizes_by_log, covariance, information_vectors[1:] @ covariance
 
     def _process_log(
         self, groups_of_log: Sequence[Sequence[MeasuredWindow]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return scores [1 + F, Q] and information of a log, weighted by the scatter of logs."""
+        """Return scores [F, Q] and information [Q, Q] of a log, weighted by their variance."""
         score, information = (
             np.stack(arrays)
             for arrays in zip(*map(self._process_group, groups_of_log), strict=True)
         )
         group_scores = GroupScores(np.zeros(len(groups_of_log)), score, information)
-        weighted_scores, weighted_information, redundancy = (
+        # all groups belong to one log; the design effect accounts for their correlation
+        weighted_scores, weighted_information, design_effect = (
             self.detector.score_distribution.select_causes(self.cause_indices).weigh_by_log(
                 group_scores
             )
         )
-        return weighted_scores[0] / redundancy.mean(), weighted_information[0] / redundancy.mean()
+        return (
+            weighted_scores[0] / design_effect.mean(),
+            weighted_information[0] / design_effect.mean(),
+        )
 
     def _set_sizes(self, sizes: np.ndarray) -> None:
         """Set the parameters of the model for changes of the given sizes [Q]."""
         self.baseline.set_free(self.initial_parameters + self.directions @ torch.from_numpy(sizes))
 
     def _process_group(self, windows: Sequence[MeasuredWindow]) -> tuple[np.ndarray, np.ndarray]:
-        """Return scores and information about corrections of the sizes from a group of windows.
-
-        Scores [1 + F, Q] use the bias of all clean logs first, then the bias without each fold.
-        """
+        """Return scores [F, Q] and information [Q, Q] of a group about corrections of the sizes."""
         detector = self.detector
         innovations_by_fold: list[list[tuple[np.ndarray, np.ndarray]]] = [
             [] for _ in detector.bias_by_fold
         ]
         for i, n_parts in enumerate(detector.part_counts):
-            _, cause_effects = detector.compute_innovations(windows, n_parts)
-            # the effects of windows with a diverged free run are set to zero: they are ignored
-            is_valid = (cause_effects != 0.0).any(axis=(1, 2))
+            # the bias on clean logs is defined by the effects of the detector's own model, which
+            # are zero in windows with a diverged free run; these windows are ignored
+            _, detector_effects = detector.compute_innovations(windows, n_parts)
+            is_valid = (detector_effects != 0.0).any(axis=(1, 2))
             window_parts = [item for window in windows for item in split_window(window, n_parts)]
             innovation, nuisance_effects = compute_innovations(
                 self.model, window_parts, detector.nuisance_changes
             )
-            # finite differences in the sizes: the effects at the current sizes, not at zero
+            # effects at the current sizes, by finite differences in the sizes
             change_effects = []
-            for change_index, small_size in enumerate(self.small_sizes):
+            for change_index, size_step in enumerate(self.size_steps):
                 self._set_sizes(
                     self.sizes
-                    + np.where(np.arange(len(self.sizes)) == change_index, small_size, 0.0)
+                    + np.where(np.arange(len(self.sizes)) == change_index, size_step, 0.0)
                 )
                 change_effects.append(
-                    (innovation - compute_innovations(self.model, window_parts, [])[0]) / small_size
+                    (innovation - compute_innovations(self.model, window_parts, [])[0]) / size_step
                 )
             self._set_sizes(self.sizes)
             all_effects = np.concatenate(
@@ -406,9 +422,9 @@ class _InformationFilter:
                 innovations_by_fold, detector.bias_by_fold, strict=True
             ):
                 # the part that the bias on clean logs explains is not attributed to a change
-                expected_innovation = detector.expected_innovations(cause_effects, model_bias[i])
+                expected_innovation = detector.expected_innovations(detector_effects, model_bias[i])
                 expected_innovation = expected_innovation + np.einsum(
-                    "q,bqn->bn", size_bias, cause_effects[:, : len(detector.hypotheses)]
+                    "q,bqn->bn", size_bias, detector_effects[:, : len(detector.hypotheses)]
                 )
                 innovations_of_fold.append(
                     (

@@ -27,8 +27,9 @@ Above this value one axis has less than a hundredth of the mass of another, whic
 def weighted_column_std(terms: Sequence[str], x: Tensor) -> Tensor:
     """Return the scales beta std(x) [J] of the columns x [N, J] of basis functions.
 
-    The order beta reduces the weight of high orders (Jervan 2020, eqs. (4.8), (4.9)). The article's
-    eq. (3.12) prints the divisor for beta = 2 only (J15 in docs/documents/corrections.md).
+    beta is the order of a basis function, so that regularisation penalises high orders more (Jervan
+    2020, eqs. (4.8), (4.9)). Eq. (3.12) there prints the divisor for beta = 2 only (J15 in
+    docs/documents/corrections.md).
 
     Raises:
         FitError: if a column is constant.
@@ -45,7 +46,13 @@ def weighted_column_std(terms: Sequence[str], x: Tensor) -> Tensor:
 
 
 class ForceCorrection(nn.Module):
-    """Force [..., 3] that is linear in basis functions, theta_0 + Theta' phi(nu_dot, nu)."""
+    """Force that is linear in basis functions phi of the motion, theta_0 + Theta' phi(nu_dot, nu).
+
+    Args:
+        terms: names of the J basis functions.
+        coefficients: Theta [J, 3].
+        intercept: theta_0 [3].
+    """
 
     def __init__(self, terms: Sequence[str], coefficients: Tensor, intercept: Tensor) -> None:
         super().__init__()
@@ -54,7 +61,7 @@ class ForceCorrection(nn.Module):
         self.intercept = nn.Buffer(intercept.to(torch.float64))
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Return the force [..., 3] at nu_dot [..., 3] and nu [..., 3]."""
+        """Return the force [..., 3] in N, N, N m at nu_dot [..., 3] and nu [..., 3] in SI units."""
         basis = self.library(torch.cat((nu_dot, nu), dim=-1))
         force: Tensor = basis @ self.coefficients.to(nu.dtype) + self.intercept.to(nu.dtype)
         return force
@@ -62,14 +69,14 @@ class ForceCorrection(nn.Module):
 
 @final
 class ForceCorrectionSum(nn.Module):
-    """The force [..., 3] of several corrections of a hull model together."""
+    """Sum of the forces of several corrections of a hull model."""
 
     def __init__(self, corrections: Sequence[nn.Module] | nn.ModuleList) -> None:
         super().__init__()
         self.corrections = nn.ModuleList(corrections)
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Return the force [..., 3] at nu_dot [..., 3] and nu [..., 3]."""
+        """Return the force [..., 3] in N, N, N m at nu_dot [..., 3] and nu [..., 3] in SI units."""
         force = torch.zeros_like(nu)
         for correction in self.corrections:
             force = force + correction(nu_dot, nu)
@@ -148,7 +155,14 @@ def augment_mass(
     subject: str,
     names: Sequence[str] = MOTION_CHANNELS,
 ) -> tuple[Tensor, list[int]]:
-    """Return M + A [3, 3] of eps = A nu_dot + b(nu), and the indices of the terms of b.
+    """Return M + A [3, 3] of a residual eps = A nu_dot + b(nu), and the indices of the terms of b.
+
+    Args:
+        mass: mass matrix M of the prior model [3, 3].
+        terms: names of the basis functions of eps.
+        coefficients: coefficients of the basis functions [J, 3].
+        subject: name of the model in error messages.
+        names: channels of the basis functions.
 
     Raises:
         ConfigError: if a term is not affine in nu_dot with a constant factor.

@@ -145,7 +145,7 @@ SubmergedRows = Annotated[
 def coefficient_rows(
     terms_by_axis: Mapping[Any, AxisTerms], factor: float = 1.0
 ) -> list[dict[str, float]]:
-    """Return the coefficients of each axis multiplied by a factor."""
+    """Return the coefficients of each axis by term, in SI units and multiplied by a factor."""
     return [
         {term: factor * parameter.value for term, parameter in axis_terms.items()}
         for axis_terms in terms_by_axis.values()
@@ -153,11 +153,11 @@ def coefficient_rows(
 
 
 class HullCoefficients(NamedTuple):
-    """Coefficients of a hull M nu_dot = terms(motion) C + tau.
+    """Coefficients of a hull M nu_dot = f(motion) + tau, in which f is a sum of terms.
 
     Attributes:
         mass: mass matrix M with added mass [n][n].
-        force_rows: coefficients of the force of each axis by term; damping terms are
+        force_rows: coefficients of f by term, one row for each axis; coefficients of damping are
             negative.
         channels: channels of the motion: velocities, then phi with roll and theta with pitch.
     """
@@ -484,36 +484,38 @@ class RollingHullConfig(HullVessel):
     actuators: RollingActuatorsConfig
 
     def initial_speeds(self) -> Mapping[str, float]:
-        """Return the service speed, at which the thrust of the source balances the resistance."""
+        """Return the service speed; there the resistance equals the thrust that the source gives."""
         return {"u": self.speed}
 
     def hull_coefficients(self) -> HullCoefficients:
         """Return the coefficients with the inertia about the origin (Gouletas 2020, eq. (5.12)).
 
-        Coriolis forces of the added mass are included only as terms of the source (X_vr).
+        Coriolis forces of the added mass are not computed from the added mass: the source contains
+        them in its hydrodynamic forces, for example in the term X_vr.
         """
         rigid_body = self.rigid_body
         added_mass = self.added_mass
         m = rigid_body.m.value
-        moment_x = m * rigid_body.x_G.value
-        moment_z = m * rigid_body.z_G.value
-        # off-diagonal entries couple sway, roll and yaw through the centre of gravity
-        roll_row = [
-            -(moment_z + added_mass.K_vdot.value),
-            rigid_body.I_x.value - added_mass.K_pdot.value,
-        ]
+        # first moments of mass, which couple sway, roll and yaw through the centre of gravity
+        mass_moment_x = m * rigid_body.x_G.value
+        mass_moment_z = m * rigid_body.z_G.value
         mass = [
             [m - added_mass.X_udot.value, 0.0, 0.0, 0.0],
             [
                 0.0,
                 m - added_mass.Y_vdot.value,
-                -(moment_z + added_mass.Y_pdot.value),
-                moment_x - added_mass.Y_rdot.value,
+                -(mass_moment_z + added_mass.Y_pdot.value),
+                mass_moment_x - added_mass.Y_rdot.value,
             ],
-            [0.0, *roll_row, -added_mass.K_rdot.value],
             [
                 0.0,
-                moment_x - added_mass.N_vdot.value,
+                -(mass_moment_z + added_mass.K_vdot.value),
+                rigid_body.I_x.value - added_mass.K_pdot.value,
+                -added_mass.K_rdot.value,
+            ],
+            [
+                0.0,
+                mass_moment_x - added_mass.N_vdot.value,
                 -added_mass.N_pdot.value,
                 rigid_body.I_z.value - added_mass.N_rdot.value,
             ],
@@ -521,10 +523,10 @@ class RollingHullConfig(HullVessel):
         # centripetal terms of the rigid body (5.12), and the restoring moment, which is missing in
         # (5.17)
         inertial_terms: tuple[dict[str, float], ...] = (
-            {"v r": m, "r r": moment_x, "p r": -moment_z},
+            {"v r": m, "r r": mass_moment_x, "p r": -mass_moment_z},
             {"u r": -m},
-            {"u r": moment_z, "phi": -self.hydrostatics.roll_stiffness},
-            {"u r": -moment_x},
+            {"u r": mass_moment_z, "phi": -self.hydrostatics.roll_stiffness},
+            {"u r": -mass_moment_x},
         )
         coefficients = coefficient_rows(self.forces)
         for axis_coefficients, added_terms in zip(coefficients, inertial_terms, strict=True):
@@ -621,8 +623,8 @@ class SubmergedHullConfig(HullVessel):
             - np.array([parameter.value for parameter in dict(added_mass).values()])
         )
         # the centre of gravity (x, 0, z) couples forces and moments: blocks -m S(r_G) and m S(r_G)
-        for force, moment, lever in ((0, 4, z), (1, 3, -z), (1, 5, x), (2, 4, -x)):
-            mass[force, moment] = mass[moment, force] = m * lever
+        for force_axis, moment_axis, lever in ((0, 4, z), (1, 3, -z), (1, 5, x), (2, 4, -x)):
+            mass[force_axis, moment_axis] = mass[moment_axis, force_axis] = m * lever
         coefficients = coefficient_rows(self.forces)
 
         def add_term(axis: int, term: str, value: float) -> None:

@@ -51,14 +51,14 @@ class NomotoVesselConfig(VesselFile, ABC):
     """
 
     pole_names: ClassVar[tuple[str, ...]]
-    """Names of the time constants of the poles."""
+    """Fields with the time constants of the denominator of r/delta."""
     speed: MetresPerSecond = Field(gt=0)
     K: Gain
     rudder: SteeringGearConfig
 
     @abstractmethod
     def state_space(self) -> SteeringStateSpace:
-        """Return the state-space model."""
+        """Return the linear model from rudder angle to sway velocity and yaw rate, in SI units."""
 
     @model_validator(mode="after")
     def _validate_turning_sense(self) -> NomotoVesselConfig:
@@ -112,7 +112,7 @@ class NomotoConfig(NomotoVesselConfig):
         """Return the state-space model of r with constant v."""
         k = self.K.value
         T = self.T.value
-        # the derivative of v is zero: it keeps its initial value
+        # without sideslip v is constant: its derivative is zero
         return SteeringStateSpace(np.diag([0.0, -1.0 / T]), np.array([0.0, k / T]))
 
 
@@ -133,7 +133,7 @@ class SecondOrderSteeringConfig(NomotoVesselConfig, ABC):
     T3: TimeConstant
 
     def companion_matrix(self) -> np.ndarray:
-        """Return the companion matrix [2, 2] of the denominator."""
+        """Return the companion matrix [[0, 1], [-1 / (T1 T2), -(T1 + T2) / (T1 T2)]]."""
         time_product = self.T1.value * self.T2.value
         time_sum = self.T1.value + self.T2.value
         return np.array([[0.0, 1.0], [-1.0 / time_product, -time_sum / time_product]])
@@ -145,7 +145,8 @@ class SecondOrderNomotoConfig(SecondOrderSteeringConfig):
     T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot): Gouletas 2020, eq. (5.5),
     with the missing time derivatives (G12 in docs/documents/corrections.md).
 
-    The internal state q = r_dot - K T3 / (T1 T2) delta avoids the derivative of the rudder angle.
+    The internal state q = r_dot - K T3 / (T1 T2) delta, named `_yaw_lag`, avoids the derivative of
+    the rudder angle.
     """
 
     kind: Literal["nomoto_second_order"]

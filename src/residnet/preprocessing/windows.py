@@ -24,15 +24,21 @@ from residnet.preprocessing.window_index import (
 class WindowStore:
     """Concatenated samples of all logs, N in total.
 
-    The other attributes are described in `PreparedLog`, with positions relative to the start
-    of the log.
-
     Attributes:
+        y: measured pose and velocities [N, 3 + n] in SI units; positions are relative to the start
+            of the log.
+        smoothed: the same with smoothed velocities [N, 3 + n].
+        nu_dot: accelerations [N, n].
+        w: inputs that act during the step after the sample [N, m].
+        rate_inputs: inputs that are paired with the accelerations [N, m].
+        usable: whether errors at the sample count [N] bool.
+        trainable: whether the sample may be used for training [N] bool.
         n_remaining: samples up to the end of the segment, including this one [N]; 0 outside of
             segments.
         n_elapsed: samples since the start of the segment [N].
         log_index: index of the log [N].
-        precomputed: additional columns of a training [N, k]; None without.
+        precomputed: quantities that a training computes once for all samples [N, k], for example
+            the accelerations of the baseline; None without them.
     """
 
     y: Tensor
@@ -75,6 +81,7 @@ class WindowStore:
                 )
                 values[row_slice] = torch.from_numpy(np.nan_to_num(values_of_log)).to(values.dtype)
             row_start += length
+            # frees the memory of logs that are stored in files
             paged.release_pages()
         n_remaining, n_elapsed = count_segment_samples([log.segment for log in logs])
         return cls(
@@ -85,9 +92,10 @@ class WindowStore:
         )
 
     def coarsen(self, stride: int, angle_columns: Sequence[int] = ()) -> WindowStore:
-        """Return the logs with a longer time step, once for each of the `stride` first samples.
+        """Return the logs with a time step that is `stride` times as long.
 
-        States are subsampled. The input over a long step is the mean over its short steps.
+        Each log is subsampled `stride` times, from each of its first `stride` samples on, so that
+        no sample is lost. The input over a long step is the mean over its short steps.
 
         Args:
             stride: number of short steps in a long step.
@@ -101,6 +109,7 @@ class WindowStore:
             # the last samples have no following step; their last value is repeated
             padded = torch.cat((values, values[-1:].expand(stride - 1, -1)))
             step_values = padded.unfold(0, stride, 1)
+            # the mean of differences to the first value is also correct for angles that wrap
             differences = step_values - step_values[..., :1]
             for column in angle_columns:
                 differences[:, column] = torch.remainder(
@@ -144,7 +153,7 @@ class WindowStore:
         return torch.from_numpy(self.index.find_segment_starts(length, n_lead))
 
     def take_windows(self, values: Tensor, starts: Tensor, length: int) -> Tensor:
-        """Return windows [B, length, ...] of one of the tensors that begin at rows `starts` [B]."""
+        """Return windows [B, length, ...] of a tensor [N, ...] that begin at rows `starts` [B]."""
         # a strided view of all overlapping windows, without a copy
         view_shape = (len(values) - length + 1, length, *values.shape[1:])
         return values.as_strided(view_shape, (values.stride(0), *values.stride()))[starts]

@@ -26,10 +26,14 @@ from residnet.regression.estimator import (
 
 _COLLINEARITY_TOLERANCE = 1e-9
 """Ratio to the largest singular value below which centred columns count as collinear."""
-_MIN_COLLINEAR_LOAD = 0.1
-"""Ratio to the largest loading above which an error message lists a column as collinear."""
+_MIN_COLLINEAR_LOADING = 0.1
+"""Loading in the smallest singular vector, relative to the largest one, above which an error
+message lists a column as collinear.
+"""
 _ROUNDING_FACTOR = 10
-"""Rounding error of a zero eigenvalue, in units of columns times machine precision."""
+"""Largest rounding error of a zero eigenvalue of a Gram matrix, relative to its largest
+eigenvalue, in units of the number of columns times the machine precision.
+"""
 _MIN_EIGENVALUE = 1e-300
 """Lower bound of the eigenvalue in the denominator of a condition number."""
 _N_PENALTIES = 40
@@ -39,7 +43,7 @@ _MAX_ITERATIONS = 3000
 _TOLERANCE = 1e-4
 """Duality gap at which coordinate descent ends."""
 _MIN_DAMPING = 1e-8
-"""Damping that hardly changes a step; the smallest damping after a failed undamped step."""
+"""Smallest damping other than zero. Its effect on a step is negligible."""
 _MAX_DAMPING_TRIALS = 8
 """Number of dampings tried without a decrease before a point counts as the minimum."""
 
@@ -79,9 +83,11 @@ class LeastSquares(Estimator):
                 " coefficient is not identifiable; remove the regressor or record data that"
                 " excite it"
             )
-        # one pass over the data gives the normal equations of the scaled columns
+        # two passes over the data give the normal equations of the scaled columns
         gram = _sum_over_chunks(x, lambda _, chunk: (chunk / scale).T @ (chunk / scale)) / n_samples
-        cross = _sum_over_chunks(x, lambda rows, chunk: (chunk / scale).T @ y[rows]) / n_samples
+        cross_moments = (
+            _sum_over_chunks(x, lambda rows, chunk: (chunk / scale).T @ y[rows]) / n_samples
+        )
         # an eigenvalue at rounding level means collinear columns; report the two largest loadings
         eigenvalues, eigenvectors = torch.linalg.eigh(gram)
         condition = float(torch.sqrt(eigenvalues[-1] / eigenvalues[0].clamp(min=_MIN_EIGENVALUE)))
@@ -101,7 +107,7 @@ class LeastSquares(Estimator):
         for penalty in self.penalties:
             # sandwich estimator of the covariance, in the units of the unscaled columns
             inverse = torch.linalg.inv(gram + penalty * torch.eye(n_columns, dtype=y.dtype))
-            coefficients = inverse @ cross
+            coefficients = inverse @ cross_moments
             score_covariance = _score_covariance(x, y, scale, coefficients, gram, groups)
             covariance = (
                 inverse @ score_covariance @ inverse / n_samples**2 / torch.outer(scale, scale)
@@ -141,9 +147,9 @@ class CentredLeastSquares(Estimator):
         y_centred = y - mean_y
         _, singular_values, right_vectors = torch.linalg.svd(x_centred, full_matrices=False)
         if float(singular_values[-1]) <= _COLLINEARITY_TOLERANCE * float(singular_values[0]):
-            column_loads = right_vectors[-1].abs()
+            loadings = right_vectors[-1].abs()
             collinear_columns = (
-                (column_loads > _MIN_COLLINEAR_LOAD * column_loads.max()).nonzero()[:, 0].tolist()
+                (loadings > _MIN_COLLINEAR_LOADING * loadings.max()).nonzero()[:, 0].tolist()
             )
             raise FitError(
                 f"basis functions {', '.join(names[j] for j in collinear_columns)} are collinear on"
@@ -219,18 +225,27 @@ def _score_covariance(
     gram: Tensor,
     groups: Tensor | None,
 ) -> Tensor:
-    """Return the covariance of the score a'e of each output [n, J, J], for columns a = x / scale.
+    """Return the covariance [n, J, J] of the score of each output.
 
-    The covariance is that of the group sums of the score if there are at least two groups;
-    otherwise residuals are assumed independent.
+    The score is the sum over samples of the scaled columns x / scale times the residual. With at
+    least two groups its covariance is estimated from the sums of each group; otherwise residuals
+    are assumed independent.
+
+    Args:
+        x: columns [N, J].
+        y: outputs [N, n].
+        scale: root mean square of each column [J].
+        coefficients: coefficients of the scaled columns [J, n].
+        gram: mean outer product of the scaled columns [J, J].
+        groups: group of each sample [N]; None for independent residuals.
     """
     n_samples, n_columns = x.shape
     n_outputs = y.shape[1]
-    unique_groups, group_index = (
-        torch.unique(groups, return_inverse=True) if groups is not None else (y[:0, 0], None)
-    )
-    n_groups = int(unique_groups.numel())
-    if group_index is None or n_groups < 2:
+    n_groups = 0
+    if groups is not None:
+        unique_groups, group_index = torch.unique(groups, return_inverse=True)
+        n_groups = int(unique_groups.numel())
+    if n_groups < 2:
         residual_sum_of_squares = _sum_over_chunks(
             x, lambda rows, chunk: (y[rows] - chunk / scale @ coefficients).square().sum(0)
         )
@@ -246,7 +261,10 @@ def _score_covariance(
 
 
 def _sum_over_chunks(x: Regressors, contribution: Callable[[slice, Tensor], Tensor]) -> Tensor:
-    """Sum a function of rows and regressors over all chunks."""
+    """Return the sum of `contribution(rows, chunk)` over the chunks of x [N, J].
+
+    A chunk has the regressors at a slice of rows. Chunks bound the memory of lazy regressors.
+    """
     chunks = iter(iterate_chunks(x))
     rows, chunk = next(chunks)
     total = contribution(rows, chunk)

@@ -24,19 +24,25 @@ from residnet.regression.estimator import Coefficient, Estimator, EstimatorData,
 from residnet.regression.sparse_config import SparseSearchConfig
 
 _DEPENDENCE_TOLERANCE = 1e-12
-"""Norm of a unit column orthogonal to simpler ones, below which it counts as dependent on them."""
+"""Norm of the component of a unit column orthogonal to simpler columns, below which the column
+counts as linearly dependent on them.
+"""
 _MIN_NORM = 1e-300
 """Norm below which a column or target counts as zero; lower bound of a denominator."""
 _MIN_REPORTED_SHARE = 1e-6
 """Minimum weight of a simpler column that is reported as a component of a dependent column."""
 _DUPLICATE_TOLERANCE = 1e-11
-"""Norm of a unit column orthogonal to a subset, below which it consists of rounding errors."""
+"""Norm of the component of a unit column orthogonal to a subset, below which the component is a
+rounding error.
+"""
 _SPAN_TOLERANCE = 1e-9
-"""Norm of a unit column orthogonal to a subset, below which it lies in its span."""
+"""Norm of the component of a unit column orthogonal to a subset, below which the share of the
+column is not estimated.
+"""
 _NOISE_SHARE = 1e-9
 """Relative error of the best equation above which the data count as noisy."""
 _POSITIVE_EVIDENCE = 3.0
-"""Increase of the BIC on removal of a term, up to which backward elimination removes it.
+"""Increase of the BIC by removal of a term, up to which backward elimination removes the term.
 
 It lies between positive and strong evidence (Kass and Raftery 1995).
 """
@@ -64,9 +70,10 @@ class ReducedProblem:
         names: names of the linearly independent candidates, simplest first.
         degree: degree of each candidate, ascending, [J].
         scale: norm of each column before scaling to unit norm, [J].
-        r: unit columns in the coordinates of the QR factorisation [J + K, J].
+        r: unit columns in the coordinates of the QR factorisation of [columns | targets]
+            [J + K, J]. Inner products, and hence least squares, are those of the N samples.
         y: targets in the same coordinates [J + K, K].
-        independent_samples: effective number of independent samples of each target, [K].
+        n_independent_samples: effective number of independent samples of each target, [K].
         rank: number of linearly independent candidates J.
         condition: condition number of the unit columns.
         unexcited: names of candidates that are zero in all samples.
@@ -79,7 +86,7 @@ class ReducedProblem:
     scale: np.ndarray
     r: np.ndarray
     y: np.ndarray
-    independent_samples: np.ndarray
+    n_independent_samples: np.ndarray
     rank: int
     condition: float
     unexcited: tuple[str, ...]
@@ -141,13 +148,14 @@ def reduce_problem(
         scale=scale,
         r=r_factor[:, : excited.size],
         y=r_factor[:, excited.size :],
-        independent_samples=np.full(y.shape[1], float(x.shape[0])),
+        n_independent_samples=np.full(y.shape[1], float(x.shape[0])),
         rank=excited.size,
         condition=np.inf,
         unexcited=tuple(names[i] for i in order[column_norm <= _MIN_NORM]),
         dependent={},
     )
-    # residuals of the full model estimate how many samples are independent
+    # the autocorrelation of the residuals of the full model estimates how many samples are
+    # independent
     distinct = merge_similar_columns(all_candidates, _DEPENDENCE_TOLERANCE)
     columns = [excited[all_candidates.names.index(name)] for name in distinct.names]
     coefficients = (
@@ -156,7 +164,7 @@ def reduce_problem(
     )
     return replace(
         distinct,
-        independent_samples=x.shape[0]
+        n_independent_samples=x.shape[0]
         / effective_correlation_length(y - x[:, columns] @ coefficients),
     )
 
@@ -227,16 +235,16 @@ class ForwardSearch:
     Args:
         r: candidate columns of unit norm [R, J].
         y: target [R].
-        independent_samples: effective number of independent samples.
+        n_independent_samples: effective number of independent samples.
         config: settings of the search.
     """
 
     def __init__(
-        self, r: np.ndarray, y: np.ndarray, independent_samples: float, config: SparseSearchConfig
+        self, r: np.ndarray, y: np.ndarray, n_independent_samples: float, config: SparseSearchConfig
     ) -> None:
         self.r = r
         self.y = y
-        self.independent_samples = independent_samples
+        self.n_independent_samples = n_independent_samples
         self.config = config
         self.target_energy = float(y @ y)
         self.max_terms = min(config.max_terms, r.shape[1])
@@ -255,8 +263,8 @@ class ForwardSearch:
         log_combinations = (
             gammaln(n_candidates + 1) - gammaln(n_terms + 1) - gammaln(n_candidates - n_terms + 1)
         )
-        goodness_of_fit = self.independent_samples * np.log(relative_rss)
-        size_penalty = n_terms * np.log(self.independent_samples)
+        goodness_of_fit = self.n_independent_samples * np.log(relative_rss)
+        size_penalty = n_terms * np.log(self.n_independent_samples)
         return np.asarray(
             goodness_of_fit + size_penalty + 2.0 * self.config.gamma * log_combinations
         )
@@ -294,7 +302,8 @@ class ForwardSearch:
         At each size the search keeps the best extensions of the subsets by one column. Greedy
         forward selection often picks a column that replaces two true ones and cannot recover.
         """
-        best_subset: tuple[float, list[int]] = (float(self.criterion(self.target_energy, 0)), [])
+        best_criterion = float(self.criterion(self.target_energy, 0))
+        best_subset: list[int] = []
         subsets = np.zeros((1, 0), dtype=int)
         sizes_without_gain = 0
         while subsets.shape[1] < self.max_terms and sizes_without_gain < _MAX_SIZES_WITHOUT_GAIN:
@@ -310,22 +319,24 @@ class ForwardSearch:
             )
             _, unique_index = np.unique(extended, axis=0, return_index=True)
             subsets = extended[np.sort(unique_index)[:_BEAM_WIDTH]]
-            leading_set = subsets[0].tolist()
-            rss = self.rss(leading_set)
-            criterion_value = float(self.criterion(rss, len(leading_set)))
+            best_of_size = subsets[0].tolist()
+            rss = self.rss(best_of_size)
+            criterion_value = float(self.criterion(rss, len(best_of_size)))
             sizes_without_gain = sizes_without_gain + 1
-            if criterion_value < best_subset[0]:
-                best_subset = (criterion_value, leading_set)
+            if criterion_value < best_criterion:
+                best_criterion = criterion_value
+                best_subset = best_of_size
                 sizes_without_gain = 0
             if self.is_exact(rss):
                 break
-        return best_subset
+        return best_criterion, best_subset
 
     def backward_eliminate(self, subset: list[int]) -> list[int]:
         """Remove the least significant columns while the criterion increases by too little.
 
-        With many candidates, some column fits the noise of one target in several dozen well enough
-        for the criterion alone. An exact fit loses every column that it does not need.
+        With many candidates the criterion alone accepts a column that fits only noise, in about one
+        of several dozen targets. From an exact fit, all columns are removed without which the fit
+        remains exact.
         """
         subset = list(subset)
         criterion_value = self.criterion_of(subset)
@@ -383,7 +394,8 @@ class SparseEquation:
         relative_error: RMS error divided by the RMS of the target.
         is_exact: whether the error is at the level of rounding errors.
         criterion: extended BIC.
-        alternatives: term -> candidates that could replace it without strong evidence against them.
+        alternatives: term -> candidates that could replace it, because the BIC is no strong
+            evidence against the replacement.
         undecided: candidate -> upper bound (two standard errors) of its share of the target, for
             candidates outside the equation whose bound exceeds 5 %.
     """
@@ -468,10 +480,10 @@ def _search_by_degree(
 def _make_search(
     reduced: ReducedProblem, output_index: int, config: SparseSearchConfig, n_candidates: int
 ) -> ForwardSearch:
-    """Build the search among the first `n_candidates` candidates."""
-    independent_samples = float(reduced.independent_samples[output_index])
+    """Build the search among the `n_candidates` simplest candidates."""
+    n_independent_samples = float(reduced.n_independent_samples[output_index])
     return ForwardSearch(
-        reduced.r[:, :n_candidates], reduced.y[:, output_index], independent_samples, config
+        reduced.r[:, :n_candidates], reduced.y[:, output_index], n_independent_samples, config
     )
 
 
@@ -489,7 +501,7 @@ def build_equation(
     rss = search.rss(subset)
     is_exact = search.is_exact(rss)
     coefficient_values, r_inverse = solve_least_squares(search.r[:, subset], search.y)
-    residual_std = np.sqrt(rss / max(search.independent_samples - len(subset), 1.0))
+    residual_std = np.sqrt(rss / max(search.n_independent_samples - len(subset), 1.0))
     standard_errors = residual_std * np.sqrt(np.square(r_inverse).sum(axis=1))
     names = np.array(reduced.names, dtype=object)
     return SparseEquation(
@@ -507,7 +519,7 @@ def build_equation(
 def _equivalent_terms(
     search: ForwardSearch, subset: list[int], names: np.ndarray
 ) -> dict[str, list[str]]:
-    """Return, per term, the candidates that could replace it without strong evidence against."""
+    """Return `SparseEquation.alternatives` of the equation of a subset of columns."""
     if not subset:
         return {}
     # replace each term by every other candidate, and keep those with a similar criterion
@@ -594,8 +606,9 @@ class SparseRegression(Estimator):
 
         The groups of the samples are not used.
         """
-        _, y, _, names, outputs = data
-        problems = self._reduce_outputs(to_dense(data.x).numpy(), y.numpy(), names)
+        names = data.names
+        outputs = data.outputs
+        problems = self._reduce_outputs(to_dense(data.x).numpy(), data.y.numpy(), names)
         preferred = self._build_solution(problems, self.search, names, outputs)
         if not self.gammas:
             return [preferred]

@@ -1,8 +1,8 @@
 """Leave-one-out parameters of a refitted baseline by one Gauss-Newton step for each fold of logs.
 
-At the minimum over all logs, the normal equations of a fold give its contribution to Hessian and
-gradient. One Gauss-Newton step without this contribution approximates the refit without the fold
-(infinitesimal jackknife). All folds cost as much as one iteration of the refit.
+Each fold of logs contributes to the Hessian and the gradient of the cost at the refitted
+parameters. One Gauss-Newton step without the contribution of a fold approximates the refit without
+this fold (infinitesimal jackknife). All folds together cost as much as one iteration of the refit.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class RefitUncertainty(NamedTuple):
 
     Attributes:
         covariance: covariance of the free parameters [P, P].
-        mean_square_error: mean square error of a channel of the free runs, in units of the scales.
+        mean_square_error: mean square error of the free runs over all velocities, each divided by
+            its scale.
     """
 
     covariance: Tensor
@@ -63,6 +64,7 @@ def estimate_refit_covariance(
     cost, states = simulate(model, problem)
     hessian, _ = normal_equations(model, problem, cost, states)
     covariance = problem.cost_per_nat(cost) * problem.inverse(hessian)
+    # inverts the robust cost of a window, sqrt(mean square error + robust^2)
     return RefitUncertainty(covariance, float(cost.square() - config.robust**2))
 
 
@@ -111,11 +113,12 @@ def estimate_leave_one_out(
         )
         for k in range(n_folds)
     ]
-    # at the minimum the gradients of all logs and of the prior cancel
+    # at the refitted parameters this gradient and that of the prior cancel, so that it also stands
+    # for the prior in the change of the gradient below
     total_gradient = sum(
         (
-            share * equations
-            for share, (_, equations) in zip(
+            share * gradient
+            for share, (_, gradient) in zip(
                 n_windows / n_windows.sum(), equations_by_fold, strict=True
             )
         ),
@@ -132,9 +135,9 @@ def estimate_leave_one_out(
             + problem.symmetry
             + torch.diag(problem.cost_per_nat(cost) * problem.belief_precision)
         )
-        for j, (equations, _) in enumerate(equations_by_fold):
+        for j, (hessian_of_fold, _) in enumerate(equations_by_fold):
             if j != k:
-                hessian = hessian + n_windows[j] / n_remaining * equations
+                hessian = hessian + n_windows[j] / n_remaining * hessian_of_fold
         gradient_change = n_windows[k] / n_remaining * (equations_by_fold[k][1] - total_gradient)
         step = torch.linalg.lstsq(
             hessian, gradient_change.unsqueeze(1), driver="gelsd"
@@ -152,7 +155,7 @@ def _largest_improving_step(
 ) -> Tensor:
     """Return the parameters after the largest fraction of the step that lowers the cost."""
     baseline = require_parametric_baseline(model)
-    (initial_cost, _) = simulate(model, remaining)
+    initial_cost, _ = simulate(model, remaining)
     for halving in range(_MAX_HALVINGS):
         trial = parameters + 0.5**halving * step
         baseline.set_free(trial)
@@ -164,7 +167,7 @@ def _largest_improving_step(
 
 
 def _select_windows(problem: Problem, is_selected: Tensor) -> Problem:
-    """Return the problem of some of its windows, with their current initial states."""
+    """Return the problem of some windows; their initial states are not estimated again."""
     return replace(
         problem,
         x0=problem.x0[is_selected],
@@ -179,12 +182,20 @@ def _select_windows(problem: Problem, is_selected: Tensor) -> Problem:
 def _normal_equations_of_windows(
     model: HybridDynamics, problem: Problem, states: Tensor, cost: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return Hessian [P, P] and half the gradient [P] of the mean cost of some windows."""
+    """Return half the Hessian [P, P] and half the gradient [P] of the mean cost, without prior.
+
+    Args:
+        model: a baseline without a head.
+        problem: the windows.
+        states: free runs of the windows.
+        cost: cost of all windows of the refit.
+    """
     n_parameters = int(problem.free.numel())
     if len(problem.x0) == 0:
         return torch.zeros(n_parameters, n_parameters, dtype=states.dtype), torch.zeros(
             n_parameters, dtype=states.dtype
         )
+    # zero precision of all priors, and no deviation from their mean
     without_prior = replace(
         problem,
         precision=torch.zeros_like(problem.precision),

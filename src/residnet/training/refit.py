@@ -294,7 +294,9 @@ def sensitivities(
 def normal_equations(
     model: HybridDynamics, problem: Problem, cost: Tensor, states: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the Gauss-Newton Hessian [P, P] and half the gradient [P] of the cost with its prior.
+    """Return half the Gauss-Newton Hessian [P, P] and half the gradient [P] of cost and prior.
+
+    The step -hessian^-1 gradient is the same as without the factors of one half.
 
     Args:
         model: a baseline without a head.
