@@ -132,14 +132,14 @@ def check_findings(vessel: str, logs: Sequence[Log]) -> list[str]:
     """Return the findings above a note of each log and of sets of logs."""
     known_faults = _KNOWN_FAULTS.get(vessel, ())
     accusations = [
-        f"{finding.code}: {log.name}: {finding.to_line}"
+        f"{finding.code}: {log.name}: {finding.line}"
         for log in logs
         for finding in inspect_log(log).findings
         if finding.level != "note" and finding.code not in known_faults
     ]
     for start in range(0, len(logs), _SET_SIZE):
         accusations += [
-            f"{finding.code}: {finding.to_line}"
+            f"{finding.code}: {finding.line}"
             for finding in inspect_log_set(logs[start : start + _SET_SIZE]).findings
             if finding.level != "note"
         ]

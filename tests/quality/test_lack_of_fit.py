@@ -52,7 +52,7 @@ def test_other_manoeuvres_are_no_contradiction(seed: int) -> None:
     fast = [sail(seed + 7, 2.6, 0.6), sail(seed + 8, 2.4, 0.1)]
     report = inspect_log_set([*gentle, *fast], ["n", "delta"])
     accusing = [f for f in report.findings if f.code.startswith("contradicts")]
-    assert [finding.to_line for finding in accusing] == []
+    assert [finding.line for finding in accusing] == []
 
 
 def test_a_scaled_rudder_is_still_a_contradiction() -> None:
@@ -68,7 +68,7 @@ def test_turns_to_the_other_side_are_no_contradiction() -> None:
     starboard = [sail(50 + k, 1.5 + 0.1 * k, 0.5, side=1.0) for k in range(7)]
     report = inspect_log_set([*starboard, sail(60, 1.8, 0.5, side=-1.0)], ["n", "delta"])
     accusing = [f for f in report.findings if f.code.startswith("contradicts")]
-    assert [finding.to_line for finding in accusing] == []
+    assert [finding.line for finding in accusing] == []
 
 
 @pytest.mark.parametrize(("side", "is_identified"), [(0.0, True), (1.0, False)])

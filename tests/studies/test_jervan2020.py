@@ -43,7 +43,7 @@ from residnet.studies.jervan2020.ferry.judging import draw_judging_courses
 from residnet.studies.jervan2020.residual import (
     derive_forward_equations,
     estimate_earth_force,
-    missing_coefficients,
+    exact_residual_coefficients,
 )
 
 STUDIES = Path(residnet.__file__).parents[2] / "configs" / "studies" / "jervan2020"
@@ -120,7 +120,7 @@ MISSING = {
 
 
 def test_what_the_believed_hull_lacks_stands_beside_what_was_found() -> None:
-    truth = missing_coefficients("milliampere_half", "milliampere")
+    truth = exact_residual_coefficients("milliampere_half", "milliampere")
     for term, values in MISSING.items():
         assert truth[term] == pytest.approx(values, abs=0.006)
     assert set(truth) <= set(FERRY_TERMS)

@@ -158,16 +158,17 @@ class SimulationResult:
         logs: simulated measurements, one log for each manoeuvre; the logs of a learned model follow
             those of the vessel.
         motions: the simulated motions without noise.
-        indices: one row for each simulated run: log, manoeuvre, craft, fault, then manoeuvring
-            indices in SI and rad; an index is missing if the run is too short for it.
+        indices: one row for each simulated manoeuvre: log, manoeuvre, craft (vessel or learned
+            model), fault (why it did not end as intended), then manoeuvring indices in SI and rad.
+            An index is missing if the log is too short for it.
 
     Example:
         trials.indices[["log", "first_overshoot"]]
     """
 
-    def __init__(self, flights: Sequence[ManoeuvreRun], indices: pd.DataFrame) -> None:
-        self.logs: list[Log] = [flight.measured_log for flight in flights]
-        self.motions: list[Log] = [flight.true_log for flight in flights]
+    def __init__(self, simulated_runs: Sequence[ManoeuvreRun], indices: pd.DataFrame) -> None:
+        self.logs: list[Log] = [simulated_run.measured_log for simulated_run in simulated_runs]
+        self.motions: list[Log] = [simulated_run.true_log for simulated_run in simulated_runs]
         self.indices = indices
 
     def __repr__(self) -> str:
@@ -214,13 +215,13 @@ def simulate(
         name: value for name, value in programme_settings.items() if value is not None
     }
     programme: Programme = validate_config(to_builtin(settings_without_none), Programme, "simulate")
-    flights = []
+    simulated_runs = []
     rows = []
     with forward_progress(progress):
-        for craft, sea in build_crafts(programme):
-            craft_flights = simulate_all(programme, craft, sea)
-            flights += craft_flights
-            rows += build_index_rows(craft, craft_flights, programme.hull_length)
+        for craft, environment in build_crafts(programme):
+            runs_of_craft = simulate_all(programme, craft, environment)
+            simulated_runs += runs_of_craft
+            rows += build_index_rows(craft, runs_of_craft, programme.hull_length)
     flat_rows = [
         {
             "log": row.log,
@@ -231,7 +232,7 @@ def simulate(
         }
         for row in rows
     ]
-    return SimulationResult(flights, pd.DataFrame(flat_rows))
+    return SimulationResult(simulated_runs, pd.DataFrame(flat_rows))
 
 
 @final
@@ -277,7 +278,7 @@ class RunResult:
 
     @property
     def file_names(self) -> list[str]:
-        """Names of all files of the run."""
+        """Paths of all files of the run, relative to its folder, for `read_file`."""
         all_paths = sorted(self.folder.rglob("*"))
         return [str(file.relative_to(self.folder)) for file in all_paths if file.is_file()]
 
@@ -355,7 +356,7 @@ def run(
 
     Raises:
         ConfigError: if the config is wrong.
-        ResidnetError: if the input does not allow it, or a result fails a check.
+        ResidnetError: if the data do not suffice for the task, or a result fails a check.
 
     Example:
         result = residnet.run("quickstart.yaml", overrides={"seed": 3}); result.metrics

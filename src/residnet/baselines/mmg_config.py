@@ -94,6 +94,7 @@ class MMGParticularsConfig(IdentifiedConfig, ABC):
         if self.rudder_formulas != "usual":
             means = _RUDDER_MEANS[self.rudder_formulas](self.hull)
             priors |= {name: priors[name]._replace(mean=mean) for name, mean in means.items()}
+        # priors of a config have no description
         configured_priors = {
             name: ParameterPrior(*mean_and_std, "") for name, mean_and_std in self.beliefs.items()
         }
@@ -126,8 +127,8 @@ class MMGConfig(MMGParticularsConfig):
             independent sample.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
         prior_weight: `fixed` takes the standard deviations of the priors as they are; `evidence`
-            multiplies them by the factor of at least 1 with the largest marginal likelihood, so
-            that logs leave regressions that they contradict.
+            multiplies them by the factor of at least 1 with the largest marginal likelihood, which
+            reduces the weight of regressions that the logs contradict.
     """
 
     kind: Literal["mmg"] = "mmg"

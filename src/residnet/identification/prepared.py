@@ -89,7 +89,11 @@ def _report_sources(logs: Sequence[PreparedLog]) -> None:
 def mask_unexplained_idle(
     splits: Mapping[str, Sequence[Log]], config: PrepareConfig, input_names: Sequence[str]
 ) -> dict[str, Sequence[Log]]:
-    """Mask unexplained motion with constant inputs in training logs, if the config asks for it.
+    """Mask idle segments of training logs whose motion is unexplained, if the config asks for it.
+
+    In an idle segment all inputs are constant. Its motion is unexplained if a model fitted to the
+    other logs does not predict it, for example if the vessel was controlled by hand while the
+    logged commands stood still.
 
     Validation and test logs are returned unchanged, since errors of the models in such stretches
     must count.
@@ -202,7 +206,7 @@ def convert_to_motion_through_water(
     signals = settings.signals.build()
     baseline = settings.all_baselines[settings.current.baseline].build(signals.names)
     assert isinstance(baseline, RegressorBaseline), "the settings were validated"
-    # fitted logs first: estimate_currents takes the logs it fits and the others separately
+    # logs of the fit first: estimate_currents takes them and the other logs separately
     split_order = sorted(splits, key=lambda split: split not in ("train", "validation"))
     all_logs = [log for split in split_order for log in logs[split]]
     n_fitted = sum(len(logs[split]) for split in ("train", "validation"))

@@ -484,7 +484,7 @@ class RollingHullConfig(HullVessel):
     actuators: RollingActuatorsConfig
 
     def initial_speeds(self) -> Mapping[str, float]:
-        """Return the service speed; there the resistance equals the thrust that the source gives."""
+        """Return the service speed, at which the thrust of the source equals the resistance."""
         return {"u": self.speed}
 
     def hull_coefficients(self) -> HullCoefficients:

@@ -23,22 +23,29 @@ from residnet.quality.statistics import (
 )
 
 MIN_EFFECT = 0.04
-"""Relative change of a fit's predictions below which a finding is only a note."""
+"""Effect below which a finding is only a note."""
 _RIDGE = 1e-6
 """Ridge penalty for columns of unit RMS, which makes collinear columns solvable."""
-# smallest change of the predictions that counts, in RMS residuals of the fit
 _MIN_CHANGE_TO_RESIDUAL = 1.3
-# smallest change of the dead-reckoning error that counts, as a share of the distance travelled
+"""Smallest change of the predictions that counts, in RMS residuals of the fit."""
 _MIN_RECKONING_CHANGE = 0.06
-# number of stretches of equal length that are omitted for comparison: omitting any data changes
-# a fit
+"""Smallest change of the dead-reckoning error that counts, as a share of the distance travelled.
+
+Smaller changes can result from the errors of a satellite receiver.
+"""
 _N_COMPARISON_SEGMENTS = 6
+"""Number of times that as many other samples are omitted for comparison.
+
+Omitting any samples changes a fit; only the change beyond this is attributed to a fault.
+"""
 _MIN_ROWS_PER_COLUMN = 4
 """Smallest number of rows per coefficient, to avoid overfitting. Chosen by hand."""
 _CERTAIN_T_STATISTIC = 20.0
-"""t statistic from which the estimated size of a fault is certain."""
+"""t statistic of the size of a fault above which the size counts as known."""
 _MIN_VELOCITY_CHANGE = 0.1
-"""RMS error of a velocity that counts by itself, in standard deviations of the velocity."""
+"""RMS error of a velocity, in standard deviations of the velocity, from which it is an effect even
+if the predictions of the fit do not change.
+"""
 _RECKONING_DURATION = 60.0
 """Duration of a dead-reckoning run in s; shorter in a log with less than three of them."""
 
@@ -133,12 +140,13 @@ def _root_mean_square(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(np.mean(values**2, axis=0)))
 
 
-def _excess_rms(rms_value: np.ndarray, typical_rms: np.ndarray) -> np.ndarray:
-    return np.asarray(np.sqrt(np.maximum(rms_value**2 - typical_rms**2, 0.0)))
+def _excess_rms(rms_value: np.ndarray, reference_rms: np.ndarray) -> np.ndarray:
+    """Return the RMS of what adds to an independent part with the reference RMS; at least 0."""
+    return np.asarray(np.sqrt(np.maximum(rms_value**2 - reference_rms**2, 0.0)))
 
 
 def _threshold_reckoning_change(reckoning_changes: np.ndarray) -> float:
-    """Return the larger of two dead-reckoning changes [2]; 0 within receiver accuracy."""
+    """Return the larger of two changes of the dead-reckoning error [2]; 0 below the minimum."""
     return (
         float(reckoning_changes.max()) if reckoning_changes.max() >= _MIN_RECKONING_CHANGE else 0.0
     )
@@ -177,6 +185,7 @@ class FindingEffects:
         if finding.repair is not None:
             effect = self.measure_repair(finding.repair(self._log.log), finding)
         elif finding.sample_mask is not None and finding.sample_mask.any():
+            # the subsample of a long log may contain none of the affected samples
             if not finding.sample_mask[self._sample_indices].any():
                 return FindingEffects(self._full_log, finding.sample_mask).measure(finding)
             fitted_channels = {*self._log.velocities, *self._log.inputs}
@@ -199,6 +208,7 @@ class FindingEffects:
             affects_fit: whether the affected channels enter the fit; if not, only dead reckoning
                 is compared.
         """
+        # the same pattern of samples at other times of the log
         comparison_masks = [
             np.roll(sample_mask, round(sample_mask.size * (k + 0.5) / _N_COMPARISON_SEGMENTS))
             for k in range(_N_COMPARISON_SEGMENTS)
@@ -242,7 +252,7 @@ class FindingEffects:
         is_significant = (remaining_rms < 0.95 * full_residual_rms) & (
             remaining_rms < 0.98 * np.min(comparison_rms, axis=0)
         )
-        error_caused = np.where(
+        attributed_error = np.where(
             is_significant,
             _excess_rms(full_residual_rms, remaining_rms) / regression.response_std,
             0.0,
@@ -251,7 +261,9 @@ class FindingEffects:
             _excess_rms(prediction_changes, _root_mean_square(np.array(comparison_changes))),
             coefficients,
         )
-        return max(largest_change, float(error_caused.max(initial=0.0)), counted_reckoning_change)
+        return max(
+            largest_change, float(attributed_error.max(initial=0.0)), counted_reckoning_change
+        )
 
     def measure_repair(self, repaired_log: Log, finding: Finding) -> float | None:
         """Return the relative change with the corrected log; None if it cannot be estimated."""
@@ -265,9 +277,8 @@ class FindingEffects:
         if abs(finding.figures.get("size", 0.0)) > _CERTAIN_T_STATISTIC * finding.figures.get(
             "error", np.inf
         ):
-            # a fault such as a scale error is absorbed by the coefficients: one-step predictions do
-            # not
-            # show it
+            # one-step predictions do not show a fault such as a scale error, because the
+            # coefficients absorb it
             for name in self._log.velocities:
                 rms_difference = float(
                     np.sqrt(np.nanmean((repaired_statistics[name] - self._log[name]) ** 2))
@@ -287,7 +298,8 @@ class FindingEffects:
                 else max(counted_reckoning_change, velocity_change)
             )
         new_coefficients = regression.fit_ridge()
-        # a correction that increases the residual does not correct the velocities
+        # a correction that increases the residual is wrong for the velocities: its effect on the
+        # predictions does not count
         initial_rms = _root_mean_square(
             self._regression.residual_rms(coefficients) / self._regression.response_std
         )
@@ -309,13 +321,14 @@ class FindingEffects:
 def compute_reckoning_errors(log: LogStatistics, omitted: np.ndarray | None = None) -> np.ndarray:
     """Return the relative errors [2] of position and heading after one minute of dead reckoning.
 
-    The position error is a share of the distance travelled. The heading error is the share by which
-    it displaces the end of a straight line: half the angle in rad.
+    The position error is relative to the distance travelled. The heading error is converted to a
+    position error in the same unit: if it grows linearly along a straight line, it displaces the
+    end by half its final value in rad times the distance.
 
     Args:
         log: statistics of a log with increasing times.
-        omitted: samples that no window may contain [T] bool; if too few windows remain, samples at
-            which no window may begin or end.
+        omitted: samples that no window may contain [T] bool. If this excludes more than 80 % of the
+            windows, windows may contain such samples, but not begin or end at them.
     """
     window_length = min(round(_RECKONING_DURATION / log.sampling_interval), len(log) // 3)
     errors = np.zeros(2)
@@ -324,6 +337,7 @@ def compute_reckoning_errors(log: LogStatistics, omitted: np.ndarray | None = No
     window_starts = np.flatnonzero(
         cumulative_omitted[window_length + 1 :] == cumulative_omitted[: -window_length - 1]
     )
+    # many short faults leave no window without one
     if window_starts.size < 0.2 * (len(log) - window_length):
         window_starts = np.flatnonzero(~is_omitted[:-window_length] & ~is_omitted[window_length:])
     if window_length < 2 or not window_starts.size:
@@ -339,6 +353,7 @@ def compute_reckoning_errors(log: LogStatistics, omitted: np.ndarray | None = No
     def root_mean_square(values: np.ndarray) -> float:
         return float(np.sqrt(np.mean(np.abs(values[is_finite]) ** 2)))
 
+    # horizontal vectors are complex numbers, north + i east
     if all(name in log for name in ("x", "y", "psi", "u", "v")):
         earth_velocity = interpolate_gaps(
             log.t, (log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"])
@@ -352,9 +367,9 @@ def compute_reckoning_errors(log: LogStatistics, omitted: np.ndarray | None = No
                 root_mean_square(integrate_rate(np.abs(earth_velocity))), 1e-9
             )
     if "psi" in log and "r" in log:
-        displacement_error = compute_change(log["psi"]) - integrate_rate(
+        heading_error = compute_change(log["psi"]) - integrate_rate(
             interpolate_gaps(log.t, log["r"])
         )
-        is_finite = np.isfinite(displacement_error)
-        errors[1] = 0.5 * root_mean_square(displacement_error) if is_finite.any() else 0.0
+        is_finite = np.isfinite(heading_error)
+        errors[1] = 0.5 * root_mean_square(heading_error) if is_finite.any() else 0.0
     return errors

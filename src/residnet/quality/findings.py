@@ -29,13 +29,13 @@ class Finding:
     Attributes:
         level: `note`, `will mislead` (a fit is wrong unless the user acts) or `fatal` (the log is
             useless for a fit).
-        code: kind of finding, stable for programs that read the report.
+        code: identifier of the kind of finding, constant between versions.
         text: one line with figures.
         figures: numbers in SI units.
         action: recommended action; empty if there is none.
         sample_mask: affected samples [T] bool; None if the finding is not about single samples.
-        effect: measured effect on a fit: relative change of the predictions of a one-step fit
-            without the fault; None if it was not measured.
+        effect: measured effect on a fit: relative change of its one-step predictions if the fault
+            is removed from the log (`residnet.quality.effects`); None if it was not measured.
         channels: channels of the affected samples.
         repair: returns a log with the fault corrected; None if no correction is known.
         is_record_fault: whether the recording itself is faulty, so that it must be corrected
@@ -57,7 +57,7 @@ class Finding:
     invalidates_samples: bool = field(default=False, repr=False, compare=False)
 
     @property
-    def to_line(self) -> str:
+    def line(self) -> str:
         """One line with level, text and action."""
         return f"{self.level}: {self.text}" + (f"; {self.action}" if self.action else "")
 
@@ -91,14 +91,14 @@ class Finding:
 class Check:
     """Registered check of a log.
 
-    A check is called with a text to create one of its findings, with its own code, level and
-    action as defaults.
+    The function of a check receives the check itself and calls it to create a finding, for example
+    `yield check("u is constant")`. Code, level and action of the check are the defaults.
 
     Attributes:
         stage: stage of the inspection, see `residnet.quality.STAGE_DESCRIPTIONS`.
         code: default code of its findings.
         level: default level of its findings.
-        fix: default action of its findings.
+        fix: default of `Finding.action` of its findings.
         required_channels: channels without which the check is skipped.
         is_record_fault: see `Finding`.
         invalidates_samples: see `Finding`.
@@ -136,7 +136,7 @@ class Check:
             figures: numbers in SI units.
             code: code of the finding.
             level: level of the finding.
-            fix: recommended action.
+            fix: recommended action, see `Finding.action`.
             sample_mask: affected samples [T] bool.
             channels: channels of the affected samples.
             repair: returns a log with the fault corrected.
@@ -234,11 +234,11 @@ class InspectionReport:
         return any(finding.level != "note" for finding in self.findings)
 
     def with_findings(self, additional_findings: Sequence[Finding]) -> InspectionReport:
-        """Return the report with further findings."""
+        """Return the report with further findings after its own."""
         return dataclasses.replace(self, findings=(*self.findings, *additional_findings))
 
     def find_by_code(self, code: str) -> tuple[Finding, ...]:
-        """Return the findings with a code."""
+        """Return the findings of one kind (`Finding.code`)."""
         return tuple(finding for finding in self.findings if finding.code == code)
 
     def to_lines(self) -> list[str]:
@@ -248,7 +248,7 @@ class InspectionReport:
             key=lambda reported_finding: _severity_key(reported_finding.to_row()),
             reverse=True,
         )
-        return [f"{self.name}: {finding.to_line}" for finding in sorted_findings]
+        return [f"{self.name}: {finding.line}" for finding in sorted_findings]
 
     def to_record(self) -> LogInspection:
         """Return the report as a part of doctor.json."""
@@ -373,13 +373,13 @@ def summarize_inspection(inspection: InspectionFile) -> InspectionSummary:
     action = f"; {first_finding.action}" if first_finding.action else ""
     effect = _severity_key(first_finding)[1]
     effect_text = f" It changes a fit by {100.0 * effect:.0f} %." if effect else ""
-    text = f"First fix this: {log_prefix}{first_finding.text}{action}.{effect_text}"
+    first_action = f"First fix this: {log_prefix}{first_finding.text}{action}.{effect_text}"
     return InspectionSummary(
         n_logs,
         n_logs_with_problems,
         {code: len(logs_by_code[code]) for code in sorted_codes},
         tally,
-        text,
+        first_action,
     )
 
 
@@ -391,7 +391,7 @@ def format_quantity(quantity: float, unit: str) -> str:
 
 
 def format_share(share: float) -> str:
-    """Format a share as a percentage."""
+    """Format a fraction as a percentage, with two digits below 10 %."""
     return f"{100.0 * share:.2g} %" if share < 0.1 else f"{100.0 * share:.0f} %"
 
 
@@ -407,12 +407,17 @@ def describe_unit_confusion(factor: float, *dimensions: str) -> str:
     """
     if factor <= 0.0:
         return ""
+    # where dimensions have the same factor, the text of the first dimension remains
     text_by_factor = {
         unit_factor: text
         for si in reversed(dimensions)
         for unit_factor, text in unit_confusions(si).items()
     }
-    nearest_factor = min(text_by_factor, key=lambda size: abs(math.log(size / factor)), default=1.0)
+    nearest_factor = min(
+        text_by_factor,
+        key=lambda unit_factor: abs(math.log(unit_factor / factor)),
+        default=1.0,
+    )
     return (
         f" ({text_by_factor[nearest_factor]})"
         if text_by_factor and abs(math.log(nearest_factor / factor)) < 0.08

@@ -187,41 +187,41 @@ class RunFiles:
         frame = self.read_parquet(name)
         return read_table(self.path / name) if frame is None else frame
 
-    def read_record(self, kind: type[RecordT], name: str) -> RecordT | None:
+    def read_record(self, record_type: type[RecordT], name: str) -> RecordT | None:
         """Return the typed contents of a file of the folder; None if it does not exist.
 
         Args:
-            kind: class of the contents.
+            record_type: class of the contents.
             name: path of the file within the folder.
 
         Raises:
             UsageError: if the file cannot be read.
         """
-        return kind.read_optional(self.path, name)
+        return record_type.read_optional(self.path, name)
 
-    def read_required_record(self, kind: type[RecordT], name: str) -> RecordT:
+    def read_required_record(self, record_type: type[RecordT], name: str) -> RecordT:
         """Return the typed contents of a file that every run of a task has.
 
         Raises:
             UsageError: if there is no such file, or it cannot be read.
         """
-        return self.read_record(kind, name) or kind.read(self.path / name, self.path)
+        return self.read_record(record_type, name) or record_type.read(self.path / name, self.path)
 
-    def assessment(self, judged: tuple[str, Sequence[str]] | None = None) -> Assessment:
+    def assessment(self, model_verdict: tuple[str, Sequence[str]] | None = None) -> Assessment:
         """Return the assessment of the run for the metadata (model card) of an export.
 
         It consists of the verdict, the findings of the data checks, and the names of the logs for
         training, validation and test.
 
         Args:
-            judged: level and sentences of the verdict on the model; None for the verdict of the
-                run.
+            model_verdict: level and sentences of the verdict on the exported model; None for the
+                verdict on the model that the run reports.
 
         Raises:
             DataError: if a file of the run cannot be read.
         """
-        if judged is not None:
-            level, verdict = judged
+        if model_verdict is not None:
+            level, verdict = model_verdict
         else:
             summary = self.read_record(SummaryFile, "summary.json")
             level, verdict = ("", ()) if summary is None else (summary.level, summary.verdict)
@@ -267,16 +267,16 @@ class RunFiles:
         """The rows of metrics.json."""
         return self.metrics.rows
 
-    def read_task_metrics(self, kind: type[RecordT]) -> RecordT:
+    def read_task_metrics(self, record_type: type[RecordT]) -> RecordT:
         """Return the contents of metrics.json of a task other than a fit.
 
         Args:
-            kind: class of the contents.
+            record_type: class of the contents.
 
         Raises:
             UsageError: if the folder has no such file, or it cannot be read.
         """
-        metrics = self.read_record(kind, "metrics.json")
+        metrics = self.read_record(record_type, "metrics.json")
         if metrics is None:
             raise UsageError(
                 f"{self.path}: no metrics.json here; give the folder of a finished run"
@@ -357,11 +357,11 @@ class RunFiles:
 
     @cached_property
     def model_kinds(self) -> dict[str, str]:
-        """The kind (constant_velocity, baseline, head, plant, ...) of each model, in the order of
+        """The kind (constant_velocity, baseline, head, ensemble, plant) by model, in the order of
         metrics.json.
 
-        Error reductions are relative to the first baseline. Other baselines have the kind `further`
-        and are evaluated like heads (residual models).
+        Error reductions are relative to the first baseline. Other baselines have the kind
+        `further`, and are treated like heads (residual models).
         """
         kinds = {row.model: row.kind for row in self.rows}
         first_baseline = next((model for model, kind in kinds.items() if kind == "baseline"), None)
@@ -421,23 +421,24 @@ class RunFiles:
 
     @cached_property
     def logs_of_fit(self) -> tuple[int, int]:
-        """How many logs of an evaluation are among the data of the fit, and how many it has.
+        """Number of evaluated logs that are among the data of the fit, and number of all logs.
 
-        Only the evaluation on other logs names those of the fit; (0, 0) for a fit.
+        Both are 0 for the run of a fit; they are known for `residnet evaluate` on further logs.
         """
         if self.report_split != "external" or self.inspection is None:
             return 0, 0
-        marks = [
+        is_log_of_fit = [
             any(finding.code == "log_of_fit" for finding in log.findings)
             for log in self.inspection.logs
         ]
-        return sum(marks), len(marks)
+        return sum(is_log_of_fit), len(is_log_of_fit)
 
     @property
     def report_data_name(self) -> str:
         """Name of the data of the report; logs that trained the model are not external."""
-        n_known, n_logs = self.logs_of_fit
-        return "data of the fit" if n_known and n_known == n_logs else f"{self.report_split} data"
+        n_logs_of_fit, n_logs = self.logs_of_fit
+        is_data_of_fit = n_logs_of_fit > 0 and n_logs_of_fit == n_logs
+        return "data of the fit" if is_data_of_fit else f"{self.report_split} data"
 
     @cached_property
     def report_splits(self) -> list[str]:
@@ -462,7 +463,7 @@ class RunFiles:
 
     @property
     def main_protocol(self) -> str:
-        """The protocol of badge, first sentence, table and picture; see `order_protocols`."""
+        """The protocol of the verdict and of the first table and figure; see `order_protocols`."""
         return self.protocols[0]
 
     def _window_length(self, protocol: str) -> float | None:
@@ -482,9 +483,9 @@ class RunFiles:
 
     @cached_property
     def horizon_text(self) -> str:
-        """Text for the main horizon, such as `after 30 s`.
+        """When errors are compared, in words: `after 30 s` for a main horizon of 30 s.
 
-        It is `at the end` if the errors at horizons are unknown and the windows differ in length.
+        Without a main horizon this is the length of the windows, or `at the end` if they differ.
         """
         length = self._window_length(self.main_protocol)
         if self.main_horizon is not None:
@@ -498,7 +499,7 @@ class RunFiles:
 
     @cached_property
     def channels(self) -> list[str]:
-        """The channels that are scored."""
+        """Velocities whose errors metrics.json contains."""
         return [name for name in self.rows[0].rmse if name != "mean"]
 
     @cached_property

@@ -131,8 +131,8 @@ def make_example_samples(
         {"grid": {"step": EXAMPLE_TIME_STEP}, "derivative": _DERIVATIVE_SETTINGS}
     )
     logs = [
-        flight.measured_log
-        for flight in simulate_trials(trial_settings.draw_manoeuvres(), trial_settings)
+        manoeuvre_run.measured_log
+        for manoeuvre_run in simulate_trials(trial_settings.draw_manoeuvres(), trial_settings)
     ]
     available_channels = list(logs[0].channels)
     for name in signals.inputs:
@@ -189,8 +189,8 @@ def make_example_model(spec: ModelSpec) -> HybridDynamics:
     """Build the model of a specification of `make_example_spec` and identify its baseline.
 
     The head is calibrated on the example samples; a closed-form head is fitted to them. A second
-    call with an equal specification returns a copy of the first model, and leaves the generator of
-    random numbers as the first call did.
+    call with an equal specification returns a copy of the first model. It also sets the random
+    state of PyTorch to that after the first call, so that results do not depend on the cache.
     """
     key = (type(spec.baseline), type(spec.head), spec.model_dump_json())
     if key not in _EXAMPLE_MODELS:
@@ -228,8 +228,8 @@ _N_ROWS = 4
 """Batch size of the contract checks."""
 _N_STEPS = 12
 """Number of time steps of the contract checks."""
-_TIME_STEP = 0.1
-"""Time step of simulated manoeuvres, s."""
+_MANOEUVRE_TIME_STEP = 0.1
+"""Time step of simulated manoeuvres in s."""
 _SHORT_SAMPLES = 4
 """Number of samples of a truncated log, on which no index of a manoeuvre is defined."""
 
@@ -466,10 +466,10 @@ def _check_extrapolation(case: _HeadCase, samples: Tensor, max_inside: float) ->
         samples.mean(0) + std_multiple * samples.std(0) for std_multiple in (1e6, 1e9)
     )
     rho, memory = head(far_channels[None], case.zero_memory(1, samples.dtype))
-    far_residual, _ = head(farther_channels[None], case.zero_memory(1, samples.dtype))
+    farther_residual, _ = head(farther_channels[None], case.zero_memory(1, samples.dtype))
     far_sequence = head.teacher_forced_residuals(far_channels.expand(1, 200, -1))
     assert_finite(
-        torch.cat((rho, far_residual)), f"{subject}: not finite far outside the training range"
+        torch.cat((rho, farther_residual)), f"{subject}: not finite far outside the training range"
     )
     assert_finite(memory, f"{subject}: its memory is not finite far outside the training range")
     assert_finite(far_sequence, f"{subject}: not finite after 200 steps outside the training range")
@@ -554,7 +554,7 @@ def _check_storage(case: _HeadCase, spec: ModelSpec, fitted_model: HybridDynamic
 def _check_head_config(
     config: BaseHeadConfig, head: ResidualHead, names: Sequence[str], subject: str
 ) -> None:
-    """Check that what a config states without PyTorch is true of the head that it builds."""
+    """Check that the properties of a config, known without PyTorch, are those of its head."""
     config.check_channels(names)
     assert_true(
         config.has_closed_form(names) == isinstance(head, ClosedFormHead),
@@ -640,11 +640,11 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
 def _check_baseline_config(
     config: IdentifiedConfig, baseline: Baseline, samples: Samples, subject: str
 ) -> None:
-    """Check that what a config states without PyTorch is true of the baseline that it builds."""
+    """Check that the properties of a config, known without PyTorch, are those of its baseline."""
     names = samples.names
     config.check_channels(names)
     config.validate_samples(samples.origins)
-    statements = {
+    stated_and_actual = {
         "is_parametric": (
             config.is_parametric(names),
             isinstance(baseline, ParametricBaseline),
@@ -655,9 +655,9 @@ def _check_baseline_config(
             baseline.inertia_matrix() is not None,
         ),
     }
-    for method, (statement, fact) in statements.items():
+    for method, (stated, actual) in stated_and_actual.items():
         assert_true(
-            statement == fact, f"{subject}: {method} of its config differs from the baseline"
+            stated == actual, f"{subject}: {method} of its config differs from the baseline"
         )
 
 
@@ -732,7 +732,7 @@ def check_manoeuvre(
     assert_true(reloaded == manoeuvre, f"{subject}: changes when it is written and read back")
     plant = load_vessel(vessel).build()
     duration = manoeuvre.duration_within(duration)
-    dynamics = RecordedPlantDynamics(plant, _TIME_STEP)
+    dynamics = RecordedPlantDynamics(plant, _MANOEUVRE_TIME_STEP)
     single_states, inputs = _simulate([manoeuvre], dynamics, duration)
     paired_states, commands = _simulate([manoeuvre, manoeuvre], dynamics, duration)
     assert_finite(single_states, f"{subject}: the motion is not finite")
@@ -748,11 +748,15 @@ def check_manoeuvre(
         assert_close(commands[row, :, :n_commands], inputs[0, :, :n_commands], 1e-9, message)
     helm = Helm.from_plant(plant)
     length = load_vessel(vessel).length.value
-    craft = SimulatedVessel(vessel, dynamics, helm, plant.n_commands, plant.make_initial_state(1))
+    simulated_vessel = SimulatedVessel(
+        vessel, dynamics, helm, plant.n_commands, plant.make_initial_state(1)
+    )
     environment = TrialEnvironment(plant, DisturbanceConfig(), SensorsConfig(), 0)
-    flight = simulate_manoeuvres(craft, [manoeuvre], environment, duration, _TIME_STEP)[0]
-    _check_indices(manoeuvre.compute_indices(flight.true_log, length), subject)
-    motion = flight.true_log
+    manoeuvre_run = simulate_manoeuvres(
+        simulated_vessel, [manoeuvre], environment, duration, _MANOEUVRE_TIME_STEP
+    )[0]
+    _check_indices(manoeuvre.compute_indices(manoeuvre_run.true_log, length), subject)
+    motion = manoeuvre_run.true_log
     # a recording may end before a manoeuvre: indices must then be omitted instead of NaN
     short_channels = {name: values[:_SHORT_SAMPLES] for name, values in motion.channels.items()}
     short_log = Log(motion.name, motion.t[:_SHORT_SAMPLES], short_channels, motion.units)
@@ -762,7 +766,7 @@ def check_manoeuvre(
         all(math.isfinite(limit) for limit in manoeuvre_limits.values()),
         f"{subject}: a limit is not finite",
     )
-    return flight
+    return manoeuvre_run
 
 
 def _simulate(
@@ -771,7 +775,10 @@ def _simulate(
     """Simulate a batch of manoeuvres; return states [B, T+1, nx] and inputs [B, T, m]."""
     plant = dynamics.plant
     helm = Helm.from_plant(plant)
-    t = torch.arange(max(round(duration / _TIME_STEP), 2), dtype=torch.float64) * _TIME_STEP
+    t = (
+        torch.arange(max(round(duration / _MANOEUVRE_TIME_STEP), 2), dtype=torch.float64)
+        * _MANOEUVRE_TIME_STEP
+    )
     initial_states = torch.stack(
         [
             manoeuvre.initial_state(plant.make_initial_state(1)[0], helm.state)

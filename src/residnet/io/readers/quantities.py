@@ -49,7 +49,7 @@ _STARBOARD_OR_DOWN_CHANNELS = ("v", "r", "w", "q", "theta", "v_dot", "r_dot", "t
 # map must name the north column.
 _FRAME_CONVERSIONS: dict[str, dict[str, tuple[float, float]]] = {
     "ned": dict.fromkeys((*_EARTH_CHANNELS, "qw"), _IDENTITY),
-    # the frame of a quaternion is a setting of its scalar part
+    # the frame of a quaternion is given in the entry of its scalar part qw
     "enu": {"psi": _EAST_TO_NORTH, "wind_dir": _EAST_TO_NORTH, "z": _NEGATE, "qw": _IDENTITY},
     "body_fsd": dict.fromkeys((*_FORWARD_CHANNELS, *_STARBOARD_OR_DOWN_CHANNELS), _IDENTITY),
     "body_fpu": {
@@ -142,9 +142,11 @@ class Conversion(Config):
 
 
 _STEP_TOLERANCE = 0.2
-"""Relative difference that the rounded steps of a linear interpolation may have."""
+"""Largest relative difference between the steps of an interpolation across the wrap, which differ
+because recorded headings are rounded.
+"""
 _MIN_SWEEP_RATIO = 10.0
-"""Smallest ratio of a step in such an interpolation to the median step."""
+"""Smallest step of an interpolation across the wrap, in median steps of the log."""
 
 
 def mask_interpolated_headings(psi: np.ndarray) -> np.ndarray:
@@ -170,6 +172,7 @@ def mask_interpolated_headings(psi: np.ndarray) -> np.ndarray:
     is_sweep = np.abs(step) > max(_MIN_SWEEP_RATIO * float(np.median(step_size)), np.radians(5.0))
     sweep_sign = np.sign(step) * is_sweep
     bounds = np.flatnonzero(np.diff(np.concatenate(([0.0], sweep_sign, [0.0]))))
+    # steps outside of interpolations, with which those of an interpolation are compared
     typical_step = np.where(is_sweep, np.median(step_size), step_size)
     is_interpolated = np.zeros(finite_indices.size, dtype=bool)
     for start, stop in itertools.pairwise(bounds):
@@ -183,7 +186,8 @@ def mask_interpolated_headings(psi: np.ndarray) -> np.ndarray:
             typical_step[max(start - 2, 0) : start], typical_step[stop : stop + 2]
         ).max(initial=0.0)
         spans_circle = 2.0 * np.pi - abs(sweep_steps.sum()) < largest_step + 2.0 * neighbour_step
-        # the step of the short way around the circle must suit the neighbouring steps better
+        # step if the vessel turned the short way around the circle during the same samples; it must
+        # be closer to the neighbouring steps
         short_way_step = (2.0 * np.pi - abs(sweep_steps.sum())) / sweep_steps.size
         is_sudden = largest_step - neighbour_step > abs(short_way_step - neighbour_step)
         if has_equal_steps.all() and spans_circle and is_sudden:
@@ -210,7 +214,8 @@ class ChannelMap(Conversion):
         letter_o: meaning of the letter O in longitudes, `east` (Ost, Oost) or `west` (Oeste, Ouest,
             Ovest); null rejects it.
         hold: whether a value is valid until the next one (zero-order hold), as for commands that
-            are recorded when they change. Rows that have values of such channels only are left out.
+            are recorded when they change. A row with values of such channels only is no sample of
+            the log.
     """
 
     column: str
@@ -230,10 +235,11 @@ class ChannelMap(Conversion):
         return self.form != "number" or self.hemisphere is not None
 
     def require_valid_channel(self, name: str) -> None:
-        """Check the entry; see `Conversion.require_valid_channel`.
+        """Check that unit, frame and notation are possible for a channel.
 
         Raises:
-            ValueError: if the entry is not possible, or degrees with minutes have another unit.
+            ValueError: as `Conversion.require_valid_channel`, or if an angle with minutes or
+                hemispheres has another unit than degrees.
         """
         super().require_valid_channel(name)
         if self.is_angle and canonical_unit(self.unit) != "deg":
@@ -319,7 +325,7 @@ class TopicSource(Config):
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Paths of the fields."""
+        """Paths of the fields of the topic that the quantity needs, such as `twist.linear.x`."""
         return tuple(str(getattr(self, name)) for name in self.field_keys)
 
 
@@ -394,7 +400,7 @@ class QuaternionHeading(TopicSource):
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Paths of the fields."""
+        """Path of the quaternion, or paths of its parts."""
         return (self.field,) if isinstance(self.field, str) else tuple(self.field)
 
     @field_validator("field")
@@ -512,9 +518,10 @@ def list_source_channels(
 
 @final
 class UniformClock(Config):
-    """Uniform clock.
+    """Clock with a constant step.
 
-    In a recording with dates the samples are at integer multiples of the step in Unix time.
+    In a recording with dates the samples are at integer multiples of the step in Unix time, so that
+    the samples of several recordings coincide.
 
     Attributes:
         step: time between samples in s.

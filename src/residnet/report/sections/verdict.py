@@ -60,7 +60,7 @@ def verdict_sentences(run: RunFiles) -> list[str]:
 
 
 _NOISE_FLOOR_ROW = "noise floor"
-"""Name of the row with the pose errors of the integrated measured velocities."""
+"""Label of the row without a model: pose errors of the integrated measured velocities."""
 _HORIZON_LEVELS = {
     GOOD_LEVEL: "✓\u00a0Good",
     LIMITED_LEVEL: "!\u00a0Limited",
@@ -102,7 +102,7 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
         if dof_text
         else quality_summary
     )
-    one_sided_texts = (
+    one_sided_excitation_texts = (
         finding.text
         for finding in (() if inspection is None else inspection.together)
         if finding.code == "one_side" and finding.level != "note"
@@ -117,7 +117,7 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
         {} if run.limits is None else run.limits.splits.get(split, {}),
         quality_summary,
         protocol,
-        next(one_sided_texts, ""),
+        next(one_sided_excitation_texts, ""),
         run.read_record(ExcitationFile, "excitation.json"),
         n_logs,
         n_logs_of_fit,
@@ -145,7 +145,7 @@ def verdict_level(run: RunFiles) -> str:
 
 
 class _OpeningRow(NamedTuple):
-    """A line of the first table.
+    """A line of the table at the start of the report.
 
     Attributes:
         model: name of the model; None for the integrated measured velocities.
@@ -161,13 +161,13 @@ class _OpeningRow(NamedTuple):
 
 
 def _list_opening_rows(run: RunFiles, rows: Mapping[str, MetricsRow]) -> list[_OpeningRow]:
-    """Return the lines of the first table in the order of `opening_section`.
+    """Return the lines of the table at the start of the report, in the order of `opening_section`.
 
-    Runs without errors at single horizons have those at the ends of the free runs, without
-    prediction intervals.
+    The errors are those at the main horizon. Without a main horizon they are the errors at the ends
+    of the free runs, which have no prediction intervals.
     """
     horizon = run.main_horizon
-    lines = {
+    line_by_model = {
         model_name: _OpeningRow(
             model_name,
             row.final_pose_errors if horizon is None else horizon.models[model_name].by_name,
@@ -178,30 +178,34 @@ def _list_opening_rows(run: RunFiles, rows: Mapping[str, MetricsRow]) -> list[_O
         if horizon is None or model_name in horizon.models
     }
     leading_models = [run.main_model, run.selected, run.baseline, CONSTANT_VELOCITY]
-    table = [
-        lines[model_name]
+    leading_lines = [
+        line_by_model[model_name]
         for model_name in dict.fromkeys(leading_models)
-        if model_name is not None and model_name in lines
+        if model_name is not None and model_name in line_by_model
     ]
     limits = run.find_limits(run.main_protocol)
     kinematic_errors = {} if limits is None else limits.kinematics.means
     noise_floor = kinematic_errors if horizon is None else horizon.floor.by_name
-    # a pose that was integrated from the velocities has no noise floor but rounding
+    # logs without a measured pose have the integral of the velocities as their pose: then the
+    # difference is only a rounding error
     if any(error > 1e-9 for error in noise_floor.values()):
         intervals = {} if horizon is None else horizon.floor.intervals
-        table.append(_OpeningRow(None, noise_floor, intervals, ""))
-    return table + sorted(
-        (line for model_name, line in lines.items() if model_name not in leading_models),
+        leading_lines.append(_OpeningRow(None, noise_floor, intervals, ""))
+    return leading_lines + sorted(
+        (line for model_name, line in line_by_model.items() if model_name not in leading_models),
         key=lambda line: line.errors[run.pose_errors[0]],
     )
 
 
 def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
-    """Return the first screen below the verdict: the median free run and the errors of the models.
+    """Return the section below the verdict: figures of a free run, and the errors of the models.
 
     Row order: predictor, selected model, baseline, constant velocity, noise floor of the
-    measurements, then the other models by increasing error. A small table has the other horizons.
-    None if there is no free run.
+    measurements, then the other models by increasing error. A second table has the errors of the
+    main model at all horizons. None if there is no free run.
+
+    Args:
+        figures: figures of the free run that represents the main model.
     """
     rows = {
         model_name: row
@@ -213,11 +217,12 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     faults_by_model = {
         entry.model: entry.faults for entry in (run.selection.models if run.selection else ())
     }
-    table = _list_opening_rows(run, rows)
+    lines = _list_opening_rows(run, rows)
     smallest_errors = {
         pose_error: min(
             line.errors[pose_error]
-            for line in table
+            for line in lines
+            # the plant is the simulator itself, not a competitor
             if line.model is not None and line.model != run.plant
         )
         for pose_error in run.pose_errors
@@ -244,7 +249,7 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
     windows = rows[run.main_model].windows
     if run.main_horizon is not None:
         windows = run.main_horizon.windows
-    has_intervals = any(any(line.intervals.values()) for line in table)
+    has_intervals = any(any(line.intervals.values()) for line in lines)
     notes = [
         f"Mean of {format_count(windows, 'free run')} on {run.report_data_name}"
         f" ({run.main_protocol})"
@@ -258,19 +263,21 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         else "These data are not unseen: read with care.",
         "constant_velocity: the initial velocities are held." if CONSTANT_VELOCITY in rows else "",
         "Noise floor: the error of the integrated measured velocities."
-        if any(line.model is None for line in table)
+        if any(line.model is None for line in lines)
         else "",
         "Sound: all physical checks passed and no free run diverged." if faults_by_model else "",
-        *(f"✗ {model_name(line)}: {reason}." for line in table if (reason := fault_text(line))),
+        *(f"✗ {model_name(line)}: {reason}." for line in lines if (reason := fault_text(line))),
     ]
     error_table = build_table(
-        table,
+        lines,
         [
             ("model", model_name),
             *(
                 (
                     f"{name} [{unit}]",
-                    lambda line, of=pose_error, factor=factor: error_cell(line, of, factor),
+                    lambda line, pose_error=pose_error, factor=factor: error_cell(
+                        line, pose_error, factor
+                    ),
                 )
                 for pose_error, (name, unit, factor) in (
                     (pose_error, run.pose_error_unit(pose_error)) for pose_error in run.pose_errors
@@ -313,7 +320,9 @@ def _build_horizon_table(run: RunFiles) -> Table | None:
             *(
                 (
                     f"{name} [{unit}]",
-                    lambda horizon, of=pose_error, factor=factor: error_cell(horizon, of, factor),
+                    lambda horizon, pose_error=pose_error, factor=factor: error_cell(
+                        horizon, pose_error, factor
+                    ),
                 )
                 for pose_error, (name, unit, factor) in (
                     (pose_error, run.pose_error_unit(pose_error)) for pose_error in run.pose_errors
@@ -367,7 +376,7 @@ def cautions_section(run: RunFiles) -> Section | None:
         for text in (worse_than_reference_sentence(run, protocol) for protocol in run.protocols)
         if text
     ]
-    # only the first sentence; the section on sanity has the figures
+    # only the first sentence; the section of the physical checks has the figures
     failed_findings = [
         finding
         for finding in run.sanity_findings
@@ -415,7 +424,7 @@ def worse_than_reference_sentence(run: RunFiles, protocol: str) -> str:
 
 
 def sanity_section(run: RunFiles) -> Section | None:
-    """Return a table of all checks and what each found, None where no model was checked."""
+    """Return the results of the physical checks of each model; None if no model was checked."""
     if not run.sanity_findings:
         return None
     findings_by_model: dict[str, dict[str, SanityRow]] = {}

@@ -67,11 +67,16 @@ _PENALTIES = tuple(10.0**k for k in range(-10, 1))
 _RANK_TOLERANCE = 1e-7
 """Singular values of regressors below this share of the largest count as zero."""
 _MIN_EARTH_FORCE_RMS = 0.02
-"""Smallest root mean square of a unit force in earth axes after the projection (turns needed)."""
+"""Smallest root mean square of a unit force in earth axes that the basis functions do not explain.
+
+It is small if the heading hardly changes, because the force is then constant in body axes too.
+"""
 _MIRROR_SIGNS = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 """Signs of surge, sway and yaw under reflection of port and starboard."""
 _SURFACE_LIMITS = (6.3, 316.0)
-"""Limits in % of the axis of a surface analysis; errors of single models are orders above."""
+"""Limits of the error axis of a surface analysis in %. Some models have errors that are larger by
+orders of magnitude, which would hide the differences between the others.
+"""
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,8 @@ class ForceRegressionData:
         y: residual forces [N, 3] in N, N, N m.
         scale: divisors of the columns [J].
         fold: fold of each sample [N], from 0; samples of one segment or run share a fold.
-        test: samples of the document's own model selection; None to hide them from the models.
+        test: basis functions and residual forces of the test half, for the model selection of the
+            document and for the errors by order; None without them.
     """
 
     terms: tuple[str, ...]
@@ -104,7 +110,10 @@ class ForceRegressionData:
 
     @property
     def standardised(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """E [N, J], F [N, 3], mean of x, mean of y, std of y (3.3), (3.4), (4.8)."""
+        """Scaled columns E [N, J] and outputs F [N, 3], mean of x, mean of y, std of y.
+
+        Source: Jervan 2020, eqs. (3.3), (3.4), (4.8).
+        """
         mean_x = self.x.mean(0)
         mean_y = self.y.mean(0)
         std_y = self.y.std(0)
@@ -218,7 +227,10 @@ class RegressionConfig(Config):
 
 
 def _errors_by_order(data: ForceRegressionData) -> dict[str, Tensor]:
-    """Return the mean square errors [A, 3] of a PLSR by order, in cross-validation and on test."""
+    """Return the mean square errors [A, 3] of a PLSR by order, for each set of samples.
+
+    The sets are the left-out segments of a cross-validation, and the test half.
+    """
     e, f, mean_x, mean_y, std_y = data.standardised
     folds = data.fold.unique()
     nan_errors = torch.full_like(f, torch.nan).repeat(e.shape[1], 1, 1)
@@ -226,12 +238,12 @@ def _errors_by_order(data: ForceRegressionData) -> dict[str, Tensor]:
     test_errors = nan_errors[:, :1]
     for fold in folds if len(folds) > 1 else ():
         is_left_out = data.fold == fold
-        left_out_errors[:, is_left_out] = _error_by_order(
+        left_out_errors[:, is_left_out] = _pls_errors(
             e[~is_left_out], f[~is_left_out], e[is_left_out], f[is_left_out]
         )
     if data.test is not None and len(data.test[0]):
         x, y = data.test
-        test_errors = _error_by_order(e, f, (x - mean_x) / data.scale, (y - mean_y) / std_y)
+        test_errors = _pls_errors(e, f, (x - mean_x) / data.scale, (y - mean_y) / std_y)
     errors = {"left-out segments": left_out_errors, "test half": test_errors}
     return {
         sample_kind: error.square().mean(1) * std_y.square()
@@ -239,7 +251,7 @@ def _errors_by_order(data: ForceRegressionData) -> dict[str, Tensor]:
     }
 
 
-def _error_by_order(e: Tensor, f: Tensor, x: Tensor, y: Tensor) -> Tensor:
+def _pls_errors(e: Tensor, f: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Return the errors [J, N, 3] at x of a PLSR of f on e, for each order."""
     mean_e = e.mean(0)
     mean_f = f.mean(0)
@@ -284,10 +296,11 @@ class ResidualModelConfig(Config):
         fit: estimator of the coefficients, with its settings.
         terms: basis functions: products of u_dot, v_dot, r_dot, u, v, r and their absolute values;
             by default the 30 of (4.12).
-        lag: identify the thrusters' lag together with the coefficients and use the lagged command.
-            Null: an estimator with order selection compares lag, no lag and zero residual by
-            cross-validation; other estimators use no lag.
-        mirror: assume port-starboard symmetry. Null compares both if `lag` is selected.
+        lag: whether the lag of the thrusters is identified together with the coefficients, so that
+            the force is the lagged command. Null: a PLSR without a given order selects lag, no lag
+            or zero residual by cross-validation; other estimators assume no lag.
+        mirror: whether port-starboard symmetry is assumed. Null: selected by cross-validation where
+            the lag is; otherwise not assumed.
         earth: also identify a constant force in earth axes, such as wind.
     """
 
@@ -378,7 +391,8 @@ class ResidualForceModel(NamedTuple):
     def residual_along(self, record: ForceRecord) -> Tensor:
         """Return the remaining residual [N, 3] of the model along a record, in N, N, N m.
 
-        The model is compared with the command, or through its lag with the force that follows it.
+        It is the force of the thrusters minus that of the model. The force of the thrusters is the
+        command, delayed by the lag if the model has one.
         """
         force = record.command
         if self.lag is not None:
@@ -412,23 +426,25 @@ def fit_model(
     """
     if config.searches_settings:
         return _search_settings(config, record, base)
+    # basis functions and the force of the known model along the record
     train = record.is_training
     psi = record.pose[:, HEADING]
     x = TermLibrary(config.terms, MOTION_CHANNELS)(torch.cat((record.nu_dot, record.nu), dim=-1))
     base_force = base.thruster_force(record.nu_dot, record.nu, psi)
     # unit forces to north and to east in body axes, without a moment
     unit_vectors = torch.eye(2, dtype=psi.dtype)
-    earth_axes = torch.stack(
+    unit_earth_forces = torch.stack(
         [
             torch.stack((*to_body(north, east, psi), torch.zeros_like(psi)), dim=-1)
             for north, east in unit_vectors
         ],
         dim=-1,
     )
+    # the force of the thrusters: the command, or the command after the identified lag
     force = record.command
     notes: dict[str, Any] = {}
     if config.lag:
-        regressors = torch.cat((x, earth_axes[:, 0]), dim=-1) if config.earth else x
+        regressors = torch.cat((x, unit_earth_forces[:, 0]), dim=-1) if config.earth else x
         if lag is None:
             lag = fit_lag(
                 record.averaged_command,
@@ -440,23 +456,23 @@ def fit_model(
             )
         force = simulate_lagged_force(record.averaged_command, lag, record.dt, record.run_lengths)
         notes["lag"] = lag.model_dump()
+    # the residual, without the part that is constant in earth axes
     y = force - base_force
     earth_force = None
     if config.earth:
-        earth_force = estimate_earth_force(x[train], y[train], -earth_axes[train])
-        y = y + torch.einsum("nad,d->na", earth_axes, earth_force)
+        earth_force = estimate_earth_force(x[train], y[train], -unit_earth_forces[train])
+        y = y + torch.einsum("nad,d->na", unit_earth_forces, earth_force)
         notes["earth"] = dict(zip(("north", "east"), earth_force.tolist(), strict=True))
     train_terms = x[train]
     train_target = y[train]
     fold = record.fold[train]
+    # with symmetry the mirror images of the samples are samples too
     if config.mirror:
-        signs = mirror_signs(config.terms)
-        if signs is None:
+        term_signs = mirror_signs(config.terms)
+        if term_signs is None:
             raise FitError("mirror: not all basis functions are known to mirror; leave it out")
-        train_terms, train_target = (
-            torch.cat((values, values * signs_applied))
-            for values, signs_applied in ((train_terms, signs), (train_target, _MIRROR_SIGNS))
-        )
+        train_terms = torch.cat((train_terms, train_terms * term_signs))
+        train_target = torch.cat((train_target, train_target * _MIRROR_SIGNS))
         fold = fold.repeat(2)
         notes["mirror"] = True
     data = ForceRegressionData(
@@ -560,8 +576,8 @@ def estimate_earth_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
         FitError: if the vessel turned too little to separate it from a constant in body axes.
     """
     scaled = (x - x.mean(0)) / x.std(0).clamp(min=1e-300)
-    centred = torch.cat((torch.ones_like(x[:, :1]), scaled), dim=-1)
-    left_vectors, singular, _ = torch.linalg.svd(centred, full_matrices=False)
+    with_intercept = torch.cat((torch.ones_like(x[:, :1]), scaled), dim=-1)
+    left_vectors, singular, _ = torch.linalg.svd(with_intercept, full_matrices=False)
     left_vectors = left_vectors[:, singular > _RANK_TOLERANCE * singular[0]]
 
     def project_out(values: Tensor) -> Tensor:
@@ -583,7 +599,7 @@ def estimate_earth_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
 
 
 def _coefficients_by_term(rows: Sequence[Mapping[str, float]]) -> dict[str, Tensor]:
-    """Return the coefficients [3] of each term of three rows."""
+    """Return the coefficients in surge, sway and yaw [3] by term, from one row for each axis."""
     return {
         term: torch.tensor([row.get(term, 0.0) for row in rows], dtype=torch.float64)
         for term in dict.fromkeys(term for row in rows for term in row)
@@ -637,11 +653,15 @@ def derive_forward_equations(believed: str, model: ForceModel, label: str) -> Hu
     return HullEquations(u=u, v=v, r=r)
 
 
-def missing_coefficients(plant_name: str, believed: str) -> dict[str, list[float]]:
+def exact_residual_coefficients(plant_name: str, believed: str) -> dict[str, list[float]]:
     """Return the exact coefficients of a residual by basis function: surge, sway, yaw.
 
-    They are the plant's coefficients minus the believed ones; Jervan 2020 misprints the cross
-    terms (J19 in docs/documents/corrections.md).
+    They are the coefficients of the simulated vessel minus those of the believed hull. Jervan 2020
+    misprints the cross terms (J19 in docs/documents/corrections.md).
+
+    Args:
+        plant_name: name of the simulated vessel.
+        believed: name of the vessel of the known hull.
     """
 
     def factors(term: str) -> tuple[Any, ...]:
@@ -715,8 +735,8 @@ def model_sections(
     refusal_section = Section("Models that cannot run forward in time", [Bullets(refusal_reasons)])
     explanation = Text(
         "The force of a model is that of the believed hull plus the sum of coefficient times basis"
-        " function, in SI units. A weight is the magnitude of the coefficient of scaled variables:"
-        " it says how much a basis function matters."
+        " function, in SI units. A weight is the magnitude of the coefficient of scaled variables,"
+        " by which basis functions with different units can be compared."
     )
     model_blocks = []
     for name, model in models.items():
@@ -831,11 +851,11 @@ def _order_figure(
     return Figure(
         f"orders_{name}",
         "Error over the order of the PLSR",
-        "Share of the unmodelled residual's mean square that is left, by model order: on"
-        " segments that were left out of the fit one by one, and on the test half.",
+        "Mean square of the remaining residual as a share of that of the unmodelled residual, by"
+        " model order: on segments that were left out of the fit one by one, and on the test half.",
         styles,
         [
-            Panel(f"{axis}, share of the MSE left", "model order", height=285, y_log=True)
+            Panel(f"{axis}, relative MSE [-]", "model order", height=285, y_log=True)
             for axis in AXES
         ],
         [Case("", panels_shown)],
@@ -876,12 +896,13 @@ def _surface_figure(
     return Figure(
         f"surface_{name}",
         "Surface analysis",
-        "Share of the unmodelled residual's mean square that is left, by number of basis functions,"
-        " a line for each model order. Marks show what each rule chose.",
+        "Mean square of the remaining residual as a share of that of the unmodelled residual, by"
+        " number of basis functions, a line for each model order. Marks show the selection of each"
+        " rule.",
         styles,
         [
             Panel(
-                f"{axis}, share of the MSE left [%]",
+                f"{axis}, relative MSE [%]",
                 "basis functions",
                 height=285,
                 y_log=True,

@@ -58,9 +58,9 @@ from residnet.studies.jervan2020.residual import (
     ForceRecord,
     ResidualForceModel,
     derive_forward_equations,
+    exact_residual_coefficients,
     fit_model,
     fit_to_json,
-    missing_coefficients,
     model_figures,
     model_sections,
     refit_with_settings,
@@ -581,7 +581,7 @@ def write_results(
         "schema": "residnet.ferry/1",
         "run": config.name,
         "unmodelled_test_mse": study_result.unmodelled_mse,
-        "true_coefficients": missing_coefficients(config.true, config.believed),
+        "true_coefficients": exact_residual_coefficients(config.true, config.believed),
         "models": models,
         **{
             run_kind: {name: run.tracking_metrics.to_json() for name, run in runs.items()}
