@@ -471,7 +471,7 @@ class TrackingMetrics:
     iaew: tuple[float, float]
 
     def to_json(self) -> dict[str, float | list[float]]:
-        """Return the metrics as a JSON object."""
+        """Return the metrics by the names of their attributes, with tuples as lists."""
         return {
             key: list(value) if isinstance(value, tuple) else value
             for key, value in asdict(self).items()
@@ -521,7 +521,7 @@ def compute_tracking_metrics(
 
 
 def mean_squares_by_axis(residuals: Tensor) -> list[float]:
-    """Return the mean square of residuals [N, 3] for each axis."""
+    """Return the mean square of residuals [N, 3] in surge, sway and yaw, in squared units."""
     return [float(value) for value in torch.mean(residuals.square(), dim=0)]
 
 

@@ -159,7 +159,7 @@ class FourCorner(Manoeuvre):
 
     @property
     def filter_config(self) -> ReferenceFilterConfig:
-        """The config of the reference filter."""
+        """Config of the filter that turns the poses into a smooth reference motion."""
         return ReferenceFilterConfig(
             waypoints=self.poses,
             interval=self.interval,

@@ -39,7 +39,7 @@ class MMGHull(Config):
 
     @property
     def block_coefficient(self) -> float:
-        """Block coefficient, dimensionless."""
+        """Displaced volume divided by length, beam and draught, dimensionless."""
         return self.mass / (self.density * self.length * self.beam * self.draught)
 
 

@@ -102,7 +102,7 @@ class RegressorBaseline(ParametricBaseline):
         return [float(n_nonzero) for n_nonzero in ((self.theta * self.term_mask) != 0).sum(1)]
 
     def term_columns(self, axis: int) -> list[int]:
-        """Return the indices of the terms of an axis."""
+        """Return the columns of the library that the equation of an axis contains."""
         return [j for j in range(self.library.n_terms) if bool(self.term_mask[axis, j] > 0)]
 
     def free_indices(self) -> Tensor:

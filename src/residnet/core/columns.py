@@ -24,7 +24,7 @@ def dynamic_states(x: Tensor, n_dynamic: int = 3) -> Tensor:
 
 
 def pose_and_dynamic_states(x: Tensor, n_dynamic: int = 3) -> Tensor:
-    """Return pose and dynamic states [..., 3 + n] of states [..., nx]."""
+    """Return states [..., nx] without the actuator states at their end, [..., 3 + n]."""
     return x[..., : 3 + n_dynamic]
 
 

@@ -41,7 +41,7 @@ class DisplayUnit(NamedTuple):
 
 
 def display_unit(unit: str) -> DisplayUnit:
-    """Return the display unit of an SI unit."""
+    """Return the unit for display, such as deg for rad, and the factor from the SI unit."""
     return DisplayUnit(*DISPLAY_UNITS.get(unit, (unit, 1.0)))
 
 
@@ -93,7 +93,7 @@ def format_integer(value: float) -> str:
 
 
 def format_percent_change(value: float) -> str:
-    """Format a change in percent with its sign."""
+    """Format a change given in percent with its sign, rounded to 1 %."""
     return f"{value:+.0f} %".replace("-", "−") if abs(value) >= 0.5 else "0 %"
 
 

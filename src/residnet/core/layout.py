@@ -69,7 +69,7 @@ class StateLayout:
 
     @property
     def velocity_columns(self) -> slice:
-        """Columns of the dynamic states."""
+        """Columns of velocities and of attitude and depth beyond the pose, in states x."""
         return slice(len(self.pose), len(self.state_names))
 
 

@@ -183,7 +183,7 @@ class Log:
 
     @staticmethod
     def is_canonical_log(path: Path) -> bool:
-        """Return whether a file is a canonical log."""
+        """Return whether a file is a Parquet file written by `Log.save`."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 

@@ -122,16 +122,16 @@ class FunctionWriter:
 
     @property
     def zero_literal(self) -> str:
-        """Zero as a C literal."""
+        """Zero in the number type of the code."""
         return self.write_literal(0.0)
 
     @property
     def one_literal(self) -> str:
-        """One as a C literal."""
+        """One in the number type of the code."""
         return self.write_literal(1.0)
 
     def write_literal(self, value: float) -> str:
-        """Return a constant."""
+        """Return a constant as an expression of the number type of the code."""
         return write_literal(value)
 
     def __init__(self, function: ca.Function, tables: Tables, what: str) -> None:
@@ -178,7 +178,7 @@ class FunctionWriter:
         return _CColumn(texts, self.tables.table_name(texts, "REAL"))
 
     def argument_expression(self, name: str, place: int) -> str:
-        """Return an entry of an argument."""
+        """Return the C expression of entry `place` of the array of an argument."""
         return f"{name}[{place}]"
 
     def copy_argument(self, argument: int, place: int | None = None) -> _CColumn:
@@ -234,7 +234,7 @@ class FunctionWriter:
         return name
 
     def write_instruction(self, k: int, op: int, operands: Sequence[_CColumn]) -> list[_CColumn]:
-        """Write an instruction and return its results."""
+        """Write the statements of instruction k and return its results as C expressions."""
         if op in (ca.OP_VERTCAT, ca.OP_HORZCAT):
             if any(column.is_boolean for column in operands):
                 operands = [self.to_real_column(column) for column in operands]
@@ -551,7 +551,7 @@ def load_library(source: str, *, quick: bool = False) -> ctypes.CDLL:
 
 
 def _cache_path(compiler_path: str, source: str, flags: Sequence[str]) -> Path:
-    """Return the path of the library of a source in the cache."""
+    """Return the file of a compiled library, named by a hash of source, flags and machine."""
     key = hashlib.sha256(
         "\n".join((source, *flags, *_machine_key(compiler_path))).encode()
     ).hexdigest()

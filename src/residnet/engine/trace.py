@@ -597,7 +597,7 @@ class _Recorder(TorchDispatchMode):
         self._varying: set[Node] = set()
 
     def record(self, step: Callable[..., Any], examples: Sequence[Tensor]) -> Graph:
-        """Return the graph of a step on examples."""
+        """Record the operations of a step on example arguments as a graph without dead code."""
         for k, example in enumerate(examples):
             self._nodes[id(example)] = self._graph.placeholder(f"given_{k}"), example
         self._varying.update(node for node, _ in self._nodes.values())

@@ -138,7 +138,7 @@ class FreeRunErrors:
         predictions: Sequence[Prediction],
         logs: Sequence[PreparedLog],
     ) -> FreeRunErrors:
-        """Return the errors of predictions over windows of logs."""
+        """Compute predicted minus measured states of free runs, one prediction for each window."""
         log_slices = [
             (logs[window.log_index], slice(window.start, window.stop)) for window in windows
         ]

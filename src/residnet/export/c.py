@@ -54,7 +54,7 @@ def expand_if_small(function: ca.Function) -> ca.Function:
 
 
 def to_c_identifier(text: str) -> str:
-    """Return a name as an identifier of C."""
+    """Return a text in lower case with underscores for all characters that C does not allow."""
     cleaned = re.sub(r"\W", "_", text.lower(), flags=re.ASCII)
     return cleaned if re.match(r"[a-z]", cleaned) else f"m_{cleaned}"
 
@@ -113,7 +113,7 @@ class CFunction:
         return f"{return_type} {prefix}_{self.name}({', '.join(inputs + outputs) or 'void'})"
 
     def render_definition(self, prefix: str, tables: Tables) -> str:
-        """Return the definition of the function in C."""
+        """Return the C code of the function, and add its constant arrays to `tables`."""
         statement_writer = FunctionWriter(
             expand_if_small(self.function), tables, f"{prefix}_{self.name}"
         )

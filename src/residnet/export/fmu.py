@@ -115,7 +115,7 @@ class FmuExporter(Exporter):
         return card
 
     def _make_sources(self, c_files: CSource, token: str, dt: float) -> dict[str, str]:
-        """Return the source files by name."""
+        """Return the C sources of the FMU, file name -> content."""
         prefix = c_files.prefix
         upper = c_files.prefix.upper()
         return {

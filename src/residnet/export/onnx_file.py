@@ -56,7 +56,7 @@ class _NonEmptyStep(nn.Module):
 
 
 def _non_empty_results(exported: Exportable) -> list[str]:
-    """Return the names of the results that are not empty."""
+    """Return the results of the ONNX graph: without the memory of a model that has none."""
     has_empty_argument = any(n_entries == 0 for _, n_entries in exported.arguments)
     return [name for name in exported.results if not (has_empty_argument and name == "s_after")]
 

@@ -276,11 +276,11 @@ class ExportedVessel(Exportable):
         self._sweep_share = _SWEEP_SHARES[0]
 
     def to_precision(self, dtype: torch.dtype) -> HybridDynamics:
-        """Return the model in a precision."""
+        """Return a copy of the model with parameters of type `dtype`."""
         return copy.deepcopy(self.model).to(dtype)
 
     def guard_model(self, dtype: torch.dtype) -> GuardedDynamics:
-        """Return the model with its input guard."""
+        """Return a copy of the model whose step is finite for all inputs and flags invalid ones."""
         return GuardedDynamics(self.to_precision(dtype), self.spec).to(dtype).eval()
 
     def build_module(self, dtype: torch.dtype) -> nn.Module:

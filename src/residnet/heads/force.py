@@ -181,6 +181,6 @@ class AugmentedMassBaseline(RenamedStateModule):
         return baseline_acceleration @ self.inertia_ratio.to(z.dtype).T
 
     def parameter_counts(self) -> list[float]:
-        """Return the number of parameters of the baseline."""
+        """Return the number of parameters of the baseline for each axis."""
         counts: list[float] = self.baseline.parameter_counts()  # type: ignore[operator]
         return counts

@@ -318,7 +318,7 @@ def _encode_special(estimator: Any) -> dict[str, Any]:
 
 
 def _restore_special(estimator: Any, state: dict[str, Any], columns: int) -> None:
-    """Restore the state of `_encode_special`."""
+    """Set trees or covariance function of an estimator from their form by `_encode_special`."""
     class_name = type(estimator).__name__
     if class_name in _SINGLE_TREES:
         (tree,) = _decode_trees(state["trees"], columns)
@@ -366,7 +366,7 @@ def _constant(value: Any, columns: int) -> Any:
 
 
 def _set_tree(estimator: Any, tree: Any, columns: int) -> Any:
-    """Set the tree of an estimator of a single tree and return the estimator."""
+    """Set the fitted attributes of a decision tree and return it."""
     estimator.tree_ = tree
     estimator.n_outputs_ = 1
     estimator.n_features_in_ = columns
@@ -426,7 +426,7 @@ def _require_nodes(inner: np.ndarray, children: Sequence[np.ndarray], size: int)
 
 
 def _decode_trees(stored: Any, columns: int) -> list[Any]:
-    """Decode the trees of `_encode_trees`."""
+    """Build the trees of scikit-learn from the arrays of `_encode_trees`."""
     from sklearn.tree import _tree
 
     nodes_of_trees = _split_nodes(stored, _tree.NODE_DTYPE)
@@ -458,7 +458,7 @@ def _decode_trees(stored: Any, columns: int) -> list[Any]:
 
 
 def _restore_histogram_trees(estimator: Any, stored: Any, columns: int) -> None:
-    """Restore the trees of histogram boosting."""
+    """Set the trees of a histogram gradient boosting from their stored nodes."""
     from sklearn.ensemble._hist_gradient_boosting.binning import _BinMapper
     from sklearn.ensemble._hist_gradient_boosting.common import PREDICTOR_RECORD_DTYPE
     from sklearn.ensemble._hist_gradient_boosting.predictor import TreePredictor

@@ -99,7 +99,7 @@ def should_include_validation(settings: FitSettings, train: Sequence[PreparedLog
 
 
 def _fit_all_parts(fitter: Fitter, logs: Logs) -> IdentifiedModels:
-    """Fit all parts on the training logs."""
+    """Fit baselines, heads and ensembles, and return the models by name."""
     settings = fitter.settings
     models = {CONSTANT_VELOCITY: fitter.build_constant_velocity()}
     for name in settings.all_baselines:

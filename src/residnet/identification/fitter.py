@@ -94,7 +94,7 @@ class FitStore:
         return None
 
     def save(self, fitted_model: FittedModel) -> None:
-        """Save a finished model."""
+        """Store a model as soon as it is fitted, so that an interrupted fit can resume."""
 
 
 _FIRST_BASELINE = "baseline"

@@ -237,11 +237,11 @@ class FitSettings(ModelPartsConfig):
         return (*self.all_baselines, *self.heads, *self.ensembles, *self.means)
 
     def get_baseline_name(self, head_name: str) -> str:
-        """Return the name of the baseline of a head."""
+        """Return the name of the baseline whose residual a head predicts."""
         return self.base_of.get(head_name, "baseline")
 
     def get_baseline_config(self, head_name: str) -> BaselineConfig:
-        """Return the settings of the baseline of a head."""
+        """Return the config of the baseline whose residual a head predicts."""
         name = self.get_baseline_name(head_name)
         return ZeroBaselineConfig() if name == CONSTANT_VELOCITY else self.all_baselines[name]
 

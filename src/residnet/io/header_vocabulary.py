@@ -390,7 +390,7 @@ class _ChannelRule:
         self._excluded = frozenset(excluded.split())
 
     def matches(self, parsed_name: ParsedName) -> bool:
-        """Return whether the rule applies to a name."""
+        """Return whether a name has all required concepts, no excluded one and the pattern."""
         if not self._excluded.isdisjoint(parsed_name.concepts) or any(
             map(parsed_name.concepts.isdisjoint, self._required)
         ):

@@ -75,7 +75,7 @@ class LogPart(Config):
 
     @property
     def is_whole_log(self) -> bool:
-        """Whether the part is the complete log."""
+        """Whether the part has neither a start nor a stop."""
         return self.start is None and self.stop is None
 
     @property

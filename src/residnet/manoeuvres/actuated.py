@@ -189,7 +189,7 @@ class GivenActuators(Actuators):
 
 
 def command_name_for(name: str) -> str:
-    """Return the name of the command of an input."""
+    """Return `cmd_<name>` for an input such as `delta`; a command keeps its name."""
     return name if name.startswith("cmd_") else f"cmd_{name}"
 
 

@@ -260,7 +260,7 @@ def build_plant(vessel: str, disturbance: DisturbanceConfig) -> Plant:
 
 
 def build_trial_vessel(config: SimulatedTrials) -> SimulatedVessel:
-    """Return the simulated vessel of the trials."""
+    """Build the plant with its disturbances, the time step and the helm of simulated trials."""
     plant = build_plant(config.vessel, config.disturbance)
     return SimulatedVessel(
         config.vessel,

@@ -61,7 +61,7 @@ MassDensity = Annotated[Parameter, AfterValidator(convert_to_unit("kg/m^3"))]
 
 
 def require_positive(parameter: Parameter) -> Parameter:
-    """Validate that a parameter is positive."""
+    """Return a parameter; a ValueError says that it is not positive."""
     if not parameter.value > 0:
         raise ValueError(f"must be positive, got {parameter.value:g}")
     return parameter

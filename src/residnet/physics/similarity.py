@@ -302,7 +302,7 @@ class FroudeScaling:
         return math.sqrt(self.scale)
 
     def factor(self, dimension: Dimension) -> float:
-        """Return the factor of a quantity."""
+        """Return the ratio of a quantity at the new scale to that at the old one (Froude's law)."""
         return froude_factor(dimension, self.scale, self.density_ratio)
 
     def unit_factor(self, unit: str) -> float:

@@ -236,7 +236,7 @@ class CandidatesConfig(Config):
         return self.input_degree is None and not self.coupling
 
     def _input_products(self, motions: Sequence[str], inputs: Sequence[str]) -> list[str]:
-        """Return the products of inputs and coupled motions."""
+        """Return the terms with inputs, alone and times products of coupled motions."""
         if self._has_ship_inputs:
             return _ship_input_products(motions, inputs, magnitudes=self.magnitudes)
         degree = 1 if self.input_degree is None else self.input_degree

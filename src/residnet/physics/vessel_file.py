@@ -46,7 +46,7 @@ class VesselFile(Config, ABC):
 
     @abstractmethod
     def servo_specs(self) -> tuple[ServoSpec, ...]:
-        """Return the servos of the actuators."""
+        """Return limits and dynamics of every servo, in the order of the actuator states."""
 
     def check_parameters(self) -> None:
         """Check that the plant can be built.

@@ -32,7 +32,7 @@ class EpochDataModule(L.LightningDataModule, ABC):
 
     @property
     def current_epoch(self) -> int:
-        """Number of the current epoch."""
+        """Index of the current epoch, from 0; of the trainer if there is one."""
         if self._get_epoch is not None:
             return self._get_epoch()
         return 0 if self.trainer is None else int(self.trainer.current_epoch)
@@ -47,7 +47,7 @@ class EpochDataModule(L.LightningDataModule, ABC):
     @property
     @abstractmethod
     def n_batches(self) -> int:
-        """Number of batches in an epoch."""
+        """Number of batches of one epoch over all processes."""
 
     @abstractmethod
     def iterate_batches(self, epoch: int) -> Iterator[Any]:

@@ -342,5 +342,5 @@ def _apply_per_channel(
 
 
 def _median_time_step(t: np.ndarray) -> float:
-    """Return the median time step in s."""
+    """Return the median of the time steps in s; 0 with fewer than two samples."""
     return float(np.median(np.diff(t))) if t.size > 1 else 0.0

@@ -400,12 +400,12 @@ class LeastSquaresFit(NamedTuple):
 
     @property
     def sum_of_squares(self) -> float:
-        """Residual sum of squares."""
+        """Sum of squared residuals, in squared units of the response."""
         return float(self.residuals @ self.residuals)
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Standard errors [k]."""
+        """Square roots of the diagonal of the covariance, one for each coefficient [k]."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
 
     @property

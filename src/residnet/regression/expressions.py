@@ -324,7 +324,7 @@ class ProductEvaluator:
 
 
 def apply_function(function: Function, x: np.ndarray) -> np.ndarray:
-    """Apply a function to values."""
+    """Return the values of a function of one variable, such as `sin`, at x, elementwise."""
     return np.asarray(_NUMPY_FUNCTIONS[function](x))
 
 
@@ -376,7 +376,7 @@ class ProductLayer(ResizableModule):
         ]
 
     def forward(self, columns: Tensor) -> Tensor:
-        """Return the products [..., P]."""
+        """Return the P products of the selected columns [..., C] as [..., P]."""
         values = columns.index_select(-1, self.index[0])
         for d in range(1, self.index.shape[0]):
             values = values * columns.index_select(-1, self.index[d])

@@ -68,7 +68,7 @@ _MAX_BATCH_ELEMENTS = 3_000_000
 
 
 def expression_limits(config: EvolutionConfig) -> ExpressionLimits:
-    """Return the limits of the expressions of a search."""
+    """Return the limits on size and nesting of expressions that a config sets."""
     return ExpressionLimits(
         config.max_terms, config.max_degree, config.nesting, config.split == "expand"
     )

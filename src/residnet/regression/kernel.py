@@ -227,7 +227,7 @@ class Kernel(ResizableModule, ABC):
 
     @abstractmethod
     def zero_state(self) -> dict[str, Tensor]:
-        """Return the state of the zero function."""
+        """Return the state with which the kernel expansion is zero everywhere."""
 
 
 @final

@@ -52,7 +52,7 @@ class Text:
 
     @property
     def nonempty_paragraphs(self) -> list[str]:
-        """Return the paragraphs that are not empty."""
+        """Return the paragraphs of the text as a list, without empty ones."""
         paragraphs = [self.paragraphs] if isinstance(self.paragraphs, str) else self.paragraphs
         return [paragraph for paragraph in paragraphs if paragraph]
 

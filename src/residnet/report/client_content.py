@@ -73,7 +73,7 @@ class ReportTable:
     weights: Sequence[float] = ()
 
     def to_data(self) -> dict[str, Any]:
-        """Return the table for a template."""
+        """Return header, rows, caption and column widths for the PDF template."""
         return {
             "kind": "table",
             "header": list(self.header),
@@ -91,7 +91,7 @@ class ReportText:
     is_list: bool = False
 
     def to_data(self) -> dict[str, Any]:
-        """Return the text for a template."""
+        """Return the paragraphs, as text or list, for the PDF template."""
         return {"kind": "list" if self.is_list else "text", "paragraphs": list(self.paragraphs)}
 
 
@@ -119,13 +119,13 @@ ReportBlock = ReportTable | ReportText | ReportPicture
 
 @dataclass
 class ReportSection:
-    """A numbered section."""
+    """A section of the client report; its number comes from its position."""
 
     title: str
     blocks: list[ReportBlock] = field(default_factory=list)
 
     def to_data(self) -> dict[str, Any]:
-        """Return the section for a template."""
+        """Return title and blocks for the PDF template."""
         return {"title": self.title, "blocks": [block.to_data() for block in self.blocks]}
 
 
@@ -226,7 +226,7 @@ def _ship_interval(booklet: BookletFile, name: str, entry: BookletIndex) -> str:
 def _vessel_section(
     run: RunFiles, booklet: BookletFile | None, derivatives: DerivativesFile | None
 ) -> ReportSection:
-    """Return the vessel and its tests."""
+    """Build the section with main particulars of the vessel and a table of its logs."""
     section = ReportSection("Vessel and tests")
     rows: list[tuple[str, ...]] = []
     scale = booklet.scale if booklet is not None else 1.0

@@ -225,7 +225,7 @@ class RunFolder:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the run is complete."""
+        """Whether the summary of the run exists and says that all results are written."""
         return self.summary.is_file() and self.read_summary().finished
 
     def write(self, path: Path, text: str) -> None:

@@ -25,7 +25,7 @@ class RunModelStore(FitStore):
         self.folder = folder
 
     def names(self) -> list[str]:
-        """Return the names of the stored models."""
+        """Return the names of the subfolders of `models` that hold a model."""
         return list(model_names(self.folder.models))
 
     def load_finished(self, name: str) -> FittedModel | None:

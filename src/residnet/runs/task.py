@@ -242,7 +242,7 @@ class Task(Config):
         return [*self.input_files(), *dict.fromkeys(tables)]
 
     def provenance_seed(self) -> int:
-        """Return the seed that the provenance records."""
+        """Return the seed of all random numbers, for provenance.json; 0 if the task draws none."""
         return 0
 
     @final

@@ -36,7 +36,7 @@ class StudyTask(PackageTask):
 
     @final
     def build_executor(self) -> StudyExecutor[Any]:
-        """Return the executor of the study with this config."""
+        """Import the module of the executor and return its executor for this config."""
         executor_class: type[StudyExecutor[Any]] = getattr(self.executor(), self.executor_class)
         return executor_class(self)
 

@@ -54,7 +54,7 @@ class OneStage(Config):
         return 0, epoch
 
     def rate(self, epoch: int) -> float:
-        """Return the learning rate of an epoch."""
+        """Return the learning rate of an epoch, by cosine annealing within its stage."""
         return cosine_learning_rate(self.learning_rate, self.final, epoch, self.epochs)
 
 
@@ -258,7 +258,7 @@ class TrainingConfig(MachineConfig):
 
     @property
     def last_stage(self) -> int:
-        """Index of the last stage."""
+        """Index of the last stage; stage 0 is the one-step training."""
         return len(self.multi_step)
 
     def stage(self, epoch: int) -> tuple[int, int]:
@@ -273,7 +273,7 @@ class TrainingConfig(MachineConfig):
         return len(self.multi_step), max(epoch - begin, 0)
 
     def rate(self, epoch: int) -> float:
-        """Return the learning rate of an epoch."""
+        """Return the learning rate of an epoch, by cosine annealing within its stage."""
         number, epoch_in_stage = self.stage(epoch)
         stage = self.one_step if number == 0 else self.multi_step[number - 1]
         return cosine_learning_rate(stage.learning_rate, stage.final, epoch_in_stage, stage.epochs)

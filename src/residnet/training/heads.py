@@ -228,7 +228,7 @@ class HeadTraining(EpochTraining):
         return precomputed
 
     def stage_of(self, epoch: int) -> int:
-        """Return the index of the stage of an epoch."""
+        """Return the stage of an epoch: 0 for one-step training, then the multi-step stages."""
         return int(self.settings.stage(epoch)[0])
 
     def present_epoch(self) -> int:

@@ -121,7 +121,7 @@ def find_passages(track: Array, buoys: Sequence[BuoyConfig]) -> list[Passage]:
 
 
 def _vessel_side_of_buoy(track: Array, sample: int, buoy: BuoyConfig) -> str:
-    """Return the side of the vessel on which a buoy lies at a sample."""
+    """Return the side of the vessel, `starboard` or `port`, on which it has a buoy at a sample."""
     step = track[min(sample + 1, len(track) - 1)] - track[max(sample - 1, 0)]
     north = buoy.north - track[sample, 0]
     east = buoy.east - track[sample, 1]

@@ -88,7 +88,7 @@ class RouteOutline:
         )
 
     def _merge_turns(self, k: int) -> RouteOutline:
-        """Return the outline with turns k and k + 1 merged into one."""
+        """Return the outline with one turn instead of turns k and k + 1 with their leg."""
         first = self.turns[k]
         second = self.turns[k + 1]
         wider_turn = max(first, second, key=lambda bend: bend.angle)

@@ -778,7 +778,7 @@ class SteadinessLimits(Config):
     flights: int = Field(default=256, ge=2, le=1_000_000)
 
     def limits_for(self, axis: Axis) -> AxisLimits:
-        """Return the limits for the controlled axis."""
+        """Return the limits of swing in m and overshoot in m for depth, or in rad for heading."""
         if axis is DEPTH:
             return AxisLimits(self.depth.swing, self.depth.overshoot, self.depth.overshoot_p95)
         return AxisLimits(self.heading_swing, self.overshoot, self.overshoot_p95)

@@ -129,7 +129,7 @@ class LinearLaw(AnglePolicy):
 
 
 class ControllerConfig(Config, ABC):
-    """The config of a heading controller."""
+    """Base class of the configs of heading controllers, whose `build` returns the controller."""
 
     @abstractmethod
     def build(self, task: ControlTask) -> Policy:

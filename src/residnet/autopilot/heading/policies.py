@@ -413,7 +413,7 @@ class ObserverPolicy(SteeringPolicy):
         return policy
 
     def constant_values(self) -> dict[str, float]:
-        """Return the constants by name."""
+        """Return the constants of the law by name; the parameters are their logarithms."""
         constants = torch.exp(self.constants.detach()).tolist()
         return dict(zip(self.constant_names, constants, strict=True))
 

@@ -490,7 +490,7 @@ def sections(run: RunFiles) -> list[Section]:
 
 
 def _rows_by_model(rows: Sequence[HeadingRow], protocol: str) -> dict[str, RowsByProtocol]:
-    """Return the rows of the controllers with a row of a protocol, by model and protocol."""
+    """Return rows by controller and protocol, for the controllers tested under `protocol`."""
     rows_by_model: dict[str, dict[str, HeadingRow]] = {}
     for row in rows:
         rows_by_model.setdefault(row.model, {})[row.protocol] = row

@@ -487,7 +487,7 @@ def _build_vessel_file(steering: SteeringDescription, name: str) -> dict[str, An
 def _build_autopilot_config(
     steering: SteeringDescription, output_file: Path, vessel_file: Path, *, classical: bool
 ) -> dict[str, Any]:
-    """Return the content of the config."""
+    """Return the config of the task `autopilot` for a vessel with this steering response."""
     nomoto = NomotoModel(steering.gain, steering.time_constant, steering.speed)
     turn_time = minimum_turn_time(nomoto, steering.rudder, steering.rate)
     # rounded to two digits, for a readable config

@@ -65,7 +65,7 @@ class ReaderKind(Config, ABC):
 
     @abstractmethod
     def build(self) -> LogReader:
-        """Build the reader of this config."""
+        """Return the object whose `read` reads files with these settings."""
 
 
 class ConfiguredReader(ReaderKind, LogReader):

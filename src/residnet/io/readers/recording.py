@@ -137,7 +137,7 @@ class Series:
         return self.select_rows(self.sender == sender)
 
     def with_remarks(self, *remarks: Remark) -> Series:
-        """Return the series with additional remarks."""
+        """Return the series with further remarks for the data checks."""
         return dataclasses.replace(self, remarks=(*self.remarks, *remarks))
 
 

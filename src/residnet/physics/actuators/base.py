@@ -144,7 +144,7 @@ class ActuatorSystem(nn.Module, ABC):
         return torch.cat(positions, dim=-1)
 
     def derivative(self, states: Tensor, command: Tensor) -> Tensor:
-        """Return the derivative of the states [..., k]."""
+        """Return the rates [..., k] of the servo states, per second, towards a command [..., c]."""
         derivatives = [
             servo.derivative(servo_state, servo_command)
             for servo, servo_state, servo_command in self._iterate_servos(states, command)

@@ -319,7 +319,7 @@ class _FindingKind(NamedTuple):
 
     @property
     def example(self) -> FindingRow:
-        """The first finding."""
+        """The finding that represents its kind in the table."""
         return self.findings[0][1]
 
 

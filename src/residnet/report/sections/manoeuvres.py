@@ -116,7 +116,7 @@ _PLOTTED_CHANNELS = ("u", "v", "r", "p", "psi", "phi", "w", "q", "z", "theta")
 
 
 def index_title(name: str) -> str:
-    """Return the title of a manoeuvring index."""
+    """Return the words for a manoeuvring index, such as `tactical diameter`."""
     return _INDEX_TITLES.get(name, name.replace("_", " "))
 
 

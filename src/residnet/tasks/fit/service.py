@@ -113,7 +113,7 @@ class MonitoredLog:
 
     @property
     def n_windows(self) -> int:
-        """Number of monitored windows of the log."""
+        """Number of windows of the log that the monitor has tested."""
         return len(self.scores)
 
     def to_record(self) -> MonitoredLogRow:
@@ -138,7 +138,7 @@ class MonitoredLog:
         )
 
     def to_lines(self) -> list[str]:
-        """Return the result as lines for the terminal."""
+        """Return alarm and most likely causes as lines for the terminal."""
         alarm_text = (
             "no alarm" if self.alarm_time is None else f"ALARM after {self.alarm_time:.0f} s"
         )
@@ -336,7 +336,7 @@ class RefitResult:
     worth: bool = False
 
     def to_lines(self) -> list[str]:
-        """Return the result as lines for the terminal."""
+        """Return changes, reason of the end and errors before and after, one line each."""
         lines = [
             f"refit: {changed_parameter.change.name} {changed_parameter.estimated_size:+.3g} +-"
             f" {changed_parameter.standard_error:.2g} {changed_parameter.change.unit}, after"

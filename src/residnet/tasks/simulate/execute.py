@@ -244,7 +244,7 @@ def _build_model_craft(
 def _set_initial_state(
     programme: Programme, states: Tensor, state_names: tuple[str, ...], craft_name: str
 ) -> Tensor:
-    """Set the initial states of the programme in states [1, nx]."""
+    """Overwrite states [1, nx] by the entries of `programme.initial`, and return them."""
     programme.require_states(state_names, craft_name)
     for name, value in programme.initial.items():
         states[:, state_names.index(name)] = float(value)

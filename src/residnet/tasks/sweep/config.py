@@ -269,7 +269,7 @@ class FigureObjective(Config):
 
     @property
     def is_minimized(self) -> bool:
-        """Whether the figure is minimised."""
+        """Whether smaller values of the figure are better."""
         return self.direction == "minimize"
 
     @property
@@ -568,7 +568,7 @@ class SweepConfig(PackageTask):
         task.check()
 
     def input_files(self) -> list[Path]:
-        """Return the base and its input files."""
+        """Return the config file that the sweep varies, and the files that it reads."""
         base = load_config(self.base, self.common, SweepableConfig)
         return [self.base, *base.recorded_files()]
 

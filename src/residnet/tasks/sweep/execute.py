@@ -191,7 +191,7 @@ class TrialQueue:
         return RandomSampler(seed=seed)
 
     def report_finished(self) -> None:
-        """Report the number of finished trials."""
+        """Send the number of finished trials, of all processes, to the progress display."""
         n_finished = sum(
             stored_trial.state.is_finished()
             for stored_trial in self.study.get_trials(deepcopy=False)

@@ -96,7 +96,7 @@ class NoiseConfig(Config):
     factor: float = Field(default=0.0, ge=0)
 
     def add_noise(self, record: SignalRecord, generator: np.random.Generator) -> SignalRecord:
-        """Return the record with noise."""
+        """Return the record with uniform noise, relative to the range of each signal."""
         signals = {"output": ("u_dot",), "inputs": CHANNELS, "all": tuple(record)}
         noisy = signals.get(self.on, ())
         return {

@@ -87,7 +87,7 @@ def check(config: ForceResidualConfig) -> None:
 
 
 def read_logs(config: ForceResidualConfig) -> MeasuredForceLogs:
-    """Return the contents of the logs."""
+    """Read forces, motions and segments of the measured logs of the study."""
     return read_force_logs(config.data, config.channels, config.prepare, config.validation)
 
 
@@ -539,7 +539,7 @@ def _gain_sentences(regression_rows: Sequence[StudyResults]) -> list[str]:
 
 
 def _rows_by_force(results: StudyResults) -> dict[str, dict[str, StudyResults]]:
-    """Return the rows by force and model."""
+    """Return the rows of the results, force -> model -> row."""
     rows_by_force: dict[str, dict[str, StudyResults]] = {}
     for row in results["rows"]:
         rows_by_force.setdefault(row["force"], {})[row["model"]] = row
