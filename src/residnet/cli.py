@@ -911,7 +911,7 @@ def scale(
     """
     from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.registry import open_finished_task
-    from residnet.tasks.scale_settings import make_scale_settings
+    from residnet.tasks.scale_settings import ScaleRequest, make_scale_settings
 
     with show_progress(quiet=quiet):
         run, task = open_finished_task(folder, "scale")
@@ -926,9 +926,8 @@ def scale(
         )
         output = output_folder or folder.with_name(f"{folder.resolve().name}_full_scale")
         with name_damaged_key(folder):
-            finished_run = task.scale_run(
-                run, output, scaling, effects, models or (), overwrite=overwrite
-            )
+            request = ScaleRequest(run, output, scaling, effects, models or (), overwrite)
+            finished_run = task.scale_run(request)
     print_result(finished_run)
 
 

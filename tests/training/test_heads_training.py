@@ -36,6 +36,7 @@ from residnet.preprocessing.windows import WindowStore
 from residnet.training.config import MachineConfig, TrainingConfig
 from residnet.training.heads import (
     HeadTraining,
+    TrainingSetup,
     Validate,
     finish_training,
     make_training,
@@ -257,7 +258,8 @@ def trained(
 ) -> tuple[HybridDynamics, dict[str, Any]]:
     model, residual, store = prepared(logs)
     settings = TrainingConfig.model_validate({"steps": 3, "one_step": ONE_STEP, **config})
-    notes = train("mlp", model, residual, store, settings, SCALES, validate, 0, folder)
+    setup = TrainingSetup(model, residual, store, settings, SCALES, validate, 0)
+    notes = train("mlp", setup, folder)
     return model, notes
 
 
@@ -520,7 +522,7 @@ def test_networks_are_calibrated_on_both_sides_and_with_a_gain(has_baseline: boo
     settings = {"multi_step": [{"horizon": 0.5, "epochs": 1, "batch": 4}], "mirror": True}
     config = TrainingConfig.model_validate(settings)
     store = WindowStore.from_logs(trials(), torch.float32)
-    make_training(model, residual, store, config, SCALES, validated, 0)
+    make_training(TrainingSetup(model, residual, store, config, SCALES, validated, 0))
     # v, r and tau_n change their signs in the mirror
     sideways = [1, 2, 4]
     torch.testing.assert_close(head.features.low[sideways], -head.features.high[sideways])
@@ -545,7 +547,8 @@ def losses_of(
     store = WindowStore.from_logs(trials(), dtype)
     precision = "64-true" if dtype == torch.float64 else "32-true"
     config = TrainingConfig.model_validate({**SETTINGS, "precision": precision, **settings})
-    notes = train("net", model.to(dtype), residual, store, config, SCALES, validated, 0, folder)
+    setup = TrainingSetup(model.to(dtype), residual, store, config, SCALES, validated, 0)
+    notes = train("net", setup, folder)
     return [row["loss"] for row in notes["curve"]]
 
 

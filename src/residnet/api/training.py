@@ -48,7 +48,7 @@ class HeadTrainingRun:
         }
         baseline = self._models[fitter.settings.get_baseline_name(name)]
         self._head_fit = fitter.start_head(name, baseline)
-        module, data = make_training(*fitter.training_arguments(self._head_fit))
+        module, data = make_training(fitter.make_training_setup(self._head_fit))
         self.module: HeadTraining = module
         self.data: WindowsDataModule = data
         self.max_epochs: int = module.settings.epochs

@@ -49,6 +49,7 @@ from residnet.training.refit import refit, require_parametric_baseline
 from residnet.training.score import ExampleRun, Score
 
 if TYPE_CHECKING:
+    from residnet.training.heads import TrainingSetup
     from residnet.training.trainer import TrainerExtensions
 
 
@@ -486,12 +487,8 @@ class Fitter:
             # imported here because it imports Lightning, which takes seconds to load
             from residnet.training.heads import train
 
-            notes = train(
-                name,
-                *self.training_arguments(head_fit),
-                self.store.training_folder,
-                self.extensions,
-            )
+            setup = self.make_training_setup(head_fit)
+            notes = train(name, setup, self.store.training_folder, self.extensions)
         return self.finish_head(head_fit, notes)
 
     def start_head(self, name: str, baseline: FittedModel) -> HeadFit:
@@ -505,25 +502,17 @@ class Fitter:
         residuals = compute_residual_samples(model, self.training_samples)
         return HeadFit(spec, model, baseline, residuals, seed, time.perf_counter())
 
-    def training_arguments(
-        self, head_fit: HeadFit
-    ) -> tuple[
-        HybridDynamics,
-        Samples,
-        WindowStore,
-        TrainingConfig,
-        Tensor,
-        Callable[[HybridDynamics], Score],
-        int,
-    ]:
-        """Return the arguments of `training.heads.make_training` for a network."""
+    def make_training_setup(self, head_fit: HeadFit) -> TrainingSetup:
+        """Collect windows of the training logs, scales, validation and seed for a network."""
+        from residnet.training.heads import TrainingSetup
+
         training_config = self.settings.training[head_fit.spec.name]
         dtype = torch.float64 if training_config.is_double_precision else torch.float32
 
         def validate(trained_model: HybridDynamics) -> Score:
             return self.score_on_validation(head_fit.spec.average_networks(trained_model))
 
-        return (
+        return TrainingSetup(
             head_fit.model,
             head_fit.residuals,
             WindowStore.from_logs(self.training_logs, dtype),

@@ -62,7 +62,7 @@ class ExportRequest(NamedTuple):
         exported: Exportable,
         objections: Sequence[str] = (),
         stem: str = "",
-        judged: tuple[str, Sequence[str]] | None = None,
+        model_verdict: tuple[str, Sequence[str]] | None = None,
     ) -> Path:
         """Write the export file; returns its path.
 
@@ -70,8 +70,8 @@ class ExportRequest(NamedTuple):
             exported: the model, policy or force model to export.
             objections: reasons not to use the model; the model card lists them.
             stem: file name without suffix if the request names none; empty for the model's name.
-            judged: level and sentences of the verdict on this model; None for the verdict of the
-                run.
+            model_verdict: level and sentences of the verdict on this model; None for the verdict
+                of the run.
 
         Raises:
             ConfigError: if there is no such format.
@@ -97,7 +97,7 @@ class ExportRequest(NamedTuple):
         exported = require_releasable(
             exported, objections, allows_objections=self.allows_objections
         )
-        exported.assessment = RunFiles(self.run.path).assessment(judged)
+        exported.assessment = RunFiles(self.run.path).assessment(model_verdict)
         with stage_files(file, file.parent.glob("*.masses.yaml")) as staged:
             export_format.export(exported, staged)
         return file

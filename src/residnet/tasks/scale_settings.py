@@ -2,13 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from residnet.core.config import Quantity, validate_config
 from residnet.core.errors import UsageError
 from residnet.dynamics.scaling import ScaleEffects, ittc_resistance_ratio
 from residnet.physics.similarity import FroudeScaling
+from residnet.runs.folder import RunFolder
+
+
+class ScaleRequest(NamedTuple):
+    """A request to write a run whose models and logs are those of a finished fit at another scale.
+
+    Attributes:
+        run: folder of the fit.
+        output_folder: folder of the new run.
+        scaling: ratios of lengths and densities.
+        effects: scale effects of viscosity.
+        model_names: models to scale; empty for all that can be scaled.
+        overwrite: replace an earlier run in the folder.
+    """
+
+    run: RunFolder
+    output_folder: Path
+    scaling: FroudeScaling
+    effects: ScaleEffects
+    model_names: Sequence[str] = ()
+    overwrite: bool = False
 
 
 def make_scale_settings(

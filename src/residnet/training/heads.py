@@ -391,21 +391,11 @@ class HeadTraining(EpochTraining):
         return self.model, score.error
 
 
-def make_training(
-    model: HybridDynamics,
-    samples: Samples,
-    store: WindowStore,
-    config: TrainingConfig,
-    scales: torch.Tensor,
-    validate: Validate,
-    seed: int,
-) -> tuple[HeadTraining, WindowsDataModule]:
-    """Calibrate the head, and return the Lightning module and the data module of its training.
+@dataclass(frozen=True)
+class TrainingSetup:
+    """A network to train, its data and its settings.
 
-    An ensemble of recurrent networks is trained at the coarse step of its gates. Each of its
-    networks has its own windows, and a batch holds the same number of windows for each.
-
-    Args:
+    Attributes:
         model: the model with a fitted baseline; its head is trained.
         samples: training samples whose target is the residual; they determine the scales of the
             head.
@@ -414,13 +404,32 @@ def make_training(
         scales: scales of the velocities, SI [n].
         validate: returns the validation score of a model.
         seed: seed of noise and batches.
+    """
+
+    model: HybridDynamics
+    samples: Samples
+    store: WindowStore
+    config: TrainingConfig
+    scales: Tensor
+    validate: Validate
+    seed: int
+
+
+def make_training(setup: TrainingSetup) -> tuple[HeadTraining, WindowsDataModule]:
+    """Calibrate the head, and return the Lightning module and the data module of its training.
+
+    An ensemble of recurrent networks is trained at the coarse step of its gates. Each of its
+    networks has its own windows, and a batch holds the same number of windows for each.
 
     Raises:
         DataError: if no log is long enough for a stage.
     """
+    model = setup.model
+    config = setup.config
+    store = setup.store
     # mirrored windows leave the range of the samples, outside of which inputs are clamped and
     # velocities are pulled back
-    calibration_samples = add_mirror_images(samples) if config.mirror else samples
+    calibration_samples = add_mirror_images(setup.samples) if config.mirror else setup.samples
     model.head.calibrate(calibration_samples)
     dtype = torch.float64 if config.is_double_precision else torch.float32
     if isinstance(model.head, GRUEnsembleHead):
@@ -435,13 +444,13 @@ def make_training(
                 trained.signals, trained.baseline, trained.head, model.dt, model.integrator
             )
             try:
-                return validate(fine)
+                return setup.validate(fine)
             finally:
                 trained.head.set_step(coarse.dt)
 
-        module = HeadTraining(coarse, config, scales.to(dtype), validate_fine, seed)
+        module = HeadTraining(coarse, config, setup.scales.to(dtype), validate_fine, setup.seed)
     else:
-        module = HeadTraining(model, config, scales.to(dtype), validate, seed)
+        module = HeadTraining(model, config, setup.scales.to(dtype), setup.validate, setup.seed)
     # losses and scores use velocities only
     module.model.has_position = False
     module.model.to(dtype)
@@ -460,13 +469,7 @@ def finish_training(model: HybridDynamics) -> None:
 
 def train(
     name: str,
-    model: HybridDynamics,
-    samples: Samples,
-    store: WindowStore,
-    config: TrainingConfig,
-    scales: torch.Tensor,
-    validate: Validate,
-    seed: int,
+    setup: TrainingSetup,
     folder: Path | None,
     extensions: TrainerExtensions | None = None,
 ) -> dict[str, Any]:
@@ -474,7 +477,7 @@ def train(
 
     Args:
         name: name of the head.
-        model: see `make_training`, as the other arguments.
+        setup: the model, its data and the settings of the training.
         folder: folder of checkpoints and TensorBoard log; None to write neither. The checkpoint
             `checkpoints/<name>/last.ckpt` of an interrupted training is resumed.
         extensions: callbacks and logger of the user; None for none.
@@ -486,10 +489,12 @@ def train(
         FitError: if no validation gave a finite free run.
     """
     try:
-        module, data = make_training(model, samples, store, config, scales, validate, seed)
-        return run_epochs(name, module, data, module.model, model.head, folder, config, extensions)
+        module, data = make_training(setup)
+        return run_epochs(
+            name, module, data, module.model, setup.model.head, folder, setup.config, extensions
+        )
     finally:
-        finish_training(model)
+        finish_training(setup.model)
 
 
 def _with_coarse_step(model: HybridDynamics, head: GRUEnsembleHead) -> tuple[HybridDynamics, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, final
+from typing import ClassVar, NamedTuple, final
 
 import torch
 from torch import Tensor, nn
@@ -382,6 +382,24 @@ def _stopping_angle(
     )
 
 
+class HeadingLawInput(NamedTuple):
+    """Predicted motion and Nomoto parameters at the current speed, from which a law steers.
+
+    Attributes:
+        error: heading error [B, 1] in rad.
+        r: yaw rate [B, 1] in rad/s.
+        normalised_rudder: rudder angle plus disturbance [B, 1] as a fraction of the limit.
+        max_yaw_acceleration: yaw acceleration [B, 1] at full rudder in rad/s^2.
+        inverse_time_constant: 1/T [B, 1] in 1/s.
+    """
+
+    error: Tensor
+    r: Tensor
+    normalised_rudder: Tensor
+    max_yaw_acceleration: Tensor
+    inverse_time_constant: Tensor
+
+
 class HeadingLaw(nn.Module, ABC):
     """A control law from heading error and yaw rate to the rudder as a fraction of its limit.
 
@@ -392,23 +410,11 @@ class HeadingLaw(nn.Module, ABC):
     constants: ClassVar[tuple[str, ...]]
 
     @abstractmethod
-    def forward(
-        self,
-        error: Tensor,
-        r: Tensor,
-        normalised_rudder: Tensor,
-        max_yaw_acceleration: Tensor,
-        inverse_time_constant: Tensor,
-        constants: list[Tensor],
-    ) -> Tensor:
+    def forward(self, inputs: HeadingLawInput, constants: list[Tensor]) -> Tensor:
         """Return the desired rudder [B, 1] as a fraction of its limit, not yet saturated.
 
         Args:
-            error: heading error [B, 1] in rad.
-            r: yaw rate [B, 1] in rad/s.
-            normalised_rudder: rudder angle plus disturbance [B, 1] as a fraction of the limit.
-            max_yaw_acceleration: yaw acceleration [B, 1] at full rudder in rad/s^2.
-            inverse_time_constant: 1/T [B, 1] in 1/s.
+            inputs: heading error, yaw rate, rudder and parameters of the vessel.
             constants: constants of the law, [1] or [B, 1] each.
         """
 
@@ -427,22 +433,14 @@ class RegulatorLaw(HeadingLaw):
         super().__init__()
         self.limit = limit
 
-    def forward(
-        self,
-        error: Tensor,
-        r: Tensor,
-        normalised_rudder: Tensor,
-        max_yaw_acceleration: Tensor,
-        inverse_time_constant: Tensor,
-        constants: list[Tensor],
-    ) -> Tensor:
-        heading, rate = regulator_gains(
+    def forward(self, inputs: HeadingLawInput, constants: list[Tensor]) -> Tensor:
+        heading_gain, rate_gain = regulator_gains(
             constants[0],
             constants[1],
-            max_yaw_acceleration / (inverse_time_constant * self.limit),
-            1.0 / inverse_time_constant,
+            inputs.max_yaw_acceleration / (inputs.inverse_time_constant * self.limit),
+            1.0 / inputs.inverse_time_constant,
         )
-        return (heading * error - rate * r) / self.limit
+        return (heading_gain * inputs.error - rate_gain * inputs.r) / self.limit
 
 
 def regulator_gains(
@@ -474,37 +472,29 @@ class ProximateTimeOptimalLaw(HeadingLaw):
         super().__init__()
         self.swing_time = swing_time
 
-    def forward(
-        self,
-        error: Tensor,
-        r: Tensor,
-        normalised_rudder: Tensor,
-        max_yaw_acceleration: Tensor,
-        inverse_time_constant: Tensor,
-        constants: list[Tensor],
-    ) -> Tensor:
+    def forward(self, inputs: HeadingLawInput, constants: list[Tensor]) -> Tensor:
         """Return steepness times the heading error [B, 1] that remains after braking."""
         steepness = constants[0]
         share = constants[1]
         damping_ratio = constants[2]
-        predicted_error = error
-        predicted_rate = r
+        predicted_error = inputs.error
+        predicted_rate = inputs.r
         if self.swing_time > 0.0:
             # the command depends on the rudder angle with a gain above one, which only the rate
             # limit keeps stable: gradients through this loop would grow from step to step
             predicted_error, predicted_rate = predict_centred_rudder(
-                error,
-                r,
-                normalised_rudder.detach(),
-                max_yaw_acceleration,
-                inverse_time_constant,
+                inputs.error,
+                inputs.r,
+                inputs.normalised_rudder.detach(),
+                inputs.max_yaw_acceleration,
+                inputs.inverse_time_constant,
                 self.swing_time,
             )
         stopping_angle = braking_distance(
             predicted_rate,
-            share * max_yaw_acceleration,
-            inverse_time_constant,
-            steepness * max_yaw_acceleration,
+            share * inputs.max_yaw_acceleration,
+            inputs.inverse_time_constant,
+            steepness * inputs.max_yaw_acceleration,
             damping_ratio,
             self.swing_time,
         )

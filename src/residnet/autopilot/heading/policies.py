@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.autopilot.base import Policy
-from residnet.autopilot.heading.classical import HeadingLaw
+from residnet.autopilot.heading.classical import HeadingLaw, HeadingLawInput
 from residnet.autopilot.heading.steering_variation import DEPTH, HEADING, Axis
 from residnet.autopilot.heading.turning import NomotoModel
 from residnet.core.frames import wrap_angle
@@ -483,14 +483,14 @@ class ObserverPolicy(SteeringPolicy):
             estimate.disturbance_rudder, estimate.predicted_heading, ratio
         )
         normalised_rudder = (rudder + effective_disturbance) / self.limit
-        law_output = self.law(
+        law_input = HeadingLawInput(
             error,
             estimate.predicted_r,
             normalised_rudder,
             max_yaw_acceleration,
             inverse_time_constant,
-            constants[: self.n_law_constants],
         )
+        law_output = self.law(law_input, constants[: self.n_law_constants])
         law_output = law_output - effective_disturbance / self.limit
         memory = s[:, n_observer_entries + n_pending :]
         unsaturated_command = law_output

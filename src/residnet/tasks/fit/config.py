@@ -19,10 +19,9 @@ from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, ExportRequest, FinishedRun, PackageTask
 
 if TYPE_CHECKING:
-    from residnet.dynamics.scaling import ScaleEffects
-    from residnet.physics.similarity import FroudeScaling
     from residnet.report.blocks import Section
     from residnet.tasks.fit.service import MonitoredLog, NextTrials, RefitResult
+    from residnet.tasks.scale_settings import ScaleRequest
 
 
 class ExportConfig(Config):
@@ -218,33 +217,14 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
         next_trials: NextTrials = self.call_executor("plan_trial", run, model, trial_limits)
         return next_trials
 
-    def scale_run(
-        self,
-        run: RunFolder,
-        output_folder: Path,
-        scaling: FroudeScaling,
-        effects: ScaleEffects,
-        model_names: Sequence[str] = (),
-        *,
-        overwrite: bool = False,
-    ) -> FinishedRun:
+    def scale_run(self, request: ScaleRequest) -> FinishedRun:
         """Write a run whose models and logs are those of a finished fit at another scale.
-
-        Args:
-            run: folder of the fit.
-            output_folder: folder of the new run.
-            scaling: ratios of lengths and densities.
-            effects: scale effects of viscosity.
-            model_names: models to scale; empty for all that can be scaled.
-            overwrite: replace an earlier run in the folder.
 
         Raises:
             UsageError: if a named model cannot be scaled, or the folder may not be used.
             DataError: if the logs of the fit cannot be read.
         """
-        finished_run: FinishedRun = self.call_executor(
-            "scale_run", run, output_folder, scaling, effects, model_names, overwrite=overwrite
-        )
+        finished_run: FinishedRun = self.call_executor("scale_run", request)
         return finished_run
 
     def export_model(self, request: ExportRequest) -> Path:

@@ -58,11 +58,10 @@ from residnet.training.records import CurrentsFile
 
 if TYPE_CHECKING:
     from residnet.dynamics.hybrid import HybridDynamics
-    from residnet.dynamics.scaling import ScaleEffects
     from residnet.dynamics.store import ModelSpec
-    from residnet.physics.similarity import FroudeScaling
     from residnet.tasks.fit.config import FitConfig
     from residnet.tasks.fit.service import MonitoredLog, NextTrials, RefitResult
+    from residnet.tasks.scale_settings import ScaleRequest
 
 
 def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
@@ -222,9 +221,9 @@ def export_model(config: FitConfig, request: ExportRequest) -> Path:
     found = collect_evidence(RunFiles(run.path), model_name)
     # a model without free runs on the reported split has no verdict
     sentences = write_verdict(found) if model_name in found.rows_by_model else []
-    judged = (rate_model(found), sentences)
+    model_verdict = (rate_model(found), sentences)
     file = request.write(
-        ExportedVessel(spec, model, rows), list_model_objections(found), model_name, judged
+        ExportedVessel(spec, model, rows), list_model_objections(found), model_name, model_verdict
     )
     is_ensemble = model_name == metrics.selected_ensemble and model_name != metrics.selected
     if is_ensemble and get_exporter(request.file_format).is_for_microcontrollers:
@@ -332,19 +331,8 @@ def plan_trial(
     return plan_next_trials(config, run, model, trial_limits)
 
 
-def scale_run(
-    config: FitConfig,
-    run: RunFolder,
-    output_folder: Path,
-    scaling: FroudeScaling,
-    effects: ScaleEffects,
-    model_names: Sequence[str],
-    *,
-    overwrite: bool,
-) -> FinishedRun:
+def scale_run(config: FitConfig, request: ScaleRequest) -> FinishedRun:
     """Write the run of another scale; see `FitConfig.scale_run`."""
     from residnet.tasks.fit.scaling import write_scaled_run
 
-    return write_scaled_run(
-        config, run, output_folder, scaling, effects, model_names, overwrite=overwrite
-    )
+    return write_scaled_run(config, request)

@@ -39,36 +39,26 @@ from residnet.tasks.fit.outcome import build_fit_outcome, divergence_limit, writ
 
 if TYPE_CHECKING:
     from residnet.tasks.fit.config import FitConfig
+    from residnet.tasks.scale_settings import ScaleRequest
 
 LOG_FOLDER = "logs"
 """Folder of the scaled logs in the run folder."""
 
 
-def write_scaled_run(
-    config: FitConfig,
-    run: RunFolder,
-    output_folder: Path,
-    scaling: FroudeScaling,
-    effects: ScaleEffects,
-    model_names: Sequence[str] = (),
-    *,
-    overwrite: bool = False,
-) -> FinishedRun:
+def write_scaled_run(config: FitConfig, request: ScaleRequest) -> FinishedRun:
     """Scale the models and logs of a fit and write them into a new run folder.
 
     Args:
         config: config of the fit.
-        run: folder of the fit.
-        output_folder: folder of the new run.
-        scaling: ratios of lengths and densities.
-        effects: scale effects of viscosity.
-        model_names: models to scale; empty for all that can be scaled.
-        overwrite: replace an earlier run in the folder.
+        request: the run, its new folder, and the ratios.
 
     Raises:
         UsageError: if a named model cannot be scaled, or the folder may not be used.
         DataError: if the logs of the fit cannot be read.
     """
+    run = request.run
+    output_folder = request.output_folder
+    scaling = request.scaling
     if output_folder.resolve().is_relative_to(run.path.resolve()):
         raise UsageError(
             f"{output_folder}: lies in the run {run.path}, which is not changed; choose another"
@@ -79,12 +69,12 @@ def write_scaled_run(
     if output_folder.exists() and not output_folder.is_dir():
         raise UsageError(f"{output_folder}: is a file, expected a folder; choose another --out")
     store = RunModelStore(run)
-    names = _resolve_models(run, store, model_names)
+    names = _resolve_models(run, store, request.model_names)
     begin_stage(f"{config.name}: reading logs")
     scaled_logs = _scale_logs(config, scaling)
     scaled_config = scale_fit_config(config, scaling, output_folder, scaled_logs)
     resolved = dump_config(scaled_config)
-    RunFolder(output_folder).require_usable(resolved, overwrite=overwrite)
+    RunFolder(output_folder).require_usable(resolved, overwrite=request.overwrite)
     input_paths = [run.models / name / "model.json" for name in names]
     provenance = Provenance(run.resolved_config, (), config.seed, input_paths, time.time())
 
@@ -93,7 +83,9 @@ def write_scaled_run(
             for index, log in enumerate(logs):
                 log.save(folder.path / _log_file(split, index, log))
         begin_stage("scaling models")
-        scaled_models = _scale_models(store, names, scaling, effects, is_strict=bool(model_names))
+        scaled_models = _scale_models(
+            store, names, scaling, request.effects, is_strict=bool(request.model_names)
+        )
         new_store = RunModelStore(folder)
         for fitted_model in scaled_models:
             new_store.save(fitted_model)
@@ -104,7 +96,7 @@ def write_scaled_run(
 
     output_folder.mkdir(parents=True, exist_ok=True)
     with RunFolder(output_folder).lock():
-        folder = RunFolder.create(output_folder, resolved, overwrite=overwrite)
+        folder = RunFolder.create(output_folder, resolved, overwrite=request.overwrite)
         return scaled_config.run_in_folder(folder, provenance, write_results)
 
 
