@@ -25,7 +25,7 @@ from residnet.core.frames import to_body
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.simulated import InAmbientCurrent, PlantDynamics
 from residnet.dynamics.time_steps import MAX_STEPS, Integrator, check_steps
-from residnet.engine import trace as lowering
+from residnet.engine import lowering
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import Rollout
 from residnet.physics.plant import Plant

@@ -28,7 +28,7 @@ from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import BandTable, ModelSpec
 from residnet.engine.c_code import find_compiler
-from residnet.engine.trace import lower
+from residnet.engine.lowering import lower
 from residnet.evaluation.records import MetricsRow
 from residnet.export import EXPORT_FORMATS as REGISTERED
 from residnet.export import base, get_exporter, torchscript, vessel

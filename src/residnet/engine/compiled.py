@@ -28,7 +28,7 @@ from residnet.engine.rollout_source import (
     count_stored_values,
     write_rollout_source,
 )
-from residnet.engine.trace import split_step
+from residnet.engine.step_parts import split_step
 
 
 class _RolloutStep(nn.Module):

@@ -18,7 +18,7 @@ from residnet.baselines.base import ParametricBaseline
 from residnet.core.layout import HEADING
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.engine.c_code import CompilerError, load_library
-from residnet.engine.trace import lower, to_scalar_function
+from residnet.engine.lowering import lower, to_scalar_function
 from residnet.heads.base import ZeroHead
 
 # calls the function that CasADi generates for each row

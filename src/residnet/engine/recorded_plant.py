@@ -34,7 +34,7 @@ class RecordedPlantDynamics(Dynamics):
         """Return the step of one row as a CasADi function, which calls one traced sub-step."""
         import casadi as ca
 
-        from residnet.engine.trace import lower, to_scalar_function
+        from residnet.engine.lowering import lower, to_scalar_function
 
         sizes = [("x", len(self.plant.state_names)), ("w", len(self.plant.input_names))]
         model = PlantDynamics(self.plant, self.dt / self.substeps).eval()

@@ -19,7 +19,8 @@ import torch
 
 from residnet.core.errors import ExportError
 from residnet.engine.c_code import FUNCTIONS, FunctionWriter, Tables, write_literal
-from residnet.engine.trace import RowProduct, StepParts, to_scalar_function
+from residnet.engine.lowering import to_scalar_function
+from residnet.engine.step_parts import RowProduct, StepParts
 
 STATE_NAMES = ("x", "s", "q")
 """Arguments that a step updates: state x, memory s of the model and memory q of the source."""

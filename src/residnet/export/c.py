@@ -23,7 +23,7 @@ from residnet.core.errors import ExportError, UsageError
 from residnet.core.progress import log_message
 from residnet.dynamics.store import BandTable
 from residnet.engine.c_code import FunctionWriter, Tables, find_compiler, write_literal
-from residnet.engine.trace import lower, to_scalar_function
+from residnet.engine.lowering import lower, to_scalar_function
 from residnet.export.base import (
     Exportable,
     Exporter,
