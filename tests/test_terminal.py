@@ -8,9 +8,9 @@ import time
 
 import pytest
 
-from residnet import cli
-from residnet.cli import show_progress
+from residnet import terminal
 from residnet.core.progress import begin_stage, log_message, report_progress
+from residnet.terminal import show_progress
 
 
 def test_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
@@ -56,7 +56,7 @@ def test_bars_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_long_work_is_never_silent(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli, "SILENCE_SECONDS", 0.05)
+    monkeypatch.setattr(terminal, "SILENCE_SECONDS", 0.05)
     with show_progress():
         begin_stage("calibrating bands")
         log_message("  First fix this: a clock")

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from residnet.cli import QuietOption, TrustOption, print_result, show_progress
+from residnet.cli import QuietOption, TrustOption, print_result
+from residnet.terminal import show_progress
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
