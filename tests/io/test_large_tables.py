@@ -11,7 +11,7 @@ import pytest
 from residnet.core.config import validate_config
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.io.readers import ReaderConfig, text_tables
+from residnet.io.readers import ReaderConfig, table_lines, text_tables
 from residnet.io.readers.base import LogReader
 
 
@@ -24,7 +24,7 @@ def reader(kind: str = "csv") -> LogReader:
 
 def in_pieces(path: Path, monkeypatch: pytest.MonkeyPatch, *, rows: int) -> Log:
     monkeypatch.setattr(text_tables, "_CHUNK_ROWS", rows)
-    monkeypatch.setattr(text_tables, "_BLOCK_BYTES", 10 * rows)
+    monkeypatch.setattr(table_lines, "_BLOCK_BYTES", 10 * rows)
     return reader().read(path)
 
 

@@ -22,7 +22,7 @@ from residnet.io.readers import ReaderConfig
 from residnet.io.readers.detect import AutoConfig, detect_recording_format
 from residnet.io.readers.formats.topic_folder import TopicFolderConfig
 from residnet.io.readers.recording import ALL_FIELDS
-from residnet.io.readers.text_tables import detect_encoding
+from residnet.io.readers.text_encoding import detect_encoding
 from residnet.io.split import extract_segment
 from residnet.tasks.input_selection import choose_inputs
 

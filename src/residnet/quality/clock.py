@@ -12,7 +12,7 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.io.readers.text_tables import open_as_utf8
+from residnet.io.readers.text_encoding import open_as_utf8
 from residnet.io.readers.timestamps import parse_numbers, parse_texts
 from residnet.quality.findings import Check, Finding, Level, check, format_share
 from residnet.quality.statistics import SMOOTHING_SAMPLES, LogStatistics

@@ -55,13 +55,13 @@ from residnet.io.readers.quantities import (
     quaternion_tilt,
     quaternion_yaw,
 )
+from residnet.io.readers.text_encoding import open_as_utf8
 from residnet.io.readers.text_tables import (
     coerce_numeric,
     count_numbers,
     find_column_positions,
     find_header,
     make_names_unique,
-    open_as_utf8,
     read_csv,
 )
 from residnet.io.readers.timestamps import DateOrder, parse_texts, parse_zone

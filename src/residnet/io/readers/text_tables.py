@@ -1,17 +1,13 @@
-"""Text tables: detection of encoding, delimiter and header, checks of lines, parsing of cells."""
+"""Text tables: detection of delimiter and header, parsing of cells."""
 
 from __future__ import annotations
 
-import codecs
 import csv
-import io
 import re
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 
@@ -24,12 +20,21 @@ from residnet.io.header_vocabulary import (
     parse_name,
 )
 from residnet.io.readers.base import ProgressCallback
+from residnet.io.readers.table_lines import (
+    WHITESPACE_DELIMITER,
+    Header,
+    check_lines,
+    find_comment_lines,
+    find_separator_lines,
+    iter_line_blocks,
+    split_line,
+    split_lines,
+)
+from residnet.io.readers.text_encoding import HEAD_BYTES, open_as_utf8
 
 if TYPE_CHECKING:
     import pandas as pd
 
-WHITESPACE_DELIMITER = " "
-"""Delimiter of tables whose cells are separated by any number of blanks and tabs."""
 _HEADER_SEARCH_LINES = 200
 """Lines in which the header of a table with a channel map is searched."""
 _SNIFFED_LINES = 60
@@ -38,14 +43,6 @@ _MAX_UNIT_LINES = 3
 """Largest number of lines with units or remarks between column names and values."""
 # chunks of this size stay in the processor's cache while they are parsed
 _CHUNK_ROWS = 20_000
-_HEAD_BYTES = 1 << 16
-"""Number of bytes at the start from which the format is detected, and at the end for the last line.
-"""
-_BLOCK_BYTES = 1 << 18
-"""Size in bytes of the blocks in which a file is split into lines."""
-_SCAN_BYTES = 1 << 20
-"""Size in bytes of the blocks in which a file is searched for bytes that are not UTF-8."""
-_COMMENT_SIGNS = (b"#", b"%", b"//")
 _COMMENT_PREFIX = re.compile(r"\s*(?:#|%|//)\s+")
 _NUMBER = re.compile(
     r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf)", re.IGNORECASE
@@ -58,30 +55,6 @@ _WITH_UNIT = re.compile(rf"(?P<number>[-+]?[\d.,'’ \u00a0\u202f]*\d)\s*(?P<uni
 _HEMISPHERES = frozenset("NSEW")
 """Letters that behind a number mean a hemisphere rather than newtons or seconds."""
 _EXTRA_COLUMN = "beyond the last column"
-# longer marks first: the mark of UTF-32 (little endian) starts with that of UTF-16
-_BYTE_ORDER_MARKS = {
-    codecs.BOM_UTF8: "utf-8",
-    codecs.BOM_UTF32_LE: "utf-32",
-    codecs.BOM_UTF32_BE: "utf-32",
-    codecs.BOM_UTF16_LE: "utf-16",
-    codecs.BOM_UTF16_BE: "utf-16",
-}
-_ENCODINGS = ("cp1252", "cp1250", "cp1251", "cp932", "cp949", "gb18030")
-"""Encodings of recorders that do not write Unicode, the most frequent one first."""
-_MAX_ENCODING_LINES = 200
-"""Lines with other than ASCII characters from which an encoding is detected."""
-
-
-class Header(NamedTuple):
-    """Header of a text table.
-
-    Attributes:
-        names: column names.
-        n_lines_above: number of lines above the first line with values.
-    """
-
-    names: tuple[str, ...]
-    n_lines_above: int
 
 
 class HeaderlessTableError(DataError):
@@ -188,7 +161,7 @@ def read_csv(
             except UsageError as error:
                 hint = f" (only one column found; is the delimiter really '{delimiter}'?)"
                 raise UsageError(f"{error}{hint if n_columns == 1 else ''}") from None
-            is_truncated, comments, n_blank_lines = _check_lines(path, delimiter, header, file)
+            is_truncated, comments, n_blank_lines = check_lines(path, delimiter, header, file)
             chunks: dict[int, list[pd.Series]] = {position: [] for position in column_positions}
             with file.open("rb") as stream:
                 pandas_options = _pandas_options(
@@ -378,9 +351,9 @@ def read_table_head(
 
     with open_as_utf8(path) as file:
         with file.open("rb") as stream:
-            head = stream.read(_HEAD_BYTES)
+            head = stream.read(HEAD_BYTES)
         lines = head.decode("utf-8-sig", errors="replace").splitlines()
-        lines = lines[:-1] if len(head) == _HEAD_BYTES else lines
+        lines = lines[:-1] if len(head) == HEAD_BYTES else lines
         if not any(line.strip() for line in lines) or b"\x00" in head:
             raise DataError(
                 f"{path}: the file is empty or no text; a table with a header line was expected"
@@ -411,15 +384,15 @@ def read_table_head(
         names = make_names_unique(cells[header_row])
         comments = []
         n_rows_seen = 0
-        for line, block, _ in _iter_line_blocks(file):
-            skipped_lines = _find_comment_lines(
+        for line, block, _ in iter_line_blocks(file):
+            skipped_lines = find_comment_lines(
                 block, delimiter, cells[header_row], n_lines_above - line
             )
             skipped_lines = sorted(
-                {*skipped_lines, *_find_separator_lines(block, delimiter, len(names))}
+                {*skipped_lines, *find_separator_lines(block, delimiter, len(names))}
             )
             comments += [line + i for i in skipped_lines]
-            n_rows_seen += sum(bool(text.strip()) for text in _split_lines(block)) - len(
+            n_rows_seen += sum(bool(text.strip()) for text in split_lines(block)) - len(
                 skipped_lines
             )
             if n_rows_seen >= n_lines_above + rows:
@@ -461,7 +434,7 @@ def _detect_delimiter(path: Path, lines: list[str]) -> tuple[str, list[list[str]
         if candidates if delimiter == WHITESPACE_DELIMITER else delimiter not in text:
             continue
         rows = [
-            _split_line(_COMMENT_PREFIX.sub("", line, count=1), delimiter)
+            split_line(_COMMENT_PREFIX.sub("", line, count=1), delimiter)
             for line in lines[:_SNIFFED_LINES]
         ]
         header_position = find_header(rows)
@@ -506,7 +479,7 @@ def _find_values(lines: Sequence[str]) -> tuple[str, list[list[str]], int] | Non
         if most of the lines are no rows of numbers with the same number of cells.
     """
     for delimiter in (";", "\t", "|", ",", WHITESPACE_DELIMITER):
-        rows = [_split_line(line, delimiter) for line in lines[:_SNIFFED_LINES]]
+        rows = [split_line(line, delimiter) for line in lines[:_SNIFFED_LINES]]
         later_rows = [row for row in rows[len(rows) // 2 :] if any(row)]
         # the last delimiter may end the line
         later_rows = [row[:-1] if row and not row[-1] else row for row in later_rows]
@@ -581,7 +554,7 @@ def _locate_values(path: Path, delimiter: str, file: Path, names: Sequence[str])
     """
     with file.open(encoding="utf-8-sig", errors="replace") as stream:
         for i, line in enumerate(islice(stream, _HEADER_SEARCH_LINES)):
-            row = _split_line(line.rstrip("\r\n"), delimiter)
+            row = split_line(line.rstrip("\r\n"), delimiter)
             row = row[:-1] if len(row) == len(names) + 1 and not row[-1] else row
             if len(row) == len(names) and 2 * sum(map(_is_value, row)) > len(row):
                 return Header(tuple(names), i)
@@ -589,17 +562,6 @@ def _locate_values(path: Path, delimiter: str, file: Path, names: Sequence[str])
         f"{path}: no line has {len(names)} numbers, one for each of the `names`; check `names` and"
         " `delimiter`"
     )
-
-
-def _split_line(line: str, delimiter: str) -> list[str]:
-    """Return the cells of one line; a line that the csv parser rejects is one cell."""
-    if delimiter == WHITESPACE_DELIMITER:
-        return line.split()
-    try:
-        row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
-    except csv.Error:
-        return [line]
-    return [cell.strip() for cell in row]
 
 
 def _is_value(cell: str) -> bool:
@@ -795,342 +757,3 @@ def _refuse_motion_capture_export(path: Path, lines: Sequence[str]) -> None:
 def _has_repeated_cells(row: Sequence[str]) -> bool:
     filled_cells = [cell for cell in row if cell]
     return len(set(filled_cells)) < len(filled_cells)
-
-
-def _check_lines(
-    path: Path, delimiter: str, header: Header, file: Path
-) -> tuple[bool, list[int], int]:
-    """Check that every line has the same number of cells as the header.
-
-    pandas fills short lines with NaN and shifts cells silently. Blank lines are accepted, and so is
-    an additional or a missing delimiter at the end of all lines.
-
-    Args:
-        path: file of the table, for messages.
-        delimiter: separator of cells.
-        header: header of the table.
-        file: the same text in UTF-8.
-
-    Returns:
-        Whether the file ends within its last line, and the indices of lines without values, which
-        begin with `#`, `%` or `//`, repeat the column names, or hold separators only; and the
-        number of the latter.
-
-    Raises:
-        DataError: if a line has another number of cells, or a zero byte.
-    """
-    n_columns = len(header.names)
-    n_lines_above = header.n_lines_above
-    # columns without a name at the end may have no cells
-    n_named_columns = max(
-        (i for i, name in enumerate(header.names, start=1) if name), default=n_columns
-    )
-    is_truncated = _is_truncated(file, delimiter, n_named_columns)
-    n_lines = 0
-    n_blank_lines = 0
-    comments: list[int] = []
-    for first_line, block, is_last_block in _iter_line_blocks(file):
-        if b"\x00" in block:
-            line_index = first_line + block[: block.index(b"\x00")].count(b"\n") + 1
-            raise DataError(
-                f"{path}: line {line_index} contains a zero byte; the file is damaged or not UTF-8,"
-                " export it again"
-            )
-        cells = _count_cells(block, delimiter, n_columns)
-        is_irregular = (cells != n_columns) & (cells != 0)
-        is_irregular[: max(n_lines_above - first_line, 0)] = False
-        skipped_lines = _find_comment_lines(
-            block, delimiter, header.names, n_lines_above - first_line
-        )
-        if is_irregular.any():
-            # a spreadsheet writes blank rows as separators, often fewer than the header has
-            separator_lines = _find_separator_lines(block, delimiter, n_columns)
-            n_blank_lines += len(separator_lines)
-            skipped_lines += separator_lines
-        comments += [first_line + i for i in sorted({*skipped_lines})]
-        is_irregular[[i for i in skipped_lines if i < is_irregular.size]] = False
-        if is_irregular.any():
-            # rare, therefore tested only now: an empty cell or a column without a name at the end
-            rows = _split_lines(block)
-            sign = delimiter.encode()
-            has_trailing_delimiter = np.array([row.rstrip(b" ").endswith(sign) for row in rows])
-            is_irregular &= ~((cells >= n_named_columns) & (cells < n_columns))
-            is_irregular &= (
-                ~((cells == n_columns + 1) & has_trailing_delimiter)
-                if has_trailing_delimiter.size == cells.size
-                else True
-            )
-        if is_last_block and is_truncated:
-            is_irregular[-1:] = False
-        if is_irregular.any():
-            line_index = int(np.argmax(is_irregular))
-            raise DataError(
-                f"{path}: line {first_line + line_index + 1} has {cells[line_index]} cells, the"
-                f" header {n_columns} ({int(is_irregular.sum())} such lines nearby); check"
-                " `delimiter` and `decimal`, or delete the damaged lines"
-            )
-        n_lines = first_line + cells.size
-    return is_truncated and n_lines - 1 not in comments[-1:], comments, n_blank_lines
-
-
-def _iter_line_blocks(path: Path) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield blocks of complete lines, with line ends of one byte.
-
-    A block ends outside quotation marks, because a quoted cell may contain line ends.
-
-    Yields:
-        The index of the first line, the bytes, and whether this is the last block.
-    """
-    with path.open("rb") as stream:
-        pending = b""
-        line_number = 0
-        while True:
-            block = stream.read(_BLOCK_BYTES)
-            text = pending + block
-            tail = b""
-            if b"\r" in text:
-                # the \n of a Windows line end may be in the next block
-                if block and text.endswith(b"\r"):
-                    text = text[:-1]
-                    tail = b"\r"
-                text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-            if not block:
-                if text:
-                    yield line_number, text, True
-                return
-            block_end = text.rfind(b"\n") + 1 if text.count(b'"') % 2 == 0 else 0
-            if block_end:
-                yield line_number, text[:block_end], False
-                line_number += text.count(b"\n", 0, block_end)
-            pending = text[block_end:] + tail
-
-
-def _split_lines(block: bytes) -> list[bytes]:
-    lines = block.split(b"\n")
-    return lines if lines[-1] else lines[:-1]
-
-
-def _find_comment_lines(
-    block: bytes, delimiter: str, names: Sequence[str], n_lines_above: int
-) -> list[int]:
-    """Return the indices of lines in a block that are comments or repeat the column names.
-
-    Args:
-        block: complete lines.
-        delimiter: separator of cells.
-        names: column names.
-        n_lines_above: number of lines at the start of the block to ignore; may be negative.
-    """
-    header_cells = list(names)
-    # a search for bytes excludes most blocks without splitting them into lines
-    longest_name = max(names, key=len, default="").encode() or _COMMENT_SIGNS[0]
-    offset = 0
-    for _ in range(n_lines_above):
-        offset = block.find(b"\n", offset) + 1 or len(block)
-    block = block[offset:]
-    if not any(sign in block for sign in (*_COMMENT_SIGNS, longest_name)):
-        return []
-    return [
-        i
-        for i, line in enumerate(_split_lines(block), max(n_lines_above, 0))
-        if line.lstrip().startswith(_COMMENT_SIGNS)
-        or (
-            longest_name in line
-            and _split_line(line.decode("utf-8", "replace"), delimiter) == header_cells
-        )
-    ]
-
-
-def _find_separator_lines(block: bytes, delimiter: str, n_columns: int) -> list[int]:
-    """Return the indices of blank lines in a block whose number of separators is irregular.
-
-    Args:
-        block: complete lines.
-        delimiter: separator of cells.
-        n_columns: number of cells of a regular line.
-    """
-    sign = delimiter.encode()
-    if delimiter == WHITESPACE_DELIMITER or not re.search(
-        rb"(?m)^[" + re.escape(sign) + rb" ]+$", block
-    ):
-        return []
-    return [
-        i
-        for i, line in enumerate(_split_lines(block))
-        if sign in line
-        and not line.replace(sign, b"").strip()
-        and line.count(sign) + 1 != n_columns
-    ]
-
-
-def _count_cells(block: bytes, delimiter: str, n_columns: int) -> np.ndarray:
-    """Return the number of cells in each line, int [K]; 0 for blank lines.
-
-    Args:
-        block: complete lines.
-        delimiter: separator of cells.
-        n_columns: expected number, for which a fast test exists.
-    """
-    if delimiter == WHITESPACE_DELIMITER:
-        return np.array([len(line.split()) for line in _split_lines(block)], dtype=np.int64)
-    if b'"' in block:
-        text = io.StringIO(block.decode("utf-8", errors="replace"), newline="")
-        reader = csv.reader(text, delimiter=delimiter, skipinitialspace=True)
-        try:
-            return np.array([len(row) if any(row) or len(row) > 1 else 0 for row in reader])
-        except csv.Error:
-            # a cell of more than 128 kB: an unclosed quotation mark includes the following lines
-            return np.ones(1, dtype=np.int64)
-    delimiter_bytes = delimiter.encode()
-    if n_columns > 1 and len(delimiter_bytes) == 1:
-        # fast test of regular blocks: n_columns - 1 delimiters and a line end, repeated
-        separator_bytes = block.translate(
-            None, bytes({*range(256)} - {delimiter_bytes[0], ord("\n")})
-        )
-        if separator_bytes == (delimiter_bytes * (n_columns - 1) + b"\n") * (
-            len(separator_bytes) // n_columns
-        ):
-            return np.full(len(separator_bytes) // n_columns, n_columns)
-    lines = _split_lines(block)
-    cells = np.array([line.count(delimiter_bytes) for line in lines], dtype=np.int64) + 1
-    for i in np.flatnonzero(cells == 1):
-        cells[i] = bool(lines[i].strip())
-    return cells
-
-
-def _is_truncated(path: Path, delimiter: str, n_columns: int) -> bool:
-    """Return whether the file ends within its last line.
-
-    Such a line has no line end, and either too few cells or a last cell that is shorter than those
-    of the 50 previous lines.
-    """
-    with path.open("rb") as stream:
-        size = stream.seek(0, io.SEEK_END)
-        stream.seek(max(0, size - _HEAD_BYTES))
-        tail = stream.read()
-    if not tail or tail.endswith((b"\n", b"\r")):
-        return False
-    lines = [line for line in tail.replace(b"\r", b"\n").split(b"\n") if line.strip()]
-    delimiter_bytes = None if delimiter == WHITESPACE_DELIMITER else delimiter.encode()
-    last_cells = lines[-1].split(delimiter_bytes)
-    previous_lines = [line.split(delimiter_bytes) for line in lines[-51:-1]]
-    # the first line of the tail may itself be incomplete, or be the header
-    last_cell_lengths = [
-        len(cells[-1].strip())
-        for cells in previous_lines[1:]
-        if len(cells) == n_columns and cells[-1].strip()
-    ]
-    if size <= _HEAD_BYTES and len(lines) < 2:
-        return False
-    return len(last_cells) < n_columns or (
-        bool(last_cell_lengths)
-        and len(last_cells) == n_columns
-        and len(last_cells[-1].strip()) < min(last_cell_lengths)
-    )
-
-
-def detect_encoding(path: Path) -> str:
-    """Return the encoding of a text file.
-
-    A byte order mark decides first, then whether the complete file is UTF-8. Otherwise the
-    encodings of Western and Central Europe, Russia, Japan, Korea and China are compared:
-    charset-normalizer excludes those that give implausible characters. A header has too few words
-    for its language statistics, so the encoding wins in which most cells are known column names.
-    """
-    from charset_normalizer import from_bytes
-
-    with path.open("rb") as stream:
-        bom_encoding = _encoding_from_bom(stream.read(_HEAD_BYTES))
-        if bom_encoding is not None:
-            return bom_encoding
-        stream.seek(0)
-        block = _find_non_utf8_block(stream)
-    if not block:
-        return "utf-8"
-    # numbers say nothing about an encoding, and lines often repeat
-    foreign_lines = dict.fromkeys(line for line in block.split(b"\n") if not line.isascii())
-    sample = b"\n".join(list(foreign_lines)[:_MAX_ENCODING_LINES])
-    candidates: list[tuple[int, float, int]] = []
-    for match in from_bytes(sample, cp_isolation=list(_ENCODINGS), preemptive_behaviour=False):
-        cells = {cell for line in str(match).splitlines() for cell in re.split(r"[,;|\t]", line)}
-        n_concepts = sum(len(parse_name(cell).concepts) for cell in cells if not cell.isascii())
-        # encodings that give the same text are one match
-        candidates += [
-            (-n_concepts, match.chaos, _ENCODINGS.index(name))
-            for name in match.could_be_from_charset
-            if name in _ENCODINGS
-        ]
-    # latin-1 decodes every byte, so that numbers and ASCII names remain readable
-    return _ENCODINGS[min(candidates)[2]] if candidates else "latin-1"
-
-
-def detect_encoding_of_head(head: bytes) -> str:
-    """Return the encoding of a text from its first bytes: a Unicode encoding, UTF-8 by default."""
-    return _encoding_from_bom(head) or "utf-8"
-
-
-@contextmanager
-def open_as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
-    """Provide the text of a file in UTF-8, possibly with a byte order mark.
-
-    Zero bytes at the end, which some recorders write in advance, are removed.
-
-    Args:
-        path: file of the text.
-        encoding: encoding of the file; None detects it.
-
-    Yields:
-        `path` itself if it is UTF-8, otherwise a temporary copy that is deleted afterwards.
-
-    Raises:
-        DataError: if the file is not text in this encoding.
-    """
-    name = codecs.lookup(encoding or detect_encoding(path)).name
-    is_multibyte = name.startswith(("utf-16", "utf-32"))
-    with path.open("rb") as stream:
-        stream.seek(max(0, path.stat().st_size - 1))
-        has_trailing_zeros = not is_multibyte and stream.read() == b"\0"
-    if name in ("utf-8", "utf-8-sig", "ascii") and not has_trailing_zeros:
-        yield path
-        return
-    content = path.read_bytes()
-    content = content.rstrip(b"\0") if has_trailing_zeros else content
-    try:
-        # an incremental decoder ignores an incomplete character at the end
-        text = codecs.getincrementaldecoder(name)().decode(content)
-    except UnicodeError as error:
-        error_position = getattr(error, "start", 0)
-        raise DataError(
-            f"{path}: not {name.upper()} text (near byte {error_position}); save the file as UTF-8,"
-            " or give its `encoding`"
-        ) from error
-    with tempfile.TemporaryDirectory() as folder:
-        utf8_copy = Path(folder) / path.name
-        utf8_copy.write_bytes(text.encode("utf-8"))
-        yield utf8_copy
-
-
-def _encoding_from_bom(head: bytes) -> str | None:
-    """Return a Unicode encoding from the byte order mark or the zero bytes of UTF-16, else None."""
-    for mark, name in _BYTE_ORDER_MARKS.items():
-        if head.startswith(mark):
-            return name
-    if len(head) < 4 or b"\x00" not in head:
-        return None
-    byte_pairs = np.frombuffer(head[: len(head) // 2 * 2], dtype=np.uint8).reshape(-1, 2)
-    even_zero_share, odd_zero_share = (byte_pairs == 0).mean(axis=0)
-    if odd_zero_share > 0.5 and even_zero_share < 0.01:
-        return "utf-16-le"
-    return "utf-16-be" if even_zero_share > 0.5 and odd_zero_share < 0.01 else None
-
-
-def _find_non_utf8_block(stream: BinaryIO) -> bytes:
-    """Return the complete lines of the first block that is not UTF-8; empty if all blocks are."""
-    decoder = codecs.getincrementaldecoder("utf-8")()
-    while block := stream.read(_SCAN_BYTES):
-        try:
-            if not (block.isascii() and decoder.getstate()[0] == b""):
-                decoder.decode(block)
-        except UnicodeDecodeError:
-            return block[: block.rfind(b"\n") + 1] or block
-    return b""

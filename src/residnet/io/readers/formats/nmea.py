@@ -30,7 +30,7 @@ from residnet.io.readers.recording import (
     TimeStamps,
     build_recording,
 )
-from residnet.io.readers.text_tables import detect_encoding_of_head, open_as_utf8
+from residnet.io.readers.text_encoding import detect_encoding_of_head, open_as_utf8
 from residnet.io.readers.timestamps import parse_texts
 
 _SENTENCE = re.compile(rb"^(?P<before>[^$!]*)(?P<sentence>[$!][A-Z]{2}[A-Z0-9]{2,4},[\x20-\x7e]*)")

@@ -34,7 +34,7 @@ from residnet.io.readers.recording import (
     TimeStamps,
     build_recording,
 )
-from residnet.io.readers.text_tables import detect_encoding_of_head, open_as_utf8
+from residnet.io.readers.text_encoding import detect_encoding_of_head, open_as_utf8
 from residnet.io.readers.timestamps import parse_texts
 
 _HEX = r"[0-9A-Fa-f]"

@@ -34,7 +34,7 @@ from residnet.io.readers.recording import (
     build_recording,
     normalize_field_path,
 )
-from residnet.io.readers.text_tables import detect_encoding_of_head, open_as_utf8
+from residnet.io.readers.text_encoding import detect_encoding_of_head, open_as_utf8
 from residnet.io.readers.timestamps import (
     detect_unix_unit,
     infer_time_unit,
