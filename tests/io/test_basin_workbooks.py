@@ -13,7 +13,7 @@ import yaml
 
 import residnet
 from residnet.core.log import Log
-from residnet.io.readers.tables import read_excel_sheet
+from residnet.io.readers.excel_tables import read_excel_sheet
 from residnet.physics.actuators.steering_gear import simulate_gear
 
 DEGREES = 180.0 / np.pi

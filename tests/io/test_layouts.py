@@ -28,8 +28,9 @@ from residnet.io.drafting.tables import (
 )
 from residnet.io.header_vocabulary import match_input_channel, match_state_channel, parse_name
 from residnet.io.readers.clock_repair import repair_clock
+from residnet.io.readers.excel_tables import read_excel_sheet
 from residnet.io.readers.manoeuvre_kinds import infer_manoeuvre, match_manoeuvre_name
-from residnet.io.readers.tables import CsvConfig, read_excel_sheet
+from residnet.io.readers.tables import CsvConfig
 
 
 def round_to_digits(t: np.ndarray, digits: int) -> np.ndarray:

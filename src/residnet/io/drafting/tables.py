@@ -57,20 +57,15 @@ from residnet.io.header_vocabulary import (
 from residnet.io.readers.angles import AngleForm, LetterO, hemisphere_signs, parse_degrees
 from residnet.io.readers.base import require_file
 from residnet.io.readers.clock_repair import find_unique_rows, repair_clock
+from residnet.io.readers.excel_tables import join_excel_sheets, list_sheet_names, read_excel_sheet
+from residnet.io.readers.json_tables import read_json_head
 from residnet.io.readers.manoeuvre_kinds import match_manoeuvre_name
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
     QUATERNION,
     SINE_SUFFIX,
 )
-from residnet.io.readers.tables import (
-    TABLE_KINDS,
-    join_excel_sheets,
-    list_sheet_names,
-    read_excel_sheet,
-    read_json_head,
-    read_parquet_head,
-)
+from residnet.io.readers.tables import TABLE_KINDS, read_parquet_head
 from residnet.io.readers.text_tables import HeaderlessTableError, read_table_head
 from residnet.io.readers.timestamps import (
     detect_date_order,

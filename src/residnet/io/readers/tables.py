@@ -7,14 +7,11 @@ starboard, down); psi is unwrapped.
 from __future__ import annotations
 
 import codecs
-import json
-import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
+from typing import TYPE_CHECKING, ClassVar, Literal, final
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -24,13 +21,12 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.frames import rotate, unwrap_angle
 from residnet.core.log import Log, Remark, make_remark
 from residnet.core.names import suggest_name, truncate
-from residnet.core.units import canonical_unit, is_unit, to_si
+from residnet.core.units import canonical_unit, to_si
 from residnet.io.readers.angles import hemisphere_signs, parse_degrees
 from residnet.io.readers.base import (
     ConfiguredReader,
     ProgressCallback,
     describe_provenance,
-    optional_import,
     reading_progress,
     require_file,
     require_increasing,
@@ -39,6 +35,8 @@ from residnet.io.readers.base import (
     wrap_read_errors,
 )
 from residnet.io.readers.clock_repair import find_unique_rows, repair_clock
+from residnet.io.readers.excel_tables import join_excel_sheets, read_excel_sheet
+from residnet.io.readers.json_tables import JsonObjectReader
 from residnet.io.readers.manoeuvre_kinds import resolve_manoeuvre
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
@@ -55,13 +53,10 @@ from residnet.io.readers.quantities import (
     quaternion_tilt,
     quaternion_yaw,
 )
-from residnet.io.readers.text_encoding import open_as_utf8
 from residnet.io.readers.text_tables import (
     coerce_numeric,
     count_numbers,
     find_column_positions,
-    find_header,
-    make_names_unique,
     read_csv,
 )
 from residnet.io.readers.timestamps import DateOrder, parse_texts, parse_zone
@@ -86,14 +81,6 @@ TABLE_KINDS = {
 }
 """File extension -> `kind` of the reader for tables, which need a channel map."""
 FIX_CHANNELS = ("latitude", "longitude")
-_HEADER_SEARCH_ROWS = 60
-"""Rows of a sheet in which the header is searched."""
-_MIN_TABLE_COLUMNS = 3
-"""Smallest number of columns of a table that occurs several times in a sheet."""
-_MAX_LIST_COLUMNS = 16
-"""Longest JSON list whose entries become columns."""
-_MIN_TABLE_ROWS = 20
-"""Number of rows from which a second list in a JSON document counts as a table."""
 
 
 class TimeColumn(Config):
@@ -683,7 +670,7 @@ class JsonLinesConfig(TableConfig):
         """Read columns; an object without a key has an empty cell."""
         import pandas as pd
 
-        lines = _JsonObjectReader(path)
+        lines = JsonObjectReader(path)
         rows = list(lines)
         keys = {key for row in rows for key in row}
         for name in columns:
@@ -808,227 +795,6 @@ def _to_local_plane(
     return {"x": north, "y": east, **other_channels}, remarks
 
 
-def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.DataFrame:
-    """Read a sheet and detect its row of column names.
-
-    Args:
-        path: Excel file.
-        sheet: name of the sheet; None takes the first one.
-        rows: largest number of rows to read; None reads all.
-
-    Returns:
-        The cells below the header. `attrs` has `n_lines_above` (rows above the values) and
-        `unit_rows` (cells of the rows between names and values).
-
-    Raises:
-        UsageError: if the sheet does not exist.
-        DataError: if the file cannot be read, or the sheet has several tables.
-    """
-    import pandas as pd
-
-    names = list_sheet_names(path)
-    if sheet is not None and sheet not in names:
-        raise UsageError(f"{path}: no sheet '{sheet}'{suggest_name(sheet, names)}")
-    with wrap_read_errors(path, "an Excel file"):
-        cells = pd.read_excel(
-            path, sheet_name=sheet or 0, nrows=rows, engine="openpyxl", header=None
-        )
-    head_rows = [
-        ["" if pd.isna(cell) else str(cell).strip() for cell in row]
-        for row in cells.head(_HEADER_SEARCH_ROWS).itertuples(index=False)
-    ]
-    header_row, first_value_row = find_header(head_rows) or (0, 1)
-    # the names in the first rows made all columns object columns
-    table = cells.iloc[first_value_row:].infer_objects()
-    unit_rows = head_rows[header_row + 1 : first_value_row]
-    names = head_rows[header_row] if head_rows else []
-    if header_row > 0 and _is_unit_row(names):
-        unit_rows = head_rows[header_row:first_value_row]
-        names = _join_grouped_names(head_rows[:header_row])
-    _refuse_several_tables(path, table, names, first_value_row)
-    table.columns = pd.Index(make_names_unique(names))
-    table = _convert_decimal_commas(table.dropna(how="all"))
-    table.attrs |= {
-        "n_lines_above": first_value_row,
-        "unit_rows": unit_rows,
-    }
-    return table
-
-
-def _refuse_several_tables(
-    path: Path, table: pd.DataFrame, names: Sequence[str], first_value_row: int
-) -> None:
-    """Refuse a sheet with several tables of the same columns, such as a table for each test.
-
-    Args:
-        path: Excel file.
-        table: cells below the column names.
-        names: column names.
-        first_value_row: number of rows above the values.
-
-    Raises:
-        DataError: if the column names occur again in a later row, or further right.
-    """
-    filled = [name for name in names if name]
-    if len(filled) < _MIN_TABLE_COLUMNS:
-        return
-    instruction = "copy each table to a separate file, and give the folder of the files"
-    first_name = names.index(filled[0])
-    is_repeated = table.iloc[:, first_name].map(lambda cell: str(cell).strip() == filled[0])
-    for position in is_repeated.to_numpy().nonzero()[0]:
-        cells = [str(cell).strip() for cell in table.iloc[position]]
-        if all(name in ("", cell) for name, cell in zip(names, cells, strict=True)):
-            raise DataError(
-                f"{path}: row {first_value_row + position + 1} has the column names again"
-                f" ('{filled[0]}', '{filled[1]}', ...), a sheet has one log; {instruction}"
-            )
-    half = len(filled) // 2
-    if half >= _MIN_TABLE_COLUMNS and filled[0] in filled[1:]:
-        width = filled.index(filled[0], 1)
-        if width >= _MIN_TABLE_COLUMNS and all(
-            name == filled[k % width] for k, name in enumerate(filled)
-        ):
-            raise DataError(
-                f"{path}: has {len(filled) // width} tables side by side, each with '{filled[0]}',"
-                f" '{filled[1]}', ..., a sheet has one log; {instruction}"
-            )
-
-
-def _is_unit_row(row: Sequence[str]) -> bool:
-    """Return whether all filled cells of a row are units, some of them in brackets."""
-    return all(is_unit(cell.strip("[]()")) for cell in row if cell)
-
-
-def _join_grouped_names(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return column names from the rows above the units.
-
-    The last row has the names. Where it is incomplete, the row before it names groups of columns in
-    merged cells, of which the first one is filled: `Position` above `X`, `Y`.
-
-    Args:
-        rows: cells of the rows above the units, at least one row.
-    """
-    lower_names = list(rows[-1])
-    if all(lower_names) or len(rows) < 2:
-        return lower_names
-    names = []
-    group = ""
-    for group_cell, name in zip(rows[-2], lower_names, strict=True):
-        group = group_cell or (group if name else "")
-        names.append(f"{group} {name}".strip())
-    return names
-
-
-_DECIMAL_COMMA = re.compile(r"\s*[-+]?\d+(,\d+)?([eE][-+]?\d+)?\s*")
-"""A number in a cell of text, with a decimal comma or none."""
-_CLEAR_COMMA = re.compile(r"\s*[-+]?(0,\d+|\d+,(\d{1,2}|\d{4,})([eE].*)?)\s*")
-"""A number whose comma cannot separate thousands."""
-
-
-def _convert_decimal_commas(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table whose columns of texts such as `1,091` are numbers.
-
-    A number has no decimal sign in a cell of Excel unless it is a text. A comma before three digits
-    may also separate thousands, so that one column has to have a clear decimal comma.
-    """
-    import pandas as pd
-
-    converted: dict[int, pd.Series] = {}
-    has_clear_comma = False
-    for position, (_, column) in enumerate(table.items()):
-        if not pd.api.types.is_object_dtype(column) and not pd.api.types.is_string_dtype(column):
-            continue
-        texts = column[column.map(lambda cell: isinstance(cell, str))]
-        if texts.empty or not texts.map(lambda text: "," in text).any():
-            continue
-        if texts.map(lambda text: _DECIMAL_COMMA.fullmatch(text) is not None).all():
-            has_clear_comma |= bool(
-                texts.map(lambda text: _CLEAR_COMMA.fullmatch(text) is not None).any()
-            )
-            numbers = column.map(
-                lambda cell: float(cell.replace(",", ".")) if isinstance(cell, str) else cell
-            )
-            converted[position] = pd.to_numeric(numbers, errors="coerce")
-    if not has_clear_comma:
-        return table
-    columns = [
-        converted.get(position, column) for position, (_, column) in enumerate(table.items())
-    ]
-    result: pd.DataFrame = pd.concat(columns, axis=1)
-    result.columns = table.columns
-    return result
-
-
-def join_excel_sheets(path: Path, tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Join the sheets of one recording: their rows in order of time, equal times in one row.
-
-    Args:
-        path: Excel file.
-        tables: sheets by name; the first column of each is the time.
-
-    Returns:
-        The joined table; a column is empty in rows of other sheets. `attrs` are those of
-        `read_excel_sheet`.
-
-    Raises:
-        DataError: if the sheets have different names of their first columns, or a common further
-            column.
-    """
-    import pandas as pd
-
-    parts = []
-    column_names: list[str] = []
-    unit_rows: list[list[str]] = []
-    time_name = ""
-    for name, table in tables.items():
-        names = [str(column) for column in table.columns]
-        if not time_name:
-            time_name = names[0]
-            column_names = [time_name]
-        if names[0] != time_name:
-            raise DataError(
-                f"{path}: the first column of sheet '{name}' is '{names[0]}', expected the time"
-                f" '{time_name}' like in sheet '{next(iter(tables))}'; give the sheets the same"
-                " column of time"
-            )
-        common_names = set(names[1:]) & set(column_names)
-        if common_names:
-            raise DataError(
-                f"{path}: column '{min(common_names)}' is in sheet '{name}' and in an earlier one;"
-                " rename it in one of them"
-            )
-        for k, units in enumerate(table.attrs["unit_rows"]):
-            if k == len(unit_rows):
-                # the first sheet gives the unit of the time
-                unit_rows.append(list(units[:1]))
-            missing = len(column_names) - len(unit_rows[k])
-            unit_rows[k] += [*[""] * missing, *units[1:]]
-        column_names += names[1:]
-        timed = table.copy()
-        timed.attrs = {}
-        timed[time_name] = pd.to_numeric(timed[time_name], errors="coerce")
-        timed = timed.dropna(subset=[time_name])
-        # merging needs unique keys
-        parts.append(timed.drop_duplicates(time_name).set_index(time_name))
-    joined: pd.DataFrame = pd.concat(parts, axis=1).sort_index().reset_index(names=time_name)
-    first_table = next(iter(tables.values()))
-    joined.attrs = {"n_lines_above": first_table.attrs["n_lines_above"], "unit_rows": unit_rows}
-    return joined
-
-
-def list_sheet_names(path: Path) -> list[str]:
-    """Return the names of the sheets of an Excel file, in order.
-
-    Raises:
-        UsageError: if openpyxl is not installed.
-        DataError: if the file cannot be read.
-    """
-    with optional_import("excel", "openpyxl", "an Excel sheet"):
-        import openpyxl
-    with wrap_read_errors(path, "an Excel file"):
-        return [str(name) for name in openpyxl.load_workbook(path, read_only=True).sheetnames]
-
-
 def _read_parquet_names(path: Path) -> list[str]:
     import pyarrow.parquet as pq
 
@@ -1059,16 +825,6 @@ def read_parquet_head(path: Path, rows: int) -> pd.DataFrame:
         return table
 
 
-def read_json_head(path: Path, rows: int) -> pd.DataFrame:
-    """Return the first rows of a JSON table, with a column for each key."""
-    import pandas as pd
-
-    objects = list(islice(_JsonObjectReader(path), rows))
-    if not objects:
-        raise DataError(f"{path}: the file is empty; one JSON object per line was expected")
-    return coerce_numeric(pd.DataFrame(objects).infer_objects())
-
-
 def read_column_names(path: Path) -> tuple[str, ...]:
     """Return a key that is equal for tables with the same columns.
 
@@ -1084,132 +840,3 @@ def read_column_names(path: Path) -> tuple[str, ...]:
     # the numbers of tables without a line of names differ from file to file
     n_numbers = count_numbers(line)
     return (f"{n_numbers} columns of numbers" if n_numbers > 1 else line,)
-
-
-@final
-class _JsonObjectReader:
-    """Iterator over the flattened objects of a JSON file; nested keys become `nav.lat`, `q[0]`."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.is_truncated = False
-
-    def __iter__(self) -> Iterator[dict[str, Any]]:
-        n_objects = 0
-        with open_as_utf8(self._path) as file, file.open("rb") as stream:
-            if (table := _parse_json_table(self._path, file)) is not None:
-                yield from map(_flatten_json, table)
-                return
-            for line_number, line in enumerate(stream, start=1):
-                text = line.decode("utf-8-sig", errors="replace").strip()
-                try:
-                    if text:
-                        value = json.loads(text)
-                        if not isinstance(value, dict):
-                            raise ValueError("no object")
-                        yield from _expand_signal_k(value)
-                        n_objects += 1
-                except (ValueError, RecursionError) as error:
-                    # the last line is incomplete if the recorder was switched off
-                    self.is_truncated = n_objects > 0 and not line.endswith(b"\n")
-                    if self.is_truncated:
-                        return
-                    raise DataError(
-                        f"{self._path}: line {line_number}, '{truncate(text, 60)}', is no JSON"
-                        " object; give files with one object per line"
-                    ) from error
-
-
-def _parse_json_table(path: Path, file: Path) -> Sequence[Mapping[str, Any]] | None:
-    """Return the rows of the table in a JSON document; None if the file has one object per line.
-
-    Raises:
-        DataError: if the document contains no table or several.
-    """
-    if path.suffix.lower() != ".json":
-        return None
-    try:
-        document = json.loads(file.read_text("utf-8-sig", errors="replace"))
-    except (ValueError, RecursionError):
-        return None
-    tables = dict(_find_json_tables(document))
-    if not tables:
-        raise DataError(
-            f"{path}: contains no table; a list of objects, or named lists of equal length, were"
-            " expected"
-        )
-    longest_name = max(tables, key=lambda name: len(tables[name]))
-    other_names = [
-        name
-        for name, rows in tables.items()
-        if len(rows) >= _MIN_TABLE_ROWS and name != longest_name
-    ]
-    if other_names:
-        table_sizes = ", ".join(
-            f"{name} ({len(tables[name])} rows)" for name in [longest_name, *other_names]
-        )
-        raise DataError(
-            f"{path}: contains several tables, {table_sizes}; write each with its time to a"
-            " separate file: files whose names differ in one word only are read as one log"
-        )
-    return tables[longest_name]
-
-
-def _find_json_tables(
-    value: Any, name: str = ""
-) -> Iterator[tuple[str, Sequence[Mapping[str, Any]]]]:
-    """Yield name and rows of each table in a JSON value.
-
-    A table is a list of objects, or a group of named lists of equal length.
-    """
-    if isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
-        yield name, value
-    if not isinstance(value, dict):
-        return
-    columns = {key: cells for key, cells in value.items() if isinstance(cells, list)}
-    plain_columns = {
-        n: c for n, c in columns.items() if not any(isinstance(cell, dict) for cell in c)
-    }
-    max_length = max(map(len, plain_columns.values()), default=0)
-    plain_columns = {key: cells for key, cells in plain_columns.items() if len(cells) == max_length}
-    if len(plain_columns) > 1:
-        yield (
-            name,
-            [
-                dict(zip(plain_columns, row, strict=True))
-                for row in zip(*plain_columns.values(), strict=True)
-            ],
-        )
-    for key, child in value.items():
-        yield from _find_json_tables(child, f"{name}.{key}" if name else str(key))
-
-
-def _expand_signal_k(value: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of an object: one, or one for each update of a Signal K message."""
-    updates = value.get("updates")
-    if not isinstance(updates, list) or "context" not in value:
-        yield _flatten_json(value)
-        return
-    for update in updates:
-        values_by_path = {entry["path"]: entry["value"] for entry in update.get("values", [])}
-        yield _flatten_json({"timestamp": update.get("timestamp")} | values_by_path)
-
-
-def _flatten_json(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the numbers and texts of a nested object, by keys such as `nav.lat` and `q[0]`."""
-    flattened: dict[str, Any] = {}
-    if value.get("type") == "Point" and isinstance(value.get("coordinates"), list):
-        # GeoJSON, RFC 7946, section 3.1.1
-        coordinates = zip(("longitude", "latitude"), value["coordinates"], strict=False)
-        value = dict(coordinates)
-    for key, entry in value.items():
-        name = f"{prefix}{key}"
-        if isinstance(entry, dict):
-            flattened |= _flatten_json(entry, f"{name}.")
-        elif isinstance(entry, list):
-            # longer lists are scans or images, not channels
-            entry = entry if len(entry) <= _MAX_LIST_COLUMNS else []
-            flattened |= _flatten_json({f"{name}[{i}]": part for i, part in enumerate(entry)})
-        else:
-            flattened[name] = entry
-    return flattened
