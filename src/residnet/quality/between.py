@@ -28,7 +28,6 @@ from residnet.quality.consensus import (
     Consensus,
     find_consensus,
     find_dead_steering,
-    rank_hypotheses,
 )
 from residnet.quality.excitation import compute_condition_number, format_names
 from residnet.quality.findings import (
@@ -39,6 +38,7 @@ from residnet.quality.findings import (
     format_quantity,
     format_share,
 )
+from residnet.quality.outlier_causes import rank_hypotheses
 from residnet.quality.statistics import (
     MIN_TURN_SHARE,
     MOTION_CHANNELS,
