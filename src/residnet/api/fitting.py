@@ -104,8 +104,7 @@ class FreeRuns:
         """One row for each log, protocol, model, window and time step.
 
         Columns: log, protocol, model, window, t (s, clock of the log), usable, diverged; measured
-            u,
-        v (m/s), r (rad/s), psi (rad), x, y (m); predicted states with the suffix `_hat`.
+        states u, v (m/s), r (rad/s), psi (rad), x, y (m); predicted ones with the suffix `_hat`.
         """
         import pandas as pd
 
@@ -197,7 +196,7 @@ class FreeRuns:
                 f" {window}"
             )
         stored_window = (
-            max(windows_of_log, key=lambda one: len(one.t))
+            max(windows_of_log, key=lambda candidate: len(candidate.t))
             if window is None
             else windows_of_log[window]
         )

@@ -102,7 +102,14 @@ _POWER_SPELLINGS = {"²": "^2", "³": "^3", "**": "^", "⁻": "^-", "¹": "1"}
 
 @cache
 def unit_confusions(si: str) -> dict[float, str]:
-    """Return the scale factor of each confusion of two units of a dimension -> description."""
+    """Return the factors by which values are wrong if a unit is taken for another one.
+
+    Args:
+        si: SI unit of the dimension.
+
+    Returns:
+        Factor -> description such as `deg taken as rad`.
+    """
     factors = _FACTORS_OF_DIMENSION.get(si, {})
     confusions = dict[float, str]()
     for reference_unit in (si.replace("rad", "deg"), si):

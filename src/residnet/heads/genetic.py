@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
 @final
 class GeneticHead(EquationHead):
-    """Head with the residual terms(features) coefficients.
+    """Head whose residual is the sum of coefficients times expressions of the features.
 
-    With the baseline `still` it is an equation of the acceleration.
+    With the baseline `still`, whose acceleration is zero, it is an equation of the acceleration.
     """
 
     def __init__(self, config: GeneticConfig, names: Sequence[str]) -> None:
@@ -82,7 +82,11 @@ class GeneticHead(EquationHead):
         return [self._add_lack_of_fit(solution, samples) for solution in solutions]
 
     def _add_lack_of_fit(self, solution: Solution, samples: Samples) -> Solution:
-        """Add the lack of fit of the usual candidates and the terms of a solution to its notes."""
+        """Add a test for missing terms to the notes of a solution.
+
+        The test asks whether functions of the features (`probes`) explain what the candidates of
+        sparse regression and the terms of the solution together do not.
+        """
         rows = select_test_rows(len(samples))
         z = self.features.select_clamped(samples.z[rows])
         target = samples.target[rows].numpy()
@@ -115,7 +119,7 @@ class GeneticHead(EquationHead):
     def _sparse_candidates(
         self, z: Tensor
     ) -> tuple[TermLibrary, Tensor, tuple[CandidateTerm, ...]]:
-        """Return the usual candidates of sparse regression.
+        """Return the candidates of a sparse regression with default settings.
 
         Returns:
             The library of J terms, whether each has no divisor near zero in the channels z [J], and

@@ -30,8 +30,10 @@ _MIN_GATE = 1e-13
 class GRUEnsembleHead(RenamedStateModule, ResidualHead):
     """Ensemble of K recurrent networks whose weights have a leading axis of size K.
 
-    Rows of z [K B, nz (+ n)] and s [K B, H] are K consecutive blocks of B rows, one per network.
-    The n innovations may be appended to the channels.
+    Rows of z and s [K B, H] are K consecutive blocks of B rows, one per network. In the measured
+    past, further columns follow the channels z [K B, nz]: the n innovations; with an encoder one
+    flag, which is 1 where the states are measured. Without these columns the states are
+    predictions, and innovations and flag are zero.
     """
 
     legacy_parameter_names: ClassVar[Mapping[str, str]] = {
@@ -97,19 +99,21 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
         return self.scale.std
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return residuals [K B, n] and the next memories at channels z [K B, nz (+ n or + 1)].
+        """Return residuals [K B, n] and the next memories [K B, n_state].
 
-        Innovations are zero, and states are predicted, if they are not appended to the channels.
+        Args:
+            z: channels, and innovations or flag in the measured past [K B, nz (+ n or + 1)].
+            s: memories [K B, n_state].
         """
-        z, appended = z.split([self.n_channels, z.shape[-1] - self.n_channels], dim=-1)
+        z, measured_columns = z.split([self.n_channels, z.shape[-1] - self.n_channels], dim=-1)
         inputs = self.features(z)
         if not self.has_encoder:
-            if appended.shape[-1] == 0:
+            if measured_columns.shape[-1] == 0:
                 innovation = torch.zeros_like(z[..., : self.n_dof])
             else:
                 # large innovations are outliers or faults: limit their effect smoothly
                 innovation = self.innovation_clip * torch.tanh(
-                    appended / (self.innovation_clip * self.scale.std.to(z.dtype))
+                    measured_columns / (self.innovation_clip * self.scale.std.to(z.dtype))
                 )
             inputs = torch.cat((inputs, innovation), dim=-1)
         inputs = inputs.view(self.batch_ensemble_size, -1, self.n_inputs)
@@ -120,15 +124,16 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
             self.hidden_weight,
             self.bias_hidden,
         )
-        if self.has_encoder and appended.shape[-1] > 0 and not self.is_decoding_only:
-            encoded = self.update_memory(
+        # the encoder has other weights, with which it updates the memory from measured states
+        if self.has_encoder and measured_columns.shape[-1] > 0 and not self.is_decoding_only:
+            encoded_memory = self.update_memory(
                 torch.baddbmm(self.encoder_bias, inputs, self.encoder_input_weight),
                 memory,
                 self.encoder_hidden_weight,
                 self.encoder_bias_hidden,
             )
-            is_measured = appended.view(self.batch_ensemble_size, -1, 1)
-            next_memory = next_memory + is_measured * (encoded - next_memory)
+            is_measured = measured_columns.view(self.batch_ensemble_size, -1, 1)
+            next_memory = next_memory + is_measured * (encoded_memory - next_memory)
         network_output = torch.baddbmm(
             torch.baddbmm(self.bias_out, inputs, self.skip_weight),
             next_memory[..., : self.hidden_size],
@@ -159,7 +164,9 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
         self.training_gain = gain
 
     def clip_member_gradients(self, max_norm: float) -> None:
-        """Limit the norm of the gradient of each network, so that none slows down the others.
+        """Limit the norm of the gradient of each network.
+
+        A common limit would reduce the steps of all networks because of the gradient of one.
 
         Args:
             max_norm: largest norm of the gradient of a network's own loss; the loss of the ensemble
@@ -189,21 +196,21 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
             all_gates = input_gates + torch.bmm(hidden, hidden_weight)
             gates, candidate = all_gates.split([3 * size, size], dim=-1)
             forget_gate, input_gate, output_gate = torch.sigmoid(gates).chunk(3, dim=-1)
-            target = input_gate * torch.tanh(candidate + bias_hidden)
+            cell_input = input_gate * torch.tanh(candidate + bias_hidden)
             if self.step_ratio == 1.0:
-                cell = forget_gate * cell + target
+                cell = forget_gate * cell + cell_input
             else:
-                # the cell relaxes towards target / (1 - forget_gate), for a step of another length
+                # a step of another length: the cell relaxes towards cell_input / (1 - forget_gate)
                 forgotten = (1.0 - forget_gate).clamp(min=_MIN_FORGOTTEN_SHARE)
                 retained = torch.exp(self.step_ratio * torch.log(1.0 - forgotten))
-                cell = retained * cell + (1.0 - retained) / forgotten * target
+                cell = retained * cell + (1.0 - retained) / forgotten * cell_input
             return torch.cat((output_gate * torch.tanh(cell), cell), dim=-1)
         gates, candidate = input_gates.split([2 * size, size], dim=-1)
         hidden_gates, hidden_candidate = torch.bmm(memory, hidden_weight).split(
             [2 * size, size], dim=-1
         )
         update_gate, reset_gate = torch.sigmoid(gates + hidden_gates).chunk(2, dim=-1)
-        # the gate is the share retained over the training step; take its root for shorter steps
+        # the gate is the share retained over a training step; other steps retain a power of it
         if self.step_ratio != 1.0:
             update_gate = torch.exp(
                 self.step_ratio * torch.log(update_gate.clamp(min=self.min_gate))

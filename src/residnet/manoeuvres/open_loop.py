@@ -100,9 +100,10 @@ class AccelerationDeceleration(ScheduledManoeuvre):
 
 
 class AccelerationDecelerationFamily(ManoeuvreFamily):
-    """Random steps between a high and a low level, each uniform in its range.
+    """Random steps between a high and a low level, each drawn uniformly in its range.
 
-    Successive high levels are 1, 3/4 and 1/2 of the drawn one.
+    High and low levels alternate. The first high level is the drawn one, the next two are 3/4 and
+    1/2 of it, and so on in turn.
 
     Attributes:
         high: range of the high level of the propulsion command.
@@ -198,7 +199,8 @@ def _check_band(band: tuple[float, float]) -> tuple[float, float]:
 
 FrequencyBand = Annotated[tuple[Hertz, Hertz], AfterValidator(_check_band)]
 """Lowest and highest frequency."""
-# numbers of the random waves of a manoeuvre; those of single commands follow
+# indices of the independent random waves of a manoeuvre: one for each demand, then one for each
+# command of the vessel; they select the random numbers of a wave
 _DRIVE, _STEER, _SWAY, _DIVE, _FIRST_COMMAND_WAVE = range(5)
 
 
@@ -231,7 +233,7 @@ class Excitation(ScheduledManoeuvre, ABC):
 
     @abstractmethod
     def _demand_wave(self, t: Tensor, wave_index: int) -> Tensor:
-        """Return the wave [T] within +-1 of a demand at times t [T] since the start in s."""
+        """Return a wave [T] between -1 and 1 at times t [T] since the start in s."""
 
     def _delayed_wave(self, t: Tensor, wave_index: int) -> Tensor:
         """Return a wave [T] at times t [T] in s, zero before the start."""

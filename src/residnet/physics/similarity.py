@@ -400,7 +400,8 @@ def _list_alternatives(annotation: Any) -> list[Any]:
 def _dimension_of_parameter(unit: str) -> Dimension:
     """Return the dimension of an SI unit of a vessel file, such as kg m/s; dimensionless if none.
 
-    The exponent of the mass is not part of the text of a unit in newtons, so that it is tried.
+    `parse_dimension` needs the exponent of the mass, since a newton contains a kilogram. It is 0
+    or 1 in vessel files.
     """
     for mass_power in (0, 1):
         powers = parse_dimension(unit, mass_power)
@@ -517,12 +518,17 @@ def estimate_lateral_dynamics(particulars: Particulars) -> list[list[float]] | N
     coupling = static_moment + added_mass.sway_yaw
     transposed_coupling = static_moment + added_mass.yaw_sway
     yaw_inertia = inertia + added_mass.yaw
-    unit = 0.5 * particulars.density * length**2 * speed
-    sway_forces = (derivatives["Y_v"] * unit, derivatives["Y_r"] * unit * length - mass * speed)
-    yaw_moments = (
-        derivatives["N_v"] * unit * length,
-        derivatives["N_r"] * unit * length**2 - static_moment * speed,
+    # unit of Y_v in the prime I system
+    unit_of_damping = 0.5 * particulars.density * length**2 * speed
+    sway_forces = (
+        derivatives["Y_v"] * unit_of_damping,
+        derivatives["Y_r"] * unit_of_damping * length - mass * speed,
     )
+    yaw_moments = (
+        derivatives["N_v"] * unit_of_damping * length,
+        derivatives["N_r"] * unit_of_damping * length**2 - static_moment * speed,
+    )
+    # accelerations M^-1 F of the 2 x 2 mass matrix of sway and yaw
     determinant = sway_mass * yaw_inertia - coupling * transposed_coupling
     columns = list(zip(sway_forces, yaw_moments, strict=True))
     return [

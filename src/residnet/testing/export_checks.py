@@ -86,8 +86,8 @@ def check_bad_inputs(
     Each case is a short free run. At one step, elements of the state, the inputs or the memory are
     NaN, infinite or far outside the training range. All results must be finite. The flag must be
     set for values outside the range and its margin or outside the operating domain, and for no
-    others. Unflagged results must equal the results
-    of the model, and results after the bad step must not depend on it.
+    others. Unflagged results must equal the results of the model, and results after the bad step
+    must not depend on it.
 
     Args:
         exported: an object with the methods `initial_state`, `warmup`, `step` and `rollout` of

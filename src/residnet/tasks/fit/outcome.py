@@ -57,8 +57,8 @@ def write_inspection(
     begin_stage("examining logs")
     inputs = config.signals.regressor_columns
     masks = (*config.prepare.masks, SpikeMask())
-    logs = [log for members in splits.values() for log in members]
-    split_of = {log.name: split for split, members in splits.items() for log in members}
+    logs = [log for logs_of_split in splits.values() for log in logs_of_split]
+    split_of = {log.name: split for split, split_logs in splits.items() for log in split_logs}
     reports = [inspect_log(log, inputs, masks) for log in logs]
     joint_report = inspect_log_set(logs, inputs, split_of)
     for report in reports:
@@ -123,7 +123,9 @@ def write_evaluation(
         },
     )
     folder.write_record(folder.limits, limits)
-    quality = [_summarize_log(log, split) for split, members in logs.items() for log in members]
+    quality = [
+        _summarize_log(log, split) for split, split_logs in logs.items() for log in split_logs
+    ]
     folder.write_record(folder.data_quality, DataQualityFile(tuple(quality)))
 
 
