@@ -79,7 +79,7 @@ def test_a_refit_leaves_the_old_run_alone_and_can_be_exported(
     (change,) = found["changes"]
     assert change["cause"] == "gain n_stbd"
     assert found["worth_taking"]
-    assert "IS worth taking" in said.out
+    assert "significantly better and selected" in said.out
     metrics = read_json(out / "metrics.json")
     assert metrics["selected"] == "baseline_refit"
     assert {row["model"] for row in metrics["rows"]} == {

@@ -335,6 +335,7 @@ def write_rollout_source(
         The C code, the layout of the values that a step stores for its gradient, and the layout of
         the cotangents of products.
     """
+    # arrays of the file: sizes of products, offsets of their matrices, strides of arguments
     step = to_scalar_function(parts.function)
     _require_compilable(step)
     products = dict(enumerate(parts.products))
@@ -365,6 +366,7 @@ def write_rollout_source(
     stored_pointers = dict[str, str]()
     shared_cotangents = dict[str, str]()
     backward = list[str]()
+    # the gradient: which values a step stores for it, and the function that uses them
     if trained_indices is not None:
         single_products = [k for k in matrices if products[k].n_repeats == 1]
         vjp_function, shared_cotangents = _vector_jacobian_function(
@@ -399,6 +401,7 @@ def write_rollout_source(
                 ("x_before", "gradient"),
             )
         ]
+    # the step: it writes stored values to the history, and all others to local arrays
     forward = stored_pointers | {
         name: local(name)
         for name in sizes_by_name
@@ -411,6 +414,7 @@ def write_rollout_source(
         calls("times", "factor_{}", "product_{}"),
         forward,
     )
+    # sizes as macros, which the loops over steps and rows use
     n_theta = len(trained_indices or ())
     counts = dict(sizes) | {
         "history": count_stored_values(forward_storage),

@@ -260,6 +260,7 @@ def compute_derivatives(
     baseline = _require_planar_baseline(spec, model)
     input_names = list(spec.signals.input_columns)
     particulars = _complete_particulars(baseline, particulars)
+    # operating point, mass matrix and monomials of the Taylor series of the force
     point = _find_operating_point(spec, model, baseline, input_names, particulars.speed)
     mass_of, source = _choose_mass_matrix(baseline, particulars)
     variables = _expansion_variables(spec, input_names)
@@ -276,6 +277,7 @@ def compute_derivatives(
     )
 
     def coefficients(theta: Tensor) -> Tensor:
+        """Return the coefficients of all monomials [M, 3] for parameters theta."""
         taylor = _taylor_coefficients(lambda q: force(theta, q), variables, smooth_monomials, order)
         if not modulus_columns:
             return taylor
@@ -283,6 +285,7 @@ def compute_derivatives(
         modulus = mass_of(theta) @ (theta * baseline.term_mask)[:, list(modulus_columns)]
         return torch.cat((taylor, modulus.T))
 
+    # values, and their standard errors by propagation of the covariance of the parameters
     theta = baseline.theta.detach().double()
     values = coefficients(theta)
     parameter_covariance = _to_covariance(baseline, covariance)
@@ -292,6 +295,7 @@ def compute_derivatives(
         errors, first_order_covariance = _propagate_covariance(
             coefficients, theta, baseline.free_indices(), parameter_covariance, 1 + len(variables)
         )
+    # rows at the target scale, without terms that are negligible on their axis
     full_scale = particulars.scaled(scale, density_ratio)
     is_force = source != "unknown"
     rows: list[DerivativeRow] = []

@@ -324,9 +324,10 @@ def plan_trials(
     horizon = round(refit_config.horizon / spec.dt)
     state_scales = torch.from_numpy(state_scales_array)
     manoeuvres = propose_manoeuvres(trial_limits, spec.signals.dof)
-    # manoeuvres of the same class are simulated as one batch
+    # simulate all candidates and keep those within the limits; manoeuvres of the same class are
+    # simulated as one batch
     all_candidates = PredictionGoal(
-        sorted(manoeuvres, key=lambda one: one.kind), trial_limits.time, {}
+        sorted(manoeuvres, key=lambda manoeuvre: manoeuvre.kind), trial_limits.time, {}
     )
     simulated_trajectories = [
         (simulated_run, *_to_trajectory(simulated_run, spec.signals))
@@ -345,11 +346,13 @@ def plan_trials(
     grams = sensitivity_information(
         model, [(states, w) for _, states, w in allowed_trajectories], horizon, state_scales
     )
-    # Errors of successive samples are correlated over `correlation` seconds: a sample counts as
-    # dt / correlation independent ones. Information is in units of the residual variance.
+    # Information of each candidate. Errors of successive samples are correlated over `correlation`
+    # seconds: a sample counts as dt / correlation independent ones. The unit is the inverse of the
+    # residual variance.
     information_per_gram = (
         spec.dt / refit_config.correlation / max(refit_uncertainty.mean_square_error, 1e-12)
     )
+    # weights of the parameters in the predictions whose intervals are to be reduced
     goal_weights = grams.sum(dim=0)
     if prediction_goal is not None:
         goal_trajectories = [
@@ -366,6 +369,7 @@ def plan_trials(
             f" predict, or it cannot simulate them for {refit_config.horizon:g} s; add logs that"
             " cover their speeds and rudder angles, or shorten refit.horizon"
         )
+    # benefit of each candidate alone, then the greedy selection of several
     trials = []
     for (simulated_run, states, _), gram in zip(allowed_trajectories, grams, strict=True):
         duration_minutes = (len(states) - 1) * spec.dt / 60.0

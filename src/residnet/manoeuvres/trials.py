@@ -154,6 +154,7 @@ def simulate_manoeuvres(
     ]
     n_steps = max(max_steps_by_trial)
     times = torch.arange(n_steps, dtype=torch.float64) * dt
+    # inputs that the manoeuvre does not command: disturbances of a plant, wind of a learned model
     generator = np.random.default_rng([environment.seed, 3])
     source = make_manoeuvre_source(manoeuvres, vessel.helm, times)
     if environment.plant is not None:
@@ -191,6 +192,7 @@ def simulate_manoeuvres(
     channel_names = list_logged_channels(
         vessel.helm.state, vessel.helm.inputs[: vessel.n_commands], environment.disturbance
     )
+    # one log for each manoeuvre, up to its stop condition
     runs = []
     for i, (manoeuvre, log_name) in enumerate(
         zip(manoeuvres, make_log_names(manoeuvres), strict=True)

@@ -621,13 +621,14 @@ class ResponseDelay:
         delay: delay in s; negative if the response precedes the input.
         standard_error: standard error of the delay in s.
         improvement: residual sum of squares without the shift over that with it.
-        late_answer_ratio: residual sum of squares of the best causal shift over the smallest one.
+        causal_ratio: residual sum of squares of the best shift with which the response does not
+            precede the input, over that of the best shift of all.
     """
 
     delay: float
     standard_error: float
     improvement: float
-    late_answer_ratio: float
+    causal_ratio: float
 
 
 def estimate_delays(
@@ -737,6 +738,7 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], velocity: str) -> R
     Returns:
         None if the log is too short or the best shift is at the end of the range.
     """
+    # blocks that remain within the log for every shift, without a seam of two stretches
     step = log.sampling_interval
     blocks = log.cached(make_blocks, velocity)
     max_shift = max(2 * blocks.length, round(3.0 / step))
@@ -806,6 +808,7 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], velocity: str) -> R
                 zip(shift_batch.tolist(), (residuals**2).sum(axis=1).tolist(), strict=True)
             )
 
+    # a coarse grid over the range, then a fine grid around its best local minima
     evaluate_shifts(
         round(k * max_shift / _N_SHIFTS_PER_SIDE)
         for k in range(-_N_SHIFTS_PER_SIDE, _N_SHIFTS_PER_SIDE + 1)
@@ -829,7 +832,8 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], velocity: str) -> R
     best_sum_of_squares = max(
         float(squared_residuals_by_shift[best_shift][is_finite].sum()), 1e-300
     )
-    late_ratio = (
+    # a large ratio is evidence that the response precedes the input: no causal shift fits as well
+    causal_ratio = (
         min(
             value
             for shift, value in sum_of_squares_by_shift.items()
@@ -841,7 +845,7 @@ def estimate_delay(log: LogStatistics, names: Sequence[str], velocity: str) -> R
         best_shift * step,
         standard_error,
         float(squared_residuals_by_shift[0][is_finite].sum()) / best_sum_of_squares,
-        late_ratio,
+        causal_ratio,
     )
 
 
@@ -860,9 +864,7 @@ def check_acausal_response(log: LogStatistics, make_finding: Check) -> Iterator[
     """
     for (channels, velocity), (names, delay) in log.cached(estimate_delays).items():
         lead_time = -delay.delay
-        is_significant = (
-            delay.improvement > 1.35 and delay.late_answer_ratio > _MAX_EQUIVALENT_RATIO
-        )
+        is_significant = delay.improvement > 1.35 and delay.causal_ratio > _MAX_EQUIVALENT_RATIO
         if is_significant and lead_time > max(
             MIN_LEAD_TIME, 1.5 * log.sampling_interval, 3.0 * delay.standard_error
         ):

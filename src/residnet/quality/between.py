@@ -438,6 +438,7 @@ def _excitation_ratio(log: LogStatistics, name: str) -> float:
 @check("between", "no_excitation", fix="record manoeuvres: zigzag, 3-2-1-1")
 def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     """Report missing or collinear excitation in the set of logs."""
+    # do the vessels move, and turn to both sides?
     n_logs = len(logs.logs)
     velocities = [name for name in VELOCITY_NAMES if name in logs]
     subsamples = [log.subsample for log in logs.logs]
@@ -468,6 +469,7 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
             level: Level = "will mislead" if n_logs > 1 else "note"
             fix = "add turns to both sides: zigzag, 3-2-1-1"
             yield make_finding(text, {"port": port_share}, code="one_side", level=level, fix=fix)
+    # do the inputs vary?
     driving_inputs = [name for name in logs.inputs if not name.startswith(("wind", "current"))]
     max_spread_within_logs = {
         name: max(_relative_spread(log[name]) for log in subsamples) for name in driving_inputs
@@ -500,7 +502,7 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     varying_channels = [
         name for name in (*velocities, *driving_inputs) if name not in constant_inputs
     ]
-    # evenly spread samples suffice for the condition number
+    # are velocities and inputs collinear? Evenly spread samples suffice for the condition number
     sample_stride = -(-sum(len(log) for log in subsamples) // MAX_SAMPLES_IN_MEMORY)
     columns = np.concatenate(
         [log.log.stack(varying_channels)[::sample_stride] for log in subsamples]

@@ -224,6 +224,7 @@ def draft_fit_config(
             f"{paths[0]}: --{key[-1]} ({'.'.join(key)}) applies to tables of text that are one log"
             " each; these logs do not use it, leave it out"
         )
+    # inputs of the model
     inputs = choose_inputs(list(draft_logs.complete_logs.values()), draft_notes)
     _note_missing_inputs(inputs, draft_logs, draft_notes)
     missing_text = _explain_missing_steering(
@@ -246,6 +247,7 @@ def draft_fit_config(
     from residnet.preprocessing.prepare import PrepareConfig
     from residnet.tasks.fit.config import FitConfig
 
+    # masks, channels and preparation
     mask_settings = _choose_mask_settings(finding_codes, dof)
     masks = validate_config({"grid": {"step": 1.0}, **mask_settings}, PrepareConfig, "draft").masks
     preparation_recipe = PreparationPlan.from_logs(
@@ -266,6 +268,7 @@ def draft_fit_config(
     usable_logs = draft_logs.select_usable(
         (*inputs, *preparation_recipe.wind_channels), preparation
     )
+    # split of the logs, and the evaluation that their lengths allow
     root, split_entries = _split_logs(
         draft_logs, usable_logs, folder, draft_notes, holds_out_manoeuvres=naval is not None
     )

@@ -148,6 +148,7 @@ def draft_naval_sections(
     shares: dict[str, dict[str, str | float]] = {
         rudder: {"steer": f"{max(angle_deg, _IMO_RUDDER_DEG):g} deg", **gear}
     }
+    # all other inputs are constant during the manoeuvres
     drives = [name for name in inputs if name != rudder]
     for name in drives:
         level = float(np.median(np.concatenate([log[name] for log in logs])))
@@ -156,6 +157,7 @@ def draft_naval_sections(
             draft_notes.add_guess(
                 (*BOOKLET_KEY, "inputs", name), "held at its median in all manoeuvres"
             )
+    # standard manoeuvres at the tested rudder angle; durations scale with the time per length
     time_unit = naval.length / speed
     manoeuvres = _draft_manoeuvres(angle_deg, time_unit)
     if any(is_drive(name) and float(np.nanmin(log[name])) < 0.0 for log in logs for name in drives):

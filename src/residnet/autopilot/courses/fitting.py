@@ -382,6 +382,7 @@ class RouteProblem:
             self.cached_linearization[0], z
         ):
             return self.cached_linearization[1]
+        # distances of the buoys from the course, and their derivatives
         geometry = self.route(z)
         self.n_evaluations += 1
         last_circle = self.circles[-1]
@@ -401,6 +402,8 @@ class RouteProblem:
             nearest_points.distance_jacobian[:n_circles],
             side_column * nearest_points.abeam_jacobian[:n_circles],
         )
+        # a value above zero violates a constraint: circles are entered, or passed on their side
+        # and not too far outside
         for j, circle in enumerate(self.circles):
             if circle.turn_sign == 0:
                 constraints.append(
@@ -414,6 +417,7 @@ class RouteProblem:
                     _Constraint(j, passing_distance[j] - circle.radius, passing_jacobian[j]),
                     _Constraint(j, excess_distance, -passing_jacobian[j]),
                 ]
+        # other parts of the course do not cross a circle
         for k, part in enumerate(self.other_parts, start=n_circles):
             constraints.append(
                 _Constraint(
@@ -435,6 +439,7 @@ class RouteProblem:
                 _Constraint(n_circles - 1, goal_offset.real, alongside_jacobian),
                 _Constraint(n_circles - 1, -goal_offset.real, -alongside_jacobian),
             ]
+        # soft constraints: the passing is the part of the course that is nearest to a buoy
         n_hard = len(constraints)
         for k, part in enumerate(self.other_parts, start=n_circles):
             j = part.circle

@@ -95,6 +95,7 @@ def tune_parameters(
     evaluation = CandidateEvaluation(config, task, conditions, steps, compiler)
 
     def costs(points: np.ndarray, /) -> Any:
+        """Return the costs of candidates, given as logarithms of the tuned parameters [P, B]."""
         candidate_values = torch.from_numpy(np.exp(points.reshape(len(names), -1).T))
         candidates = {name: candidate_values[:, j] for j, name in enumerate(names)}
         candidates |= {
@@ -103,6 +104,7 @@ def tune_parameters(
         }
         return evaluation.mean_costs(candidates).numpy()
 
+    # without a parameter to tune, only the cost is computed
     if not names:
         fixed_candidate = {name: torch.tensor([value]).double() for name, value in fixed.items()}
         return TuningResult(fixed, float(evaluation.mean_costs(fixed_candidate)[0]), 1)
@@ -130,9 +132,8 @@ def tune_parameters(
     )
     if not result_de.fun < _DIVERGED_COST:
         raise FitError(
-            f"no {config.model_dump()['kind']} controller of {result_de.nfev} tried holds the"
-            " vessel"
-            " under these conditions; widen the rudder's limit or narrow the conditions"
+            f"none of {result_de.nfev} {config.model_dump()['kind']} controllers stabilises the"
+            " vessel under these conditions; widen the rudder's limit or narrow the conditions"
         )
     best_parameters = dict(zip(names, (math.exp(value) for value in result_de.x), strict=True))
     ordered_parameters = {
@@ -145,6 +146,7 @@ def tune_parameters(
         }
     ):
         return tuned
+    # the search is over logarithms, which exclude the value that disables a parameter
     simpler_result = tune_parameters(
         config.with_parameters(disabled_parameters),
         task,
@@ -154,7 +156,7 @@ def tune_parameters(
         compiler,
         stage,
     )
-    return min(tuned, simpler_result, key=lambda each: each.cost)
+    return min(tuned, simpler_result, key=lambda result: result.cost)
 
 
 @final

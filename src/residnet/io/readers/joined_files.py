@@ -365,6 +365,7 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
     Raises:
         DataError: if the log is too short.
     """
+    # changes of u and r over blocks, in standard deviations
     motion_log = complete_motion(log, MotionConfig())
     stride = max(1, len(motion_log) // _MAX_SAMPLES)
     t = motion_log.t[::stride]
@@ -386,7 +387,7 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
     motion_regressors = integrate_columns(
         np.ones_like(u), u, u * np.abs(u), r, r * np.abs(r), u * r
     )
-    # residual of the model without commands
+    # residual of a model without the channels of the other log: what these may explain
     motion_residual = (
         velocity_change
         - motion_regressors @ np.linalg.lstsq(motion_regressors, velocity_change, rcond=1e-9)[0]
@@ -403,6 +404,7 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
     min_overlap = _MIN_OVERLAP * min(t[-1] - t[0], other_log.t[-1] - other_log.t[0])
 
     def explained_share(shift: float) -> float:
+        """Return the share of the residual that the other log, `shift` s later, explains."""
         shifted_times = t - shift
         block_start = shifted_times[blocks.starts]
         block_end = shifted_times[blocks.starts + block_length]
@@ -436,6 +438,7 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
             (squared_motion_residual[in_range].sum() - (residual**2).sum()) / total_variance
         )
 
+    # coarse search over all offsets with sufficient overlap, then a fine one around the best
     lower_shift = t[0] - other_log.t[-1] + min_overlap
     upper_shift = t[-1] - other_log.t[0] - min_overlap
     coarse_shifts = np.arange(
@@ -448,6 +451,7 @@ def estimate_clock_offset(log: Log, other_log: Log) -> ClockOffset:
     )
     fine_scores = np.array([explained_share(shift) for shift in fine_shifts.tolist()])
     seconds = float(fine_shifts[fine_scores.argmax()])
+    # the score of the best other offset shows whether the estimate is ambiguous
     is_alternative = scores[np.abs(coarse_shifts - seconds) > _MIN_ALTERNATIVE_OFFSET]
     return ClockOffset(seconds, float(fine_scores.max()), float(is_alternative.max(initial=0.0)))
 

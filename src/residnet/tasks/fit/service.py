@@ -323,17 +323,17 @@ class RefitResult:
     Attributes:
         recursive_refit: identified changes of the model.
         folder: folder of the new run; None if no change was identified.
-        old: mean free-run error (NRMSE) of the old model on the held-out logs.
-        new: mean free-run error (NRMSE) of the new model on the held-out logs.
-        worth: whether the new model is significantly better, by the 95 % confidence interval of the
-            paired differences.
+        old_error: mean free-run error (NRMSE) of the old model on the held-out logs.
+        new_error: mean free-run error (NRMSE) of the new model on the held-out logs.
+        is_better: whether the new model is significantly better, by the 95 % confidence interval of
+            the paired differences.
     """
 
     recursive_refit: RecursiveRefit
     folder: Path | None = None
-    old: float = float("nan")
-    new: float = float("nan")
-    worth: bool = False
+    old_error: float = float("nan")
+    new_error: float = float("nan")
+    is_better: bool = False
 
     def to_lines(self) -> list[str]:
         """Return changes, reason of the end and errors before and after, one line each."""
@@ -343,16 +343,17 @@ class RefitResult:
             f" each log {', '.join(f'{size:+.3g}' for size in changed_parameter.size_by_log)}"
             for changed_parameter in self.recursive_refit.identified_changes
         ]
-        lines.append(f"refit: ended since {self.recursive_refit.stopping_reason}")
+        lines.append(f"refit: ended because {self.recursive_refit.stopping_reason}")
         if self.folder is None:
-            return [*lines, "refit: no model was written; the old one stays"]
-        error_text = f"old {self.old:.4f}, new {self.new:.4f} (mean NRMSE of free runs)"
+            return [*lines, "refit: no change was identified; no model was written"]
+        error_text = f"old {self.old_error:.4f}, new {self.new_error:.4f} (mean NRMSE of free runs)"
         conclusion = (
-            f"it IS worth taking; {self.folder}"
-            if self.worth
-            else f"it is NOT worth taking; it stands in {self.folder}, with the old model selected"
+            f"the new model is significantly better and selected in {self.folder}"
+            if self.is_better
+            else "the new model is NOT significantly better; the old model is selected in"
+            f" {self.folder}"
         )
-        return [*lines, f"refit: on the logs held out: {error_text}", f"refit: {conclusion}"]
+        return [*lines, f"refit: held-out logs: {error_text}", f"refit: {conclusion}"]
 
     def to_record(self) -> RefitRow:
         """Return the entry of monitor.json."""
@@ -370,9 +371,9 @@ class RefitResult:
             ),
             ended=self.recursive_refit.stopping_reason,
             run=str(self.folder) if has_run else None,
-            nrmse_old=self.old if has_run else None,
-            nrmse_new=self.new if has_run else None,
-            worth_taking=self.worth,
+            nrmse_old=self.old_error if has_run else None,
+            nrmse_new=self.new_error if has_run else None,
+            worth_taking=self.is_better,
         )
         return RefitRow(refit=summary)
 
@@ -415,6 +416,7 @@ def run_refit(monitor: FittedModelMonitor, output_folder: Path) -> RefitResult:
         )
     for log in monitor.logs:
         check_window_fits(log, config)
+    # the last logs are held out: a refit must predict later logs than it was fitted to
     n_held_out = max(len(monitor.logs) // _HOLD_OUT_RATIO, 1)
     training_logs = monitor.logs[:-n_held_out]
     held_out_logs = monitor.logs[-n_held_out:]
@@ -434,6 +436,7 @@ def run_refit(monitor: FittedModelMonitor, output_folder: Path) -> RefitResult:
     result = RefitResult(recursive_result, output_folder)
 
     def evaluate_refit(folder: RunFolder) -> TaskOutcome:
+        """Store old and new models, evaluate both on the held-out logs and select the better."""
         nonlocal result
         store = RunModelStore(folder)
         models = monitor.run.models
@@ -445,6 +448,7 @@ def run_refit(monitor: FittedModelMonitor, output_folder: Path) -> RefitResult:
         for name in reference_names:
             shutil.copytree(models / name, folder.models / name)
         store.save(refitted_model)
+        # the new model is compared with the old one window by window
         evaluations = evaluate_splits(
             [
                 replace(candidate_model, reference=original_model.name)
@@ -467,13 +471,14 @@ def run_refit(monitor: FittedModelMonitor, output_folder: Path) -> RefitResult:
         refitted_row = find_row(rows, model=refitted_model.name)
         difference = refitted_row.difference
         assert difference is not None, "the original model is the reference of the refitted one"
+        # too few logs give no confidence interval: then the mean difference decides
         upper_bound = difference.nrmse_mean if difference.ci95 is None else difference.ci95[1]
         is_better = refitted_row.diverged == 0 and upper_bound < 0.0
         result = replace(
             result,
-            old=find_row(rows, model=original_model.name).mean_nrmse,
-            new=refitted_row.mean_nrmse,
-            worth=is_better,
+            old_error=find_row(rows, model=original_model.name).mean_nrmse,
+            new_error=refitted_row.mean_nrmse,
+            is_better=is_better,
         )
         selected_name = refitted_model.name if is_better else original_model.name
         write_evaluation(
@@ -487,10 +492,10 @@ def run_refit(monitor: FittedModelMonitor, output_folder: Path) -> RefitResult:
             f"{change['cause']} {change['size']:+.3g}"
             for change in refitted_model.notes["refit_changes"]
         ]
+        effect = "significantly reduces" if is_better else "does not significantly reduce"
         sentence = (
-            f"The recursive refit ({', '.join(changes)}) is {'' if is_better else 'not '}worth"
-            f" taking"
-            " by the logs that were held out."
+            f"The recursive refit ({', '.join(changes)}) {effect} the free-run error on the"
+            " held-out logs."
         )
         outcome = build_fit_outcome(folder, EXTERNAL_SPLIT)
         return replace(outcome, verdict=[*outcome.verdict, sentence])

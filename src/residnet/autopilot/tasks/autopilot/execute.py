@@ -241,6 +241,7 @@ def _train_policy_or_resume(
             f"  {name} learns on {policy_config.learned.model} of {policy_config.learned.run}: K ="
             f" {nomoto.gain:.4g} 1/s, T = {nomoto.time:.4g} s"
         )
+    # the untrained policy, from the law and the response of the vessel
     torch.manual_seed(config.seed)
     observed_law = angle_law_of(base_law)
     spec_fields = {
@@ -262,6 +263,7 @@ def _train_policy_or_resume(
         }
     spec = config.policy_spec_class(name).model_validate(spec_fields)
     policy = spec.build()
+    # a resumed run restores the policy; otherwise it is trained, if it has a training
     store = RunModelStore(folder)
     notes = store.restore_module(name, policy)
     start_times = (time.time(), time.process_time())
