@@ -384,7 +384,7 @@ def test_planes_of_a_learned_torpedo_pitch_it_as_the_vessel_does() -> None:
     found, wanted = (one.estimate_nomoto(5 * DEG, 20.0, 0.1) for one in (learned, vessel))
     assert found.gain == pytest.approx(wanted.gain, rel=0.05)
     assert found.time == pytest.approx(wanted.time, rel=0.1)
-    with pytest.raises(ConfigError, match="depth control needs a model that tells z"):
+    with pytest.raises(ConfigError, match="depth control needs a model with the state z"):
         SteeredModel(nomoto_model(GAIN, TIME, 0.1)[1], ("delta",), "start", vessel)
 
 

@@ -88,7 +88,7 @@ def test_report_and_figures_show_the_equations(run: Path, notes: dict[str, Any])
     assert titles >= {f"Equation of {model}, term by term" for model in CONFIG["heads"]}
     text = plain(run / "report.html")
     assert "Equations of equation" in text
-    assert "candidate terms differ on these data (condition number" in text
+    assert "candidate terms are linearly independent on these data (condition number" in text
     seconds = notes["late"]["delay"]["seconds"]
     assert f"Delayed inputs act {seconds:g} s after they are given." in text
     assert notes["whole"]["coefficients"][0]["term"] in text

@@ -49,22 +49,20 @@ _FRAME_TEXT = (
     " is where the wind comes from"
 )
 _BAD_INPUT_RULES = (
-    "an entry that is no number becomes the one under `substitute`, any other beyond"
-    " `state_ranges` the"
-    " nearest value of its training range; a memory that is not finite or beyond what the head can"
-    " have begins anew; a step that would leave `state_ranges` is held at its edge; `outside` is"
-    " then"
-    " true"
+    "NaN is replaced by the value under `substitute`, a value outside `state_ranges` by the nearest"
+    " value of its training range; a memory that is not finite or outside the bounds of the head is"
+    " reset; a next state outside `state_ranges` is limited to them; in all these cases `outside`"
+    " is true"
 )
 _WAVE_LOADS_TEXT = (
     "none: the model has no input for wave loads and computes none; it is the mean of the logs,"
     " whatever their waves"
 )
 _BAND_TEXT = (
-    "half widths of the {:.3g} % prediction intervals of the errors of a free run so many steps"
-    " after a measured state, whatever the run is like; the level is that of each channel; between"
-    " the steps they are interpolated, and beyond the last they grow in proportion to time, without"
-    " any promise; the position's is the radius about the predicted one"
+    "half widths of the {:.3g} % prediction intervals of a free run for each channel, by number of"
+    " steps since the measured state, independent of the motion; interpolate between the steps;"
+    " beyond the last step they are extrapolated in proportion to time, without calibration; that of"
+    " the position is the radius of a circle around the predicted position"
 )
 
 

@@ -74,8 +74,8 @@ def choose_inputs(logs: Sequence[Log], draft_notes: DraftNotes) -> tuple[str, ..
     if control_loops:
         draft_notes.add_guess(
             INPUTS_KEY,
-            f"u_{min(control_loops)} is taken as what a controller asks for, by the names beside"
-            f" it",
+            f"u_{min(control_loops)} is taken as the output of a controller, because of the names"
+            " of other channels",
         )
     names = [name for name in actuator_names if _is_excited(name, values[name], draft_notes)]
     names = _prefer_measured_inputs(_choose_force_set(logs, names, draft_notes), draft_notes)
@@ -159,10 +159,12 @@ def _is_actuator_name(name: str, draft_notes: DraftNotes) -> bool:
         return True
     is_passive = not parsed_name.has_none("voltage", "age", "depth", "index", "machinery")
     if is_passive or match_state_channel(parsed_name) is not None:
-        draft_notes.add_note(INPUTS_KEY, f"{name} is left out: by its name it drives nothing")
+        draft_notes.add_note(
+            INPUTS_KEY, f"{name} is not used: its name is not that of an actuator or a command"
+        )
         return False
     draft_notes.add_guess(
-        INPUTS_KEY, f"{name} is taken, though its name does not say what it drives"
+        INPUTS_KEY, f"{name} is used, although its name does not identify an actuator"
     )
     return True
 
@@ -201,7 +203,7 @@ def _choose_force_set(
     )
     draft_notes.add_guess(
         INPUTS_KEY,
-        f"forces stand for all actuators; share of the accelerations explained: {shares_text}",
+        f"forces replace all actuators; explained share of the accelerations: {shares_text}",
     )
     return list(max(explained_shares.items(), key=lambda pair: pair[1])[0])
 
@@ -252,15 +254,15 @@ def _prefer_measured_inputs(names: Sequence[str], draft_notes: DraftNotes) -> li
         if measured_name is not None:
             draft_notes.add_guess(
                 INPUTS_KEY,
-                f"{measured_name} is taken as measured, and not what was ordered ({name})",
+                f"the measured {measured_name} is used instead of the command {name}",
             )
         elif name.removesuffix("_rate") in {*names} - {name}:
             draft_notes.add_note(
-                INPUTS_KEY, f"{name} is left out beside {name.removesuffix('_rate')}"
+                INPUTS_KEY, f"{name} is not used: it is the rate of {name.removesuffix('_rate')}"
             )
         elif name.removeprefix("cmd_").startswith("thrust") and shaft_inputs:
             draft_notes.add_note(
-                INPUTS_KEY, f"{name} is left out beside {shaft_inputs[0]}: it follows from it"
+                INPUTS_KEY, f"{name} is not used: it is the thrust due to {shaft_inputs[0]}"
             )
         else:
             selected.append(name)

@@ -417,9 +417,9 @@ class SteeredModel(SteeredVessel):
         self.rate = vessel.rate
         if not {axis.gear, axis.command} & set(input_names) or axis.value not in states:
             raise ConfigError(
-                f"{axis.name} control needs a model that tells {axis.value} and is driven by"
-                f" '{axis.gear}' or '{axis.command}'; it tells {', '.join(states)}, and its inputs"
-                f" are {', '.join(input_names)}"
+                f"{axis.name} control needs a model with the state {axis.value} and the input"
+                f" '{axis.gear}' or '{axis.command}'; this model has the states {', '.join(states)}"
+                f" and the inputs {', '.join(input_names)}"
             )
         self.has_free_step = model.n_state == 0
         self.input_indices: list[int] = []

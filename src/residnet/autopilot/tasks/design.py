@@ -153,8 +153,8 @@ def _fit_steering(
     if feedback is not None and instrumented is None:
         raise DataError(
             "steering: a controller set the rudder: feedback from the heading explains"
-            f" {100 * feedback.share:.0f} % of what the yaw rate does not, so that K and T"
-            f" cannot be identified; {objection}, or give K and T, such as 0.12,18"
+            f" {100 * feedback.share:.0f} % of the variance that the yaw rate does not explain, so"
+            f" that K and T are not identifiable; {objection}, or give K and T, such as 0.12,18"
         )
     if instrumented is not None and feedback is not None:
         log_message(

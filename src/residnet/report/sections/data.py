@@ -117,9 +117,10 @@ def _currents_table(run: RunFiles, currents: Sequence[CurrentRow]) -> Table:
             ("p-value", lambda row: format_number(row.p_value, 1)),
             ("coefficients", lambda row: "fitted with it" if row.fitted else "of other logs"),
         ],
-        caption="Every log ran in a constant current of its own, which was estimated, with one"
-        " standard error: as far as the two halves of a log agree. The p-value is that of an F test"
-        " against no current. Errors of this page are those of the motion through the water.",
+        caption="Estimated constant current of each log with one standard error, which includes the"
+        " differences between the halves of logs (Birge ratio). The p-value is that of an F test"
+        " against no current."
+        " Errors of this page are those of the motion through the water.",
     )
 
 

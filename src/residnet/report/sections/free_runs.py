@@ -438,7 +438,11 @@ def _repeatability_text(run: RunFiles, repeatability: Repeatability) -> str:
         else ""
     )
     knows_wind = bool(run.fit_settings.signals.exogenous)
-    wind_text = " A model that knows the wind, as these do, can do better." if knows_wind else ""
+    wind_text = (
+        " Models with the wind as an input, such as these, can have smaller errors."
+        if knows_wind
+        else ""
+    )
     return (
         f"Repeatability: {format_count(repeatability.pairs, 'pair')} of stretches"
         f" ({pairs_text}) in"
@@ -516,10 +520,10 @@ def band_cautions(run: RunFiles, model: str) -> list[str]:
         max_duration = max(lengths, default=0.0)
         if max_duration > band.horizon + 1e-6:
             sentences.append(
-                f"Runs of protocol {protocol} last up to {format_fixed(max_duration, 0)} s, and"
+                f"Runs of protocol {protocol} last up to {format_fixed(max_duration, 0)} s, but"
                 f" the band is"
                 f" calibrated up to {format_fixed(band.horizon, 0)} s only; beyond, it grows in"
-                " proportion to time, without any promise."
+                " proportion to time, without calibration."
             )
     return sentences
 

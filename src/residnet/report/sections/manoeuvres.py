@@ -607,10 +607,9 @@ def booklet_figures(run: RunFiles) -> Iterator[Figure]:
         yield Figure(
             f"booklet_zigzags_{first_index // _MAX_ZIGZAGS + 1}",
             "Zigzags in closed loop",
-            "The model steers by its own heading with the rudder angle and the reversals of"
-            " each trial; the rudder is dotted. Look for the height of the peaks (overshoot)"
-            f" and for periods that run apart. The band holds {100 * content.level:.0f} % of the"
-            " draws at each instant.",
+            "The model repeats the rudder angle and the reversal angles of each trial in closed"
+            " loop with its predicted heading; the rudder is dotted. Compare the overshoots and the"
+            f" periods. The band contains {100 * content.level:.0f} % of the draws at each time.",
             {
                 "band": GlyphStyle(
                     "band of the draws", SOLID_STYLE.color, kind="fill", alpha=0.22, z_order=1

@@ -292,13 +292,14 @@ def equation_remarks(notes: FitNotes) -> list[str]:
     for name, equation in notes.equations.items():
         equal_terms |= equation.linear_dependencies
         sentences.append(
-            f"{name}: {equation.candidates} candidate terms differ on these data (condition"
-            f" number {equation.condition:.1e}). {100 * equation.error_share:.2g} % of the"
-            " target (RMS) stays unexplained."
+            f"{name}: {equation.candidates} candidate terms are linearly independent on these"
+            f" data (condition number {equation.condition:.1e}). The RMS residual is"
+            f" {100 * equation.error_share:.2g} % of the RMS of the target."
         )
         for term, alternatives in equation.indistinguishable_terms.items():
             sentences.append(
-                f"{name}: the data cannot tell {term} from {_join_truncated(alternatives)}."
+                f"{name}: {term} is not distinguishable on these data from"
+                f" {_join_truncated(alternatives)}."
             )
         if equation.max_omitted_share:
             terms = [
@@ -306,8 +307,8 @@ def equation_remarks(notes: FitNotes) -> list[str]:
                 for term, share in equation.max_omitted_share.items()
             ]
             sentences.append(
-                f"{name}: these terms were left out, but within two standard errors they could"
-                f" make up the stated share of the target: {_join_truncated(terms)}."
+                f"{name}: these terms were not selected, but their share of the target may be up to"
+                f" the stated one (two standard errors): {_join_truncated(terms)}."
             )
         for channels, share in equation.lack_of_fit.items():
             sentences.append(
@@ -317,7 +318,7 @@ def equation_remarks(notes: FitNotes) -> list[str]:
             )
     if notes.unexcited:
         sentences.append(
-            "These terms are 0 in all samples, so nothing is known of them:"
+            "These terms are 0 in all samples, so that their coefficients are not identifiable:"
             f" {_join_truncated(notes.unexcited)}."
         )
     if equal_terms:
@@ -329,7 +330,8 @@ def equation_remarks(notes: FitNotes) -> list[str]:
             for term, combination in equal_terms.items()
         ]
         sentences.append(
-            "These terms equal simpler ones on these data, which stand in their place:"
+            "These terms are linear combinations of simpler ones on these data and were replaced by"
+            " them:"
             f" {_join_truncated(texts)}."
         )
     return sentences
@@ -389,10 +391,10 @@ def term_figures(run: RunFiles) -> Iterator[Figure]:
         yield Figure(
             f"terms_{model}",
             f"Equation of {model}, term by term",
-            f"What each term adds to the acceleration along {rows['log'].iloc[0]}, and their sum"
-            " (black) against the target (grey), which is what the baseline leaves. Two large terms"
-            " that mirror each other mean that the data can hardly tell them apart. A flat term"
-            " could be left out.",
+            f"Contribution of each term to the acceleration along {rows['log'].iloc[0]}, their sum"
+            " (black) and the target (grey), which is the residual of the baseline. Two large terms"
+            " that cancel each other are hardly distinguishable on these data. A term without"
+            " variation is not needed.",
             styles,
             [
                 Panel(
@@ -465,7 +467,7 @@ def learning_figure(run: RunFiles) -> Figure | None:
         ]
         # a missing number becomes NaN, which is not drawn
         epoch, stage, loss, validation = np.array(points, dtype=float).T
-        # each stage has a loss of its own
+        # each stage has a different loss
         stage_starts = np.flatnonzero(np.diff(stage)) + 1
         loss_curves: dict[str, Curve] = {
             "loss": (np.insert(epoch, stage_starts, np.nan), np.insert(loss, stage_starts, np.nan))
@@ -510,9 +512,10 @@ def learning_figure(run: RunFiles) -> Figure | None:
     return Figure(
         "learning",
         "Learning curves",
-        "Each stage (one-step, then free runs of the stated length) has a loss of its own,"
-        " so only the slopes count. The lower panels decide: the weights of the circled"
-        " epoch are kept. A curve that still falls at its end asks for more epochs.",
+        "Each stage (one-step, then free runs of the stated length) has a different loss, so that"
+        " losses are comparable within a stage only. The lower panels show the validation error;"
+        " the weights of the circled epoch are used. If a curve still falls at its end, more epochs"
+        " reduce the error.",
         {
             "loss": GlyphStyle("training loss", BLUE),
             "validation": GlyphStyle("validation", BLUE),
@@ -557,9 +560,9 @@ def goodness_section(run: RunFiles) -> Section | None:
     if not axis_sections:
         return None
     introduction = (
-        "These are one-step residuals: what each model leaves of the measured acceleration"
-        " along the measured states. A model that is good here may still be poor in free run,"
-        " and the other way round."
+        "These are one-step residuals: measured minus predicted acceleration at the measured"
+        " states. A model with small residuals may still have a large free-run error, and vice"
+        " versa."
     )
     explanations = [
         "C_p, AIC and BIC use the noise variance of the model with the least residual. The"

@@ -749,6 +749,6 @@ def _identifiability_notes(trial: StudyResults) -> list[str]:
         )
     return [
         *notes,
-        "The standard errors account for scatter and correlation of the residuals. They do not"
-        " account for what the filter, the waves or a wrong structure of the model shift.",
+        "The standard errors account for variance and correlation of the residuals. They do not"
+        " account for bias due to the filter, the waves or a wrong model structure.",
     ]

@@ -565,10 +565,10 @@ def _data_section(config: ForceResidualConfig, results: StudyResults) -> Section
         f"Logs: {', '.join(log_texts)}. Masked: {', '.join(mask_texts) or 'nothing'};"
         f" {results['used']} of"
         f" {results['samples']} samples are used.",
-        f"There are {folds['count']} folds; {fold_text}. No model is fitted to data within"
-        f" {validation.gap:g} s of what it predicts. Orders and penalties are chosen inside the"
-        f" training part, on left-out segments of {validation.segment:g} s. Errors are means over"
-        " segments.",
+        f"There are {folds['count']} folds; {fold_text}. Training data are at least"
+        f" {validation.gap:g} s from the predicted data. Orders and penalties are selected within"
+        f" the training data, on left-out segments of {validation.segment:g} s. Errors are means"
+        " over segments.",
         "There are no intervals, because there are fewer than five segments."
         if blocks is None
         else f"Intervals (95 %) come from resampling"
