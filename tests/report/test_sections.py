@@ -304,7 +304,7 @@ def test_a_course_shows_what_was_missed(page_of: Callable[[str], Path]) -> None:
     assert sides[1][3:5] == ["2 of 2", "1 of 2"]
     assert wide[1][2:5] == ["75.0", "100.0", "1.0400"]
     assert 'class="bad">1 of 2' in text
-    assert "The circles of buoy 1 (20.00 m) are tighter than that" in text
+    assert "The circles of buoy 1 (20.00 m) are smaller" in text
     assert "The reference takes 60.00 s." in text
 
 

@@ -102,6 +102,11 @@ class _ConfigOrigin:
 
 
 def _read_mapping(path: Path) -> tuple[dict[str, Any], Node]:
+    """Read a YAML file; return its content, and its nodes with the lines of the keys.
+
+    Raises:
+        ConfigError: if the file cannot be read, or does not contain a mapping.
+    """
     try:
         # a bounded read, because a device such as /dev/zero never ends
         with path.open("rb") as file:

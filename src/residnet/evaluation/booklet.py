@@ -257,6 +257,15 @@ def _page_row(
     scale: float,
     level: float,
 ) -> BookletRow:
+    """Return the row of booklet.json of one manoeuvre: its indices with prediction intervals.
+
+    Args:
+        page: the manoeuvre and the indices of its nominal run and of the draws.
+        other_errors: errors of the model in other repeated trials, by name of the index.
+        length: length of the hull in m.
+        scale: ratio of the lengths of the ship and the vessel.
+        level: nominal coverage of the intervals.
+    """
     names = [
         name
         for name, value in page.indices[0].items()

@@ -697,6 +697,7 @@ class CExporter(Exporter):
             temporary_path = Path(name) / file.name
 
             def write_and_check(dtype: torch.dtype) -> tuple[CSource, dict[str, Any]]:
+                """Write the C file, and compare it compiled with the model in each precision."""
                 double_only = dtype == torch.float64
                 card_of_precision = card | {"dtype": get_dtype_name(dtype)} if double_only else card
                 header = temporary_path.with_suffix(".h")

@@ -216,10 +216,12 @@ class PerturbedDynamics(Dynamics):
         self.damping_sizes = repeat_for_damped([changes[k].size for k in damping_change_indices])
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        # step of the nominal model with the changed commands
         w = w * self.input_gain + self.input_offset
         nominal_next_state, next_memory = self.model.step(x, w, s)
         nu = x[:, DYNAMIC_STATES]
         velocity_increment = nominal_next_state[:, DYNAMIC_STATES] - nu
+        # the changes act on the velocity increment of the step
         if self.has_damping_changes:
             velocity_increment = velocity_increment - self._damping_perturbation(
                 x, w, s, velocity_increment
@@ -230,6 +232,7 @@ class PerturbedDynamics(Dynamics):
         changed_velocities = (
             nu + velocity_increment / self.inertia_factor + self.dt * pushed_acceleration
         )
+        # the angles follow the changed velocities; in six degrees of freedom as a rotation
         changed_next_state = nominal_next_state.clone()
         if self.model.spatial:
             changed_velocities = torch.where(

@@ -345,6 +345,13 @@ def _derivative_cells(
     ship_rows: Mapping[str, DerivativeRow],
     published: Mapping[str, float],
 ) -> list[str]:
+    """Return the cells of one derivative: value, prime system, interval, ship, and published.
+
+    Args:
+        row: the derivative at the scale of the tests.
+        ship_rows: derivatives at full scale by name; empty without scaling.
+        published: values by regressions from main particulars, prime I system, by name.
+    """
     error = row.prime_i_error
     bounds = (
         None

@@ -223,6 +223,12 @@ class CandidateEvaluation:
     def _simulate_candidates(
         self, row_parameters: dict[str, Tensor], n_candidates: int
     ) -> ClosedLoopTrajectories:
+        """Simulate all candidates in one batch, compiled if possible.
+
+        Args:
+            row_parameters: value of each parameter for each row of the batch.
+            n_candidates: number of candidates, which have the same simulations each.
+        """
         policy = self.config.build_batched(row_parameters, self.task).float().requires_grad_(False)
         simulation = ClosedLoopSimulation(
             self.task.vessel, policy, self.steps.dt, "heun", torch.float32

@@ -395,6 +395,7 @@ def _is_policy_on_course(row: AnyCourseRow) -> bool:
 
 
 def _course_definitions(metrics: CourseMetricsFile, settings: CourseSettings) -> list[str]:
+    """Return the definitions of the columns of the tables of courses, in sentences."""
     steady_turn = metrics.smallest
     tight_buoys = [
         f"buoy {entry.buoy} ({format_number(entry.radius, 4)} m)"
@@ -402,21 +403,21 @@ def _course_definitions(metrics: CourseMetricsFile, settings: CourseSettings) ->
         if not entry.possible
     ]
     feasibility_text = (
-        f"The circles of {', '.join(tight_buoys)} are tighter than that; they are widened to it."
+        f"The circles of {', '.join(tight_buoys)} are smaller; they are enlarged to this radius."
         if tight_buoys
-        else "Every circle can be followed."
+        else "No circle of a buoy is smaller."
     )
     texts = [
         f"At {math.degrees(metrics.rudder):.3g} deg of rudder the vessel turns with a radius of"
         f" {steady_turn.radius:.2f} m at {steady_turn.speed:.3g} m/s. {feasibility_text}",
-        "The reference is the shortest course that was found of straight lines and arcs of this"
-        " radius, for a vessel that yaws at once and keeps no margin. Ratio:"
-        f" course time over its length at the service speed of {metrics.speed:.3g} m/s. Ratio,"
-        " turning: the same at the speed that the vessel keeps in its smallest turn.",
-        "On its side and clear: number of buoys left on their side, and outside their circles."
-        " Margin: how far inside the circle that is entered least, or outside the one that is"
-        " passed most closely. Tightest turn: smallest radius of a flight. The cross-track error is"
-        " that from the plan, which a flight by line of sight does not follow.",
+        "The reference is the shortest computed course of straight lines and arcs of this radius,"
+        " for a vessel without yaw inertia and without margin to the circles. Ratio: course time"
+        " divided by the time for the reference course at the service speed of"
+        f" {metrics.speed:.3g} m/s. Ratio, turning: the same at the speed in the smallest turn.",
+        "On its side and clear: number of buoys passed on their side, and outside their circles."
+        " Margin: smallest depth inside a circle to enter, or smallest distance outside a circle to"
+        " pass. Tightest turn: smallest radius of the track. The cross-track error is relative to"
+        " the plan, which guidance by line of sight does not follow.",
     ]
     return [*texts, _spread_text(settings.spread)]
 

@@ -137,6 +137,7 @@ _KIND_LABELS = {
 def _iterate_autopilot_figures(
     run: RunFiles, metrics: AutopilotMetricsFile, settings: AutopilotSettings
 ) -> Iterator[Figure]:
+    """Yield the figures of an autopilot run for which its folder has the data."""
     conditioned_kinds = {
         row.model: row.kind for row in metrics.rows if row.protocol == "conditions"
     }

@@ -569,6 +569,7 @@ class NextTrials:
             return self._write(folder)
 
     def _write(self, folder: Path) -> list[Path]:
+        """Write the trials as YAML, their tracks as CSV, and a page; return the three files."""
         trials = folder / "next_trials.yaml"
         tracks = folder / "next_tracks.csv"
         simulated_runs = [trial.simulated_run for trial in self.plan.selected_trials]
