@@ -1,7 +1,7 @@
 """Motion control in three degrees of freedom: reference filter, PID, and feed-forward.
 
-Source: Jervan 2020, sections 2.2 and 2.2.1, eq. (2.15). docs/documents/corrections.md says how
-undefined symbols, the bandwidth and the headings are read (J7, J9, J13).
+Source: Jervan 2020, sections 2.2 and 2.2.1, eq. (2.15). Symbols, bandwidth and headings that the
+source does not define are interpreted as in docs/documents/corrections.md (J7, J9, J13).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class ReferenceFilter(Reference):
         super().__init__()
         self.n_state = 9
         intervals = {config.interval for config in configs}
-        # way-points change at steps only, so that a row needs no switch within a step
+        # way-points must change between steps, because the filter has a constant target in a step
         steps = max(intervals) / dt
         if len(intervals) > 1 or abs(steps - round(steps)) > 1e-6 * steps or round(steps) < 1:
             interval_text = ", ".join(f"{interval:g} s" for interval in sorted(intervals))
@@ -208,11 +208,12 @@ class MotionPID(Policy):
 
 @final
 class AllocatedPolicy(Policy):
-    """A controller whose demands are turned into the commands of a vessel.
+    """A controller whose demands are converted to the commands of a vessel.
 
-    Its forces, for example, are allocated to revolutions and angles of azimuth thrusters.
+    For example, forces are allocated to revolutions and angles of azimuth thrusters.
 
     Args:
+        policy: the controller; its output is the demand.
         allocate: maps the demand of the controller [B, d] to commands [B, c].
     """
 
@@ -387,6 +388,7 @@ class LagCompensatedPID(Policy):
             + k3 * integral_error
             + k4 * double_integral
         )
+        # inverse of the lag: the command with which the force has the required acceleration
         lead_command = (
             force + (2 * damping / frequency) * rate + required_acceleration / frequency**2
         )

@@ -114,8 +114,8 @@ def stage_files(file: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
             # the message names the folder of the user instead of the temporary one
             message = str(error).replace(str(staging), str(file.parent))
             raise type(error)(message) from error
-        found = (path for path in sorted(staging.rglob("*")) if path.is_file())
-        sources = [path for path in found if path not in copies]
+        staged_files = (path for path in sorted(staging.rglob("*")) if path.is_file())
+        sources = [path for path in staged_files if path not in copies]
         targets = [file.parent / path.relative_to(staging) for path in sources]
         for target in targets:
             require_replaceable(target)
@@ -250,8 +250,8 @@ def find_config_folder() -> Path:
     It is inside an installed package, or at the top of a source checkout.
     """
     package = Path(residnet.__file__).parent
-    inside = package / "configs"
-    return inside if inside.is_dir() else package.parents[1] / "configs"
+    installed_folder = package / "configs"
+    return installed_folder if installed_folder.is_dir() else package.parents[1] / "configs"
 
 
 def find_shipped_configs() -> dict[str, Path]:

@@ -39,9 +39,10 @@ class _RolloutStep(nn.Module):
         self.rollout = rollout
 
     def forward(self, x: Tensor, w: Tensor, s: Tensor, q: Tensor) -> tuple[Tensor, ...]:
-        """Return state, memory of the model, memory of the source, and applied inputs.
+        """Return state x, memory s of the model, memory q of the source, and applied inputs.
 
-        Applied inputs are omitted if the source returns the inputs of the rollout.
+        The source of the inputs is open loop or a controller; it computes the inputs that the model
+        receives (applied inputs) from state x and inputs w. They are omitted if they are w itself.
         """
         applied, q = self.rollout.source(x, w, 0, q)
         x, s = self.rollout.model.step(x, applied, s)

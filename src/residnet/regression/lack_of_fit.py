@@ -1,4 +1,4 @@
-"""Lack of fit of an equation: which functions of the channels explain what no candidate explains.
+"""Lack of fit of an equation: functions of the channels that explain its residual.
 
 The target and flexible probe functions are projected on the orthogonal complement of all candidate
 terms. A family of probes has a lack of fit if it predicts the remaining residual in blocks of
@@ -32,7 +32,9 @@ _MAX_ROWS: Final = 4000
 _MAX_FAMILIES: Final = 3
 """Maximum number of families that are reported for a target."""
 _SPAN_TOLERANCE: Final = 1e-6
-"""Norm of a unit probe orthogonal to the candidates, below which it lies in their span."""
+"""Singular value of unit probes projected on the complement of the candidates, below which a
+direction counts as a linear combination of candidates.
+"""
 
 
 def select_test_rows(n_rows: int) -> slice:
@@ -73,7 +75,7 @@ def probe_families(
 def estimate_lack_of_fit(
     x: np.ndarray, y: np.ndarray, families: Sequence[tuple[str, ...]], probes: Sequence[np.ndarray]
 ) -> dict[str, float]:
-    """Return the families of functions that explain a residual which no candidate explains.
+    """Return the families of functions that explain the residual of all candidates together.
 
     Families are added one by one, functions of one channel first, until none predicts the
     remaining residual.

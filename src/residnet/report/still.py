@@ -372,7 +372,7 @@ def draw_svg(figure: Figure) -> str:
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
     # identifiers of groups repeat in every drawing and are not referred to
     body = re.sub(r'<g id="[^"]*"', "<g", body).replace("xlink:href", "href")
-    # those of clip paths and markers are random: numbers make pages reproducible
+    # identifiers of clip paths and markers are random; numbers make the page reproducible
     for number, identifier in enumerate(dict.fromkeys(re.findall(r' id="([^"]+)"', body))):
         body = re.sub(
             rf'(["#]){re.escape(identifier)}(["\)])', rf"\1{figure.html_id}-{number}\2", body
@@ -387,8 +387,8 @@ def draw_svg(figure: Figure) -> str:
 def save_png(canvas: Any, path: Path, title: str, caption: str) -> None:
     """Write a PNG with title and caption as text metadata.
 
-    Its palette of 128 colours takes a third of the bytes; chosen by coverage, it keeps the thin
-    lines' own colours, which a palette chosen by frequency would mix.
+    A palette of 128 colours needs a third of the bytes. It is chosen by coverage of the colour
+    space: a palette chosen by frequency would change the colours of thin lines.
     """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo

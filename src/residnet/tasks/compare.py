@@ -27,7 +27,7 @@ from residnet.runs.folder import RunFolder
 _MAX_DIFFERENCES = 60
 """Maximum number of different settings on the page."""
 _ABSENT = object()
-"""Stands for the value of a key that a config does not have."""
+"""Value of a key that is missing in a config; None is a possible value of a key."""
 
 
 class WindowKey(NamedTuple):
@@ -282,13 +282,11 @@ def _find_config_differences(values: Sequence[Any], path: str) -> list[tuple[str
         return []
     if not all(isinstance(value, Mapping) for value in values):
         return [(path, [_summarize_value(value) for value in values])]
-    differences_found = []
+    differences = []
     for key in dict.fromkeys(key for value in values for key in value):
         child_values = [value.get(key, _ABSENT) for value in values]
-        differences_found += _find_config_differences(
-            child_values, f"{path}.{key}" if path else str(key)
-        )
-    return differences_found
+        differences += _find_config_differences(child_values, f"{path}.{key}" if path else str(key))
+    return differences
 
 
 def _summarize_value(value: Any) -> str:

@@ -13,10 +13,10 @@ from residnet.core.format import (
     DASH,
     format_exponents,
     format_fixed,
+    format_integer,
     format_interval,
     format_number,
 )
-from residnet.core.format import format_integer as whole_number
 from residnet.core.names import CHANNEL_UNITS
 from residnet.evaluation.records import GoodnessFile, GoodnessRow
 from residnet.evaluation.verdict import describe_divergence
@@ -103,13 +103,13 @@ def _refit_text(model: str, notes: FitNotes) -> str:
 def _coefficient_table(notes: FitNotes) -> Table:
     """Return coefficients with their standard errors, to two digits of these, and units."""
 
-    def value(row: CoefficientRow) -> str:
+    def format_value(row: CoefficientRow) -> str:
         error = row.standard_error
         decimals = max(1 - math.floor(math.log10(error)), 0) if error > 0 else 7
         # an exact coefficient has no standard error that determines its digits
         return format_fixed(row.value, decimals) if decimals <= 6 else format_number(row.value, 4)
 
-    def ratio(row: CoefficientRow) -> Cell:
+    def t_statistic_cell(row: CoefficientRow) -> Cell:
         value = abs(row.value)
         error = row.standard_error
         if error <= 1e-9 * value:
@@ -120,9 +120,9 @@ def _coefficient_table(notes: FitNotes) -> Table:
         notes.coefficients,
         [
             ("term", lambda row: f"d{row.axis.replace('_dot', '')}/dt: {row.term}"),
-            ("value", value, str),
+            ("value", format_value, str),
             ("standard error", lambda row: format_number(row.standard_error, 2), str),
-            ("value / error", ratio),
+            ("value / error", t_statistic_cell),
             ("unit", lambda row: term_unit(row.axis, row.term), str),
         ],
     )
@@ -184,7 +184,7 @@ def _head_section(run: RunFiles) -> Section | None:
         if not n_parameters and isinstance(notes.n_terms, float):
             # closed forms have a coefficient for each term and an offset, on each of three axes
             n_parameters = 3 * (notes.n_terms + 1)
-        return whole_number(n_parameters) if n_parameters else DASH
+        return format_integer(n_parameters) if n_parameters else DASH
 
     def error_cell(model: str) -> Cell:
         row = run.find_row(model, "validation", run.selection_protocol)

@@ -90,8 +90,9 @@ class MavlinkConfig(RecordingConfig):
     def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
         """Read messages of a telemetry log.
 
-        Times are those of the autopilot since its start, completed with the date of the ground
-        station; the times of arrival where a message has no time, or the autopilot was restarted.
+        The time of a message is the autopilot's time since its start plus the Unix time of the
+        start, which is estimated from the clock of the ground station. If messages have no such
+        time, or the autopilot was restarted, the time of arrival at the ground station is used.
         """
         require_file(path)
         with optional_import("ardupilot", "pymavlink", "a MAVLink telemetry log"):
