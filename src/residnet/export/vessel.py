@@ -61,8 +61,8 @@ _WAVE_LOADS_TEXT = (
 _BAND_TEXT = (
     "half widths of the {:.3g} % prediction intervals of a free run for each channel, by number of"
     " steps since the measured state, independent of the motion; interpolate between the steps;"
-    " beyond the last step they are extrapolated in proportion to time, without calibration; that of"
-    " the position is the radius of a circle around the predicted position"
+    " beyond the last step they are extrapolated in proportion to time, without calibration; that"
+    " of the position is the radius of a circle around the predicted position"
 )
 
 
