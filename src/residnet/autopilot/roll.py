@@ -72,8 +72,8 @@ class RollPolicy(nn.Module):
     The law is delta = -K_psi psi_f - K_r r_f - K_p p - K_phi phi and alpha = -F_p p - F_phi phi.
     psi_f and r_f are heading error and yaw rate after a low-pass filter, so that the rudder does
     not respond to the yaw motion at wave frequency, which it cannot reduce. The network adds to
-    both angles. It is an odd function of the measurements, so that the policy acts alike to port
-    and to starboard.
+    both angles. It is an odd function of the measurements, so that the policy is symmetric with
+    respect to port and starboard.
 
     Args:
         gains: constants by name, `GAIN_NAMES`; tensors [B, 1] for a constant of each row.

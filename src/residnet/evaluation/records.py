@@ -486,7 +486,7 @@ class RepeatDifferences(Record):
 
     @property
     def by_channel(self) -> ByChannel:
-        """The differences of those velocities that the model has, by channel."""
+        """The differences of the velocities of the model, by channel."""
         differences: dict[str, float | None] = {
             name: getattr(self, name) for name in SIX_DOF_LAYOUT.dynamic_states
         }

@@ -403,7 +403,7 @@ def _held_out_deviations(
     folds: Sequence[Fold],
     names: Sequence[str],
 ) -> list[np.ndarray]:
-    """Return the deviation of each sample from a relation whose gains are those of other logs."""
+    """Return the deviation of each sample from a relation whose gains come from other logs."""
     designs = [_relation_regressors(relation, sample, names) for sample in samples]
     responses = [sample[:, names.index(relation.input)] for sample in samples]
     deviations = [np.zeros(0)] * len(samples)

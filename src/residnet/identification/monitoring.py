@@ -313,8 +313,8 @@ class ChangeDetector:
 
     Attributes:
         part_counts: number of parts of a window in each division; 1 for the window as a whole.
-        bias_by_fold: model bias of each division, and size bias; first those of all clean logs,
-            then those without each fold.
+        bias_by_fold: model bias of each division, and size bias; first from all clean logs, then
+            without each fold.
 
     Raises:
         DataError: if there are too few clean logs.
@@ -420,9 +420,9 @@ class ChangeDetector:
     ) -> tuple[list[tuple[list[np.ndarray], np.ndarray]], GroupScores]:
         """Estimate biases with all groups and without each fold, and the scores of each fold.
 
-        In service the bias comes from other logs than those tested, so that the scores vary more
-        than those of the clean logs themselves. The scores of each fold with the bias of the other
-        folds vary as those in service.
+        In service the bias comes from other logs than the tested ones, so that scores vary more
+        than on the clean logs. The scores of each fold with the bias of the other folds vary as in
+        service.
 
         Args:
             innovations_by_group: innovations and effects of each group and division of windows.
@@ -521,7 +521,7 @@ class ChangeDetector:
 
     @property
     def all_changes(self) -> list[SystemChange]:
-        """The changes of the vessel, then those of its environment."""
+        """The changes of the vessel, then the changes of its environment."""
         return [*self.hypotheses, *self.nuisance_changes]
 
     def group_windows(self, windows: Sequence[MeasuredWindow]) -> list[Sequence[MeasuredWindow]]:

@@ -257,7 +257,7 @@ class _InformationFilter:
 
     Args:
         detector: detector with the statistics of clean logs; F is its number of biases
-            (`ChangeDetector.bias_by_fold`): that of all clean logs, then those without each fold.
+            (`ChangeDetector.bias_by_fold`): from all clean logs, then without each fold.
         changes: Q changes whose sizes are estimated.
 
     Attributes:
@@ -333,7 +333,7 @@ class _InformationFilter:
         Args:
             indexed_groups: groups of windows with the index of their log.
             use_initial_sizes: whether all free runs use the sizes at the start of the pass instead
-                of those estimated from the logs before.
+                of the estimates from the logs before.
 
         Returns:
             Sizes [Q] after each log, their covariance [Q, Q] at the end, and the sizes [F - 1, Q]

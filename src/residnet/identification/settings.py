@@ -43,7 +43,7 @@ class ModelPartsConfig(Config):
         ensembles: models by name that average the accelerations of their members.
         means: models by name that average the trajectories of their members; members that diverge
             on a validation window are removed.
-        training: training settings by head; what is not set follows from the logs.
+        training: training settings by head; other settings follow from the logs.
     """
 
     baseline: BaselineConfig = ZeroBaselineConfig()

@@ -554,7 +554,7 @@ def _check_storage(case: _HeadCase, spec: ModelSpec, fitted_model: HybridDynamic
 def _check_head_config(
     config: BaseHeadConfig, head: ResidualHead, names: Sequence[str], subject: str
 ) -> None:
-    """Check that the properties of a config, known without PyTorch, are those of its head."""
+    """Check that the properties of a config, known without PyTorch, match its head."""
     config.check_channels(names)
     assert_true(
         config.has_closed_form(names) == isinstance(head, ClosedFormHead),
@@ -640,7 +640,7 @@ def check_baseline(config: IdentifiedConfig, samples: Samples | None = None) -> 
 def _check_baseline_config(
     config: IdentifiedConfig, baseline: Baseline, samples: Samples, subject: str
 ) -> None:
-    """Check that the properties of a config, known without PyTorch, are those of its baseline."""
+    """Check that the properties of a config, known without PyTorch, match its baseline."""
     names = samples.names
     config.check_channels(names)
     config.validate_samples(samples.origins)

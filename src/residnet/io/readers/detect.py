@@ -78,7 +78,7 @@ def list_external_readers() -> list[type[ReaderKind]]:
 
 
 def list_log_endings() -> tuple[str, ...]:
-    """Return the extensions of files that may be logs, including those of registered readers."""
+    """Return the extensions of files that may be logs, including registered readers."""
     return (
         *_BUILTIN_ENDINGS,
         *(ending for reader in list_external_readers() for ending in _external_endings(reader)),

@@ -181,7 +181,7 @@ def join_excel_sheets(path: Path, tables: Mapping[str, pd.DataFrame]) -> pd.Data
         tables: sheets by name; the first column of each is the time.
 
     Returns:
-        The joined table; a column is empty in rows of other sheets. `attrs` are those of
+        The joined table; a column is empty in rows of other sheets. `attrs` as in
         `read_excel_sheet`.
 
     Raises:

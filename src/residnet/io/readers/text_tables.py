@@ -742,7 +742,7 @@ def _refuse_motion_capture_export(path: Path, lines: Sequence[str]) -> None:
     """Refuse an export of OptiTrack Motive, whose names stand in several rows.
 
     Raises:
-        DataError: if the first lines are those of such an export.
+        DataError: if the file is such an export.
     """
     names = next((number for number, line in enumerate(lines) if line.startswith("Frame,Time")), 0)
     if any("Rigid Body" in line for line in lines[:names]):

@@ -78,8 +78,8 @@ class MavlinkConfig(RecordingConfig):
     """Reader of MAVLink telemetry logs (tlog).
 
     A series has the name of its message (`GLOBAL_POSITION_INT`, `ATTITUDE`). Messages of other
-    vehicles have the number of their system in the name (`ATTITUDE_2`); those of ground stations
-    are left out. Fields are converted to deg, rad, m, m/s, by the units in the definitions of the
+    vehicles have the number of their system in the name (`ATTITUDE_2`); messages of ground stations
+    are omitted. Fields are converted to deg, rad, m, m/s, by the units in the definitions of the
     messages.
     """
 
