@@ -15,6 +15,7 @@ from residnet.evaluation.selection import (
     log_error_ratio,
     select_models,
 )
+from residnet.evaluation.verdict import describe_diverged_heads
 
 EVEN = SelectionBlocks(np.full(5, 0.2), "logs")
 JITTER = np.array([1.0, -1.0, 2.0, -2.0, 0.0])
@@ -147,6 +148,29 @@ def test_the_file_says_of_each_model_what_decided() -> None:
     assert rows["mlp"]["standard_error"] == pytest.approx(0.1 * JITTER.std(ddof=1) / np.sqrt(5))
     assert (rows["mlp"]["sound"], rows["mlp"]["diverged"]) == (False, 2)
     assert rows["constant_velocity"]["sound"] is True
+
+
+@pytest.mark.parametrize(
+    ("family", "remedy"), [("closed-form head", "choose: free_run"), ("network", "add logs")]
+)
+def test_a_single_head_that_diverges_is_refused_in_plain_words(family: str, remedy: str) -> None:
+    """Also if its error is not smaller than that of the selected model."""
+    hull = contender("hull", "baseline", 0.5)
+    for error in (0.4, 0.9):
+        head = contender("plsr", family, error, diverged=2, faults=FAULT)
+        (line,) = describe_diverged_heads(chosen(hull, head).to_record())
+        assert line.startswith(
+            "plsr must not be used alone: 2 of its 7 validation windows diverged (T30). hull was"
+            " selected instead; to use plsr, "
+        )
+        assert remedy in line
+    # another head was selected: the reason of the selection says why
+    ridge = contender("ridge", "closed-form head", 0.2)
+    head = contender("plsr", family, 0.1, diverged=2)
+    assert describe_diverged_heads(chosen(hull, ridge, head).to_record()) == []
+    # a head that only has a fault of its physical checks is not refused
+    head = contender("plsr", family, 0.9, faults=FAULT)
+    assert describe_diverged_heads(chosen(hull, head).to_record()) == []
 
 
 def test_of_stretches_half_a_standard_error_is_taken() -> None:

@@ -251,6 +251,23 @@ def test_unsound_models_and_divergences_are_named() -> None:
     )
 
 
+def test_the_verdict_refuses_a_single_head_that_diverges() -> None:
+    (network,) = selection().models
+    plsr = network.model_copy(
+        update={
+            "model": "plsr",
+            "family": "closed-form head",
+            "diverged": 3,
+            "sound": False,
+            "faults": ("3 of its 12 validation windows diverged (T30)",),
+        }
+    )
+    hull = network.model_copy(update={"model": "baseline", "family": "baseline"})
+    chosen = selection().model_copy(update={"selected": "baseline", "models": (hull, plsr)})
+    said = write_verdict(evidence(selected="baseline", selection=chosen))
+    assert any(line.startswith("plsr must not be used alone: 3 of its 12") for line in said)
+
+
 @pytest.mark.parametrize(
     ("entries", "expected", "reason"),
     [

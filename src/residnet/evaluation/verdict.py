@@ -159,8 +159,8 @@ def write_verdict(evidence: VerdictEvidence) -> list[str]:
 
     Position and heading errors of the selected model at the main horizon, the reasons for its
     level, findings of the data checks, reference models and noise floor, other horizons, number of
-    windows and range of speeds, velocity errors, failed checks, reason of the selection, and the
-    share of data outside the training range. Sentences without data are omitted.
+    windows and range of speeds, velocity errors, failed checks, reason of the selection, heads that
+    diverged, and the share of data outside the training range. Sentences without data are omitted.
     """
     main = main_horizon(evidence)
     limitation_sentences = [
@@ -180,6 +180,7 @@ def write_verdict(evidence: VerdictEvidence) -> list[str]:
         "" if main is None or is_useless(evidence) else compare_velocity_errors(evidence),
         describe_soundness(evidence),
         "" if evidence.selection is None else evidence.selection.reason,
+        *([] if evidence.selection is None else describe_diverged_heads(evidence.selection)),
         describe_extrapolation(evidence),
         describe_distance(evidence),
     ]
@@ -706,6 +707,35 @@ def describe_soundness(evidence: VerdictEvidence) -> str:
     if faults:
         return f"It is UNSOUND: {'; '.join(faults)}."
     return "No window diverged, and it passed all physical checks."
+
+
+_HEAD_FAMILIES = ("closed-form head", "network")
+_DIVERGENCE_REMEDIES = {
+    "closed-form head": (
+        "fit it with choose: free_run or a lower degree or order, or fit mlp or lstm, which are"
+        " trained on free runs"
+    ),
+    "network": "add logs of such motion, or fit plsr with choose: free_run",
+}
+
+
+def describe_diverged_heads(selection: SelectionFile) -> list[str]:
+    """Return a sentence for each head that diverged in free runs, if no head was selected.
+
+    The selected model is then not what was asked for. If another head was selected, the reason of
+    the selection names diverged heads with a smaller error.
+    """
+    selected_row = next((row for row in selection.models if row.model == selection.selected), None)
+    if selected_row is None or selected_row.family in _HEAD_FAMILIES:
+        return []
+    return [
+        f"{row.model} must not be used alone: {'; '.join(faults)}. {selection.selected} was"
+        f" selected instead; to use {row.model}, {_DIVERGENCE_REMEDIES[row.family]}."
+        for row in selection.models
+        if row.diverged
+        and row.family in _HEAD_FAMILIES
+        and (faults := [fault for fault in row.faults if "diverged" in fault])
+    ]
 
 
 def describe_extrapolation(evidence: VerdictEvidence) -> str:

@@ -19,7 +19,12 @@ from residnet.dynamics.store import load_model, model_names
 from residnet.evaluation.band import build_bands_file
 from residnet.evaluation.goodness import build_goodness_file
 from residnet.evaluation.soundness import build_sanity_file
-from residnet.evaluation.verdict import list_model_objections, rate_model, write_verdict
+from residnet.evaluation.verdict import (
+    describe_diverged_heads,
+    list_model_objections,
+    rate_model,
+    write_verdict,
+)
 from residnet.export import get_exporter
 from residnet.export.vessel import ExportedVessel
 from residnet.identification.excitation import assess_excitation
@@ -94,6 +99,8 @@ def execute(config: FitConfig, folder: RunFolder) -> TaskOutcome:
         "" if selection.default_ensemble is None else f"; predictor: {selection.default_ensemble}"
     )
     log_message(f"  selected: {selection.selected}{predictor_text}")
+    for warning in describe_diverged_heads(selection.to_record()):
+        log_message(f"  {warning}")
     folder.write_record(folder.selection, selection.to_record())
     folder.write_record(folder.sanity, build_sanity_file(identified_models.sanity_findings))
     folder.write_record(
