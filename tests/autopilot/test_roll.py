@@ -18,7 +18,7 @@ from residnet.autopilot.roll_config import (
     RollWeights,
     Sea,
 )
-from residnet.autopilot.training.roll import train_roll_policy, tune_roll_law
+from residnet.autopilot.training.roll import RollFit, train_roll_policy, tune_roll_law
 from residnet.core.errors import ConfigError
 from residnet.physics.vessel import load_vessel
 
@@ -144,6 +144,39 @@ def test_training_starts_from_the_law_and_improves_it(simulation: RollSimulation
     commands, _ = policy(measured, memory)
     mirrored, _ = policy(-measured, -memory)
     torch.testing.assert_close(mirrored, -commands)
+
+
+def test_a_larger_heading_error_than_that_of_the_law_costs(simulation: RollSimulation) -> None:
+    inputs, heights = simulation.sample_inputs(BEAM_SEAS, 4, 5)
+    law = make_policy(gains={"fin_roll_rate_gain": 2.0})
+    lazy = make_policy(gains={"fin_roll_rate_gain": 2.0, "heading_gain": 0.05})
+    settings = RollTraining(heading_excess=2.0, validation_rows=1)
+    losses = {}
+    with torch.no_grad():
+        runs = {name: simulation.simulate(p, inputs) for name, p in (("law", law), ("lazy", lazy))}
+        for name, start_law in (("free", None), ("limited", law)):
+            fit = RollFit(law, simulation, BEAM_SEAS, RollWeights(), settings, 0, start_law)
+            losses[name] = {
+                key: float(fit.compute_loss(run, inputs, heights)) for key, run in runs.items()
+            }
+    mean_costs = runs["lazy"].costs(heights, RollWeights()).mean()
+    assert losses["free"]["lazy"] == pytest.approx(float(mean_costs))
+    # the law itself has no excess
+    assert losses["limited"]["law"] == pytest.approx(losses["free"]["law"])
+    rms = {name: float(run.heading.square().mean().sqrt()) for name, run in runs.items()}
+    assert rms["lazy"] > 1.1 * rms["law"]
+    penalty = losses["limited"]["lazy"] - losses["free"]["lazy"]
+    assert penalty == pytest.approx(2.0 * (rms["lazy"] / rms["law"] - 1.0), rel=1e-3)
+
+
+def test_an_epoch_far_above_the_best_is_discarded(simulation: RollSimulation) -> None:
+    settings = RollTraining(validation_rows=1)
+    fit = RollFit(make_policy(), simulation, BEAM_SEAS, RollWeights(), settings, 0)
+    assert fit.find_worse_epochs() == []
+    fit.start_score = 2.0
+    losses = (1.9, 1.93, 2.0, math.nan, 1.5, 1.6)
+    fit.history = [{"epoch": float(i), "validation": loss} for i, loss in enumerate(losses)]
+    assert fit.find_worse_epochs() == [False, False, True, True, False, True]
 
 
 def test_tuning_finds_a_better_law(simulation: RollSimulation) -> None:

@@ -19,7 +19,8 @@ from residnet_tasks.actuators import ActuatorsTaskConfig
 from residnet_tasks.import_logs import ImportConfig
 from tiny import write_yaml
 
-from residnet.autopilot.report import course
+from residnet.autopilot.records import RollMetricsFile
+from residnet.autopilot.report import course, roll
 from residnet.autopilot.report import heading as autopilot
 from residnet.core.errors import DataError
 from residnet.core.log import Log
@@ -94,6 +95,44 @@ def made_autopilot(run: Path) -> Path:
     drawn = {key: random.uniform(1, 2, 10) for key in names}
     plants = pd.DataFrame({"controller": ["net"] * 5 + ["pd"] * 5, **drawn})
     plants.to_parquet(run / "plants.parquet")
+    return run
+
+
+def made_roll(run: Path) -> Path:
+    """Six controllers in two sea states and three directions; head seas roll nothing."""
+    resolved(run, {"task": "roll"})
+    kinds = dict.fromkeys(("heading", "rudder", "fins", "both"), "classical")
+    kinds |= {"both_trained": "constants", "learned": "policy"}
+    gain_names = ("heading_gain", "yaw_rate_gain", "filter_share", "rudder_roll_rate_gain")
+    gain_names += ("rudder_roll_gain", "fin_roll_rate_gain", "fin_roll_gain")
+    rows = []
+    totals = []
+    controllers = []
+    for i, (model, kind) in enumerate(kinds.items()):
+        reduction = 0.15 * i
+        shown = {"roll_reduction": reduction, "heading_rms": (0.3 + 0.01 * i) * DEG}
+        for state in (3, 4):
+            for direction in (0.0, 90.0, 180.0):
+                roll_rms = (0.05 if direction == 180.0 else 4.0) * (1.0 - reduction) * DEG
+                sea = {"sea_state": state, "direction": direction * DEG, "height": 0.88}
+                sea |= {"period": 7.5, "n": 12, "is_judged": direction != 180.0}
+                rms = {"roll_rms": roll_rms, "rudder_rms": DEG, "fin_rms": 5 * DEG}
+                row = {"model": model, "kind": kind, "split": "simulated"}
+                rows.append({**row, **sea, **rms, **shown})
+        for total_state in (3, 4, None):
+            total = {"model": model, "sea_state": total_state, "roll_rms": 3.3 * DEG}
+            totals.append({**total, **shown})
+        costs = {"tuning_cost": 2.0, "start_cost": None, "judged_cost": 2.0 - 0.1 * i}
+        gains = dict.fromkeys(gain_names, 0.5)
+        controllers.append({"model": model, "kind": kind, "gains": gains, **costs, "seconds": 9.0})
+    comparison = {
+        "policy": "learned", "classical": "both_trained", "tolerance": 0.02, "is_as_good": False,
+        "roll": {"value": -0.031, "interval": [-0.04, -0.02]}, "n_seas": 4, "n_less_roll": 3,
+        "heading": {"value": 0.048, "interval": [0.03, 0.06]},
+    }  # fmt: skip
+    content = {"schema": "residnet.metrics/1", "run": "made", "channels": {}, "speed": 7.71}
+    content |= {"comparison": comparison, "controllers": controllers}
+    write_json(run / "metrics.json", {**content, "totals": totals, "rows": rows})
     return run
 
 
@@ -228,6 +267,7 @@ TASKS: dict[str, tuple[Callable[[Path], Path], Callable[[RunFiles], Sequence[Sec
     "autopilot": (made_autopilot, autopilot.sections),
     "course": (made_course, course.sections),
     "fit": (made_run, fit_sections),
+    "roll": (made_roll, roll.sections),
     "import": (made_import, of_task(ImportConfig)),
     "simulate": (made_simulate, manoeuvres.sections),
     "variants": (made_variants, sweep.sections),
@@ -294,6 +334,24 @@ def test_controllers_are_compared_by_settling_time_and_effort(
     effort = next(table for table in page.tables if "sea, root mean square [deg]" in table[0])
     shown = ["net", "57.30", "68.75", "28.65", "34.38", "328.28", "393.94", *["2.000"] * 3]
     assert effort[2] == shown
+
+
+def test_roll_reduction_by_sea_state_and_direction(page_of: Callable[[str], Path]) -> None:
+    totals, seas, *_ = Page(plain(page_of("roll"))).tables
+    assert totals[-1] == ["learned policy", "75.0", "75.0", "0.350"]
+    lines = {line[0]: line[1:] for line in seas}
+    assert lines["4, 90 deg"] == ["4.00", "60.0", "75.0", "0.300", "0.340", "0.350"]
+    assert len([name for name in lines if name.endswith("deg")]) == 6
+    assert 'class="weak">75.0' in plain(page_of("roll"))
+
+
+def test_a_roll_policy_with_a_larger_heading_error_is_not_as_good(
+    page_of: Callable[[str], Path],
+) -> None:
+    metrics = RunFiles(page_of("roll").parent).read_task_metrics(RollMetricsFile)
+    first, figures, *_ = roll.verdict_texts(metrics)
+    assert first.startswith("The learned policy is NOT at least as good as")
+    assert "(+4.8 %, 95 % confidence interval +3.0 to +6.0 %)" in figures
 
 
 def test_a_course_shows_what_was_missed(page_of: Callable[[str], Path]) -> None:

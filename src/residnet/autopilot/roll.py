@@ -119,6 +119,11 @@ class RollPolicy(nn.Module):
         """Return the constants of the law by name (`GAIN_NAMES`), of the first row of a batch."""
         return {name: float(getattr(self, name)[0, 0]) for name in GAIN_NAMES}
 
+    def copy_law(self) -> RollPolicy:
+        """Return the law with the present constants, without network and gradients."""
+        gains = {name: getattr(self, name) for name in GAIN_NAMES}
+        return RollPolicy(gains, self.limits, 0, self.dt)
+
     def forward(self, measured: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return rudder and fin commands [B, 2] in rad, and the next memory [B, n_state].
 

@@ -260,8 +260,10 @@ def _rows_table(metrics: RollMetricsFile, models: Sequence[str]) -> Table:
     rows = {(row.model, row.sea_state, row.direction): row for row in metrics.rows}
     table = Table(
         ["sea state, direction", "RMS roll [deg]", *models, HEADING_ONLY, *models],
-        "RMS roll of heading control alone, its reduction, and the RMS heading error. Grey: the"
-        " vessel rolls less than the noise of the sensors, so that there is no roll to reduce.",
+        "RMS roll of heading control alone, its reduction, and the RMS heading error. "
+        + "; ".join(f"{model}: {LABELS[model]}" for model in (HEADING_ONLY, *models))
+        + ". Grey: the vessel rolls less than the noise of the sensors, so that there is no roll to"
+        " reduce.",
         [
             (LABELS[HEADING_ONLY], 1),
             ("roll reduction [%]", len(models)),
@@ -335,6 +337,8 @@ def _definitions(metrics: RollMetricsFile) -> list[str]:
         "Wave loads are first-order Froude-Krylov loads of a box with the volume and the"
         " metacentric radius of the hull; diffraction is neglected. Reductions hold for these loads"
         " and for the fins of the vessel file.",
+        "The network starts from the law with trained constants; its training has a penalty for a"
+        " heading error above that of this law (`training.heading_excess`).",
         "Cost: mean square roll, heading error and angles of rudder and fins with the weights of"
         " the config, divided by the squared significant wave height. Tuning and training minimise"
         " it. The best classical combination is that with the lowest cost in the judging seas.",

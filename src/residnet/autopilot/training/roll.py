@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from residnet.autopilot.roll import RollPolicy, RollSimulation
+from residnet.autopilot.roll import RollPolicy, RollRuns, RollSimulation
 from residnet.autopilot.roll_config import (
     GAIN_NAMES,
     RollTraining,
@@ -27,6 +27,8 @@ _DEFAULT_WEIGHTS: Final = RollWeights()
 _DEFAULT_TUNING: Final = RollTuning()
 _DIVERGED_COST: Final = 1e6
 """Cost of a simulation that is not finite."""
+_WORSE_LOSS_RATIO: Final = 1.03
+"""Validation loss relative to the best one above which an epoch is discarded."""
 SEARCH_RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "heading_gain": (0.05, 3.0),
     "yaw_rate_gain": (0.05, 20.0),
@@ -50,6 +52,7 @@ class RollFit(EpochTraining):
         weights: weights of the cost.
         settings: settings of the training.
         seed: seed of batches and validation.
+        start_law: law whose heading error the policy should not exceed; None for no such law.
     """
 
     def __init__(
@@ -60,6 +63,7 @@ class RollFit(EpochTraining):
         weights: RollWeights,
         settings: RollTraining,
         seed: int,
+        start_law: RollPolicy | None = None,
     ) -> None:
         super().__init__(settings, seed)
         self.policy = policy
@@ -69,6 +73,29 @@ class RollFit(EpochTraining):
         self.validation_inputs, self.validation_heights = simulation.sample_inputs(
             seas, settings.validation_rows, seed + 1_000_003
         )
+        # in a tuple, because the law is no part of the trained module
+        self._start_laws = () if start_law is None else (start_law,)
+
+    def compute_loss(self, runs: RollRuns, inputs: Tensor, heights: Tensor) -> Tensor:
+        """Return the mean cost, plus the penalty of a heading error above that of the start law.
+
+        Args:
+            runs: simulations of the policy.
+            inputs: their inputs, with which the start law is simulated as well.
+            heights: wave heights [B] in m, which are equal within a sea state.
+        """
+        loss = runs.costs(heights, self.weights).mean()
+        for start_law in self._start_laws:
+            with torch.no_grad():
+                law_runs = self.simulation.simulate(start_law, inputs)
+            for height in heights.unique():
+                is_state = heights == height
+                policy_square, law_square = (
+                    simulated.heading[is_state].square().mean() for simulated in (runs, law_runs)
+                )
+                excess = (policy_square / law_square).sqrt() - 1.0
+                loss = loss + self.settings.heading_excess * excess.clamp(min=0.0)
+        return loss
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Return Adam over the constants of the law and the network."""
@@ -81,29 +108,44 @@ class RollFit(EpochTraining):
             self.validate_start()
 
     def on_train_epoch_start(self) -> None:
-        """Set the learning rate of the epoch."""
+        """Set the learning rate of the epoch; restart from the best policy after a worse one."""
         self.seed_epoch()
-        for group in self.trainer.optimizers[0].param_groups:
-            group["lr"] = self.settings.rate(self.epoch)
+        is_worse = self.find_worse_epochs()
+        optimizer = self.trainer.optimizers[0]
+        if is_worse and is_worse[-1]:
+            # gradients far from a good policy are useless, and so are the moments of Adam
+            self.policy.load_state_dict(self.best_state)
+            optimizer.state.clear()
+        for group in optimizer.param_groups:
+            group["lr"] = self.settings.rate(self.epoch) * 0.5 ** sum(is_worse)
+
+    def find_worse_epochs(self) -> list[bool]:
+        """Return which epochs have a validation loss far above the best before them."""
+        best_loss = math.inf if self.start_score is None else self.start_score
+        is_worse = []
+        for entry in self.history:
+            loss = entry.get("validation", best_loss)
+            is_worse.append(not loss <= _WORSE_LOSS_RATIO * best_loss)
+            best_loss = min(best_loss, loss)
+        return is_worse
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, number: int) -> Any:
         """Return the batch unchanged, because policies are trained on the CPU."""
         return batch
 
     def training_step(self, batch: tuple[Tensor, Tensor], number: int) -> Tensor:
-        """Return the mean cost of a batch of inputs and wave heights."""
+        """Return the loss of a batch of inputs and wave heights."""
         inputs, heights = batch
-        costs = self.simulation.simulate(self.policy, inputs).costs(heights, self.weights)
-        loss = costs.mean()
+        loss = self.compute_loss(self.simulation.simulate(self.policy, inputs), inputs, heights)
         self._losses.append(float(loss.detach()))
         return loss
 
     def compute_validation_score(self) -> tuple[nn.Module, float]:
-        """Return the policy and its mean cost over the validation seas."""
+        """Return the policy and its loss over the validation seas."""
         with torch.no_grad():
             runs = self.simulation.simulate(self.policy, self.validation_inputs)
-            score = float(runs.costs(self.validation_heights, self.weights).mean())
-        return self.policy, score
+            loss = self.compute_loss(runs, self.validation_inputs, self.validation_heights)
+        return self.policy, float(loss)
 
 
 @final
@@ -150,9 +192,11 @@ def train_roll_policy(
         folder: folder of the checkpoint; None for none.
 
     Returns:
-        The curve by epoch, and the cost at the start and of the best epoch.
+        The curve by epoch, and the loss at the start and of the best epoch: the mean cost and the
+        penalty of a larger heading error.
     """
-    fit = RollFit(policy, simulation, seas, weights, settings, seed)
+    start_law = policy.copy_law() if policy.units > 0 else None
+    fit = RollFit(policy, simulation, seas, weights, settings, seed, start_law)
     notes: dict[str, Any] = run_epochs(name, fit, RandomSeas(fit), policy, policy, folder)
     return notes
 
