@@ -21,6 +21,8 @@ from residnet.identification.member_evidence import (
     group_windows,
     select_members,
 )
+from residnet.identification.records import FitNotes, MemberExclusion, describe_exclusions
+from residnet.report.sections.models import describe_excluded_members
 
 N_WINDOWS = 12
 LENGTH = 50
@@ -132,15 +134,22 @@ def members(fitter: Fitter) -> list[FittedModel]:
 
 
 def test_an_ensemble_does_not_use_the_sway_of_a_member_that_drifts(
-    fitter: Fitter, members: list[FittedModel], tmp_path: Path
+    fitter: Fitter,
+    members: list[FittedModel],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    messages: list[str] = []
+    monkeypatch.setattr("residnet.identification.fitter.log_message", messages.append)
     ensemble = fitter.build_trajectory_ensemble("ensemble", members)
     model = ensemble.model
     assert isinstance(model, MeanOfTrajectories)
     assert ensemble.spec.weights[0][1] == 1.0
     assert ensemble.spec.weights[1][1] == 0.0
     assert ensemble.notes["members"] == ["baseline", "drifting"]
-    assert ensemble.notes["excluded_velocities"]["drifting"] == ["v"]
+    notes = FitNotes.model_validate(ensemble.notes)
+    assert [(row.member, row.velocity) for row in notes.exclusions] == [("drifting", "v")]
+    assert messages[-1].startswith("  ensemble: drifting is not used for sway v (p = ")
 
     # the stored model is the same, and its sway is that of the first member
     save_model(tmp_path / "ensemble", ensemble.spec, model)
@@ -164,3 +173,28 @@ def test_an_ensemble_does_not_use_the_sway_of_a_member_that_drifts(
     ):
         np.testing.assert_allclose(mean.states[:, 4], first.states[:, 4], atol=1e-9)
         np.testing.assert_allclose(mean.states[:, 3:], stepped.states[:, 3:], atol=1e-12)
+
+
+def test_the_report_says_which_member_is_not_used_for_which_velocity() -> None:
+    def exclude(member: str, velocity: str, reference: Any, p_value: float) -> MemberExclusion:
+        return MemberExclusion(
+            member=member, velocity=velocity, reference=reference, p_value=p_value
+        )
+
+    exclusions = (
+        exclude("hull", "v", "constant velocity", 0.021),
+        exclude("hull", "r", "constant velocity", 0.0004),
+        exclude("hull_network", "u", "the mean of the others", 0.04),
+    )
+    sentences = [
+        "hull is not used for sway v (p = 0.02) and yaw rate r (p = 0.0004): on validation logs"
+        " constant velocity has a smaller error (paired t-test)",
+        "hull_network is not used for surge u (p = 0.04): on validation logs the ensemble has a"
+        " smaller error without it (paired t-test)",
+    ]
+    assert describe_exclusions(exclusions) == sentences
+    notes = FitNotes(members=("hull", "hull_network"), exclusions=exclusions, left_out=("mlp",))
+    assert describe_excluded_members(notes) == [
+        *sentences,
+        "mlp is not a member: it diverged on validation logs",
+    ]

@@ -338,6 +338,24 @@ def test_what_doctor_sanity_refit_and_currents_found_is_shown(run: Path) -> None
     assert "10 Hz over" in page
 
 
+def test_members_that_an_ensemble_does_not_use_are_named_with_the_reason(run: Path) -> None:
+    fit = run / "models" / "mlp" / "fit.json"
+    evidence = {"velocity": "v", "reference": "constant velocity", "p_value": 0.012}
+    notes = {
+        "members": ["hull", "hull_network"],
+        "left_out": ["lstm"],
+        "exclusions": [{"member": "hull", **evidence}],
+    }
+    write_json(fit, json.loads(fit.read_text()) | notes)
+    text = part(html.unescape(shown(run)), "models")
+    assert "mean of hull (not for v), hull_network" in text
+    assert (
+        "mlp: hull is not used for sway v (p = 0.01): on validation logs constant velocity has a"
+        " smaller error (paired t-test)." in text
+    )
+    assert "mlp: lstm is not a member: it diverged on validation logs." in text
+
+
 def test_goodness_of_fit_is_as_the_file_says(run: Path) -> None:
     target = autoregressive(0.9, 3, 800, seed=0).T
     noise = 0.01 * np.random.default_rng(0).normal(size=target.shape)

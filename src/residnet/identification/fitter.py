@@ -37,6 +37,7 @@ from residnet.identification.domain import estimate_domain
 from residnet.identification.member_evidence import MemberSelection, group_windows, select_members
 from residnet.identification.prepared import compute_velocity_limits
 from residnet.identification.recipe import TrainingDataSummary, has_enough_logs_for_networks
+from residnet.identification.records import MemberExclusion, describe_exclusions
 from residnet.identification.settings import FitSettings
 from residnet.identification.training_schedule import resolve_training
 from residnet.preprocessing.prepare import PreparedLog, compute_training_ranges
@@ -590,7 +591,19 @@ class Fitter:
             raise FitError("fewer than two members did not diverge on validation logs")
         if not self.validation_in_training:
             retained_members = self._add_candidates(name, retained_members, candidates)
-        selection = self._select_by_evidence(name, retained_members)
+        selection = self._select_by_evidence(retained_members)
+        dynamic_states = self.training_logs[0].dof.dynamic_states
+        exclusions = [
+            MemberExclusion(
+                member=retained_members[exclusion.member].name,
+                velocity=dynamic_states[exclusion.velocity],
+                reference=exclusion.reference,
+                p_value=exclusion.p_value,
+            )
+            for exclusion in selection.exclusions
+        ]
+        for sentence in describe_exclusions(exclusions):
+            log_message(f"  {name}: {sentence}")
         is_member = np.asarray(selection.is_used.any(axis=1))
         excluded_names += [
             member.name
@@ -610,18 +623,8 @@ class Fitter:
         weights = () if is_used.all() else tuple(map(tuple, selection.weights[is_member].tolist()))
         ensemble = self._build_ensemble(name, retained_members, weights=weights)
         ensemble.notes["left_out"] = excluded_names
-        dynamic_states = self.training_logs[0].dof.dynamic_states
-        excluded_velocities = {
-            member.name: [
-                state
-                for state, is_used_for_state in zip(dynamic_states, row, strict=True)
-                if not is_used_for_state
-            ]
-            for member, row in zip(retained_members, is_used, strict=True)
-            if not row.all()
-        }
-        if excluded_velocities:
-            ensemble.notes["excluded_velocities"] = excluded_velocities
+        if exclusions:
+            ensemble.notes["exclusions"] = [exclusion.model_dump() for exclusion in exclusions]
         return self._save_and_reload(ensemble)
 
     def _add_candidates(
@@ -646,29 +649,20 @@ class Fitter:
                 smallest_error = error
         return extended_members
 
-    def _select_by_evidence(self, name: str, members: Sequence[FittedModel]) -> MemberSelection:
-        """Return which members are used for which velocities, and log the exclusions."""
+    def _select_by_evidence(self, members: Sequence[FittedModel]) -> MemberSelection:
+        """Return which members are used for which velocities, by their validation errors."""
         scorer = self.score_on_validation
         errors_by_member = [scorer.run(member.model)[1] for member in members]
         reference_spec = self.build_spec(CONSTANT_VELOCITY, CONSTANT_VELOCITY, ZeroBaselineConfig())
         constant_velocity = scorer.run(reference_spec.build())[1]
-        dof = constant_velocity.dof
-        selection = select_members(
+        return select_members(
             [errors.velocity_errors for errors in errors_by_member],
             constant_velocity.velocity_errors,
             lambda errors: np.sqrt(constant_velocity.mean_by_window(errors**2)),
             group_windows(scorer.windows),
-            dof.active_indices,
+            constant_velocity.dof.active_indices,
             compares_members=not self.validation_in_training,
         )
-        for exclusion in selection.exclusions:
-            log_message(
-                f"  {name}: {members[exclusion.member].name} is not used for"
-                f" {dof.dynamic_states[exclusion.velocity]}: on validation logs its error is"
-                f" significantly larger than that of {exclusion.reference}"
-                f" (p = {exclusion.p_value:.2g})"
-            )
-        return selection
 
     def _build_ensemble(
         self,

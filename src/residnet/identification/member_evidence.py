@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import scipy
@@ -33,13 +34,13 @@ class Exclusion:
         member: index of the member.
         velocity: index of the velocity.
         p_value: of the paired one-sided t-test.
-        reference: what the error is significantly larger than, as a text.
+        reference: what has a significantly smaller error.
     """
 
     member: int
     velocity: int
     p_value: float
-    reference: str
+    reference: Literal["constant velocity", "the mean of the others"]
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,12 @@ write these notes. An `alias` is the key in the file.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Literal
+
 from pydantic import ConfigDict, Field
 
+from residnet.core.format import channel_title
 from residnet.core.records import FileRecord, Record
 
 Hyperparameter = float | str | tuple[float | str, ...]
@@ -161,6 +165,41 @@ class SteadyConstraint(OpenRecord):
     bias_error: float = 0.0
 
 
+class MemberExclusion(Record):
+    """A member that an ensemble does not use for a velocity, with the evidence.
+
+    Attributes:
+        member: name of the member.
+        velocity: name of the velocity.
+        reference: what has a significantly smaller error on validation windows.
+        p_value: of the paired one-sided t-test.
+    """
+
+    member: str
+    velocity: str
+    reference: Literal["constant velocity", "the mean of the others"]
+    p_value: float
+
+
+def describe_exclusions(exclusions: Sequence[MemberExclusion]) -> list[str]:
+    """Return a sentence for each member and reason, without a full stop."""
+    reasons = {
+        "constant velocity": "constant velocity has a smaller error",
+        "the mean of the others": "the ensemble has a smaller error without it",
+    }
+    sentences = []
+    for member, reference in dict.fromkeys((row.member, row.reference) for row in exclusions):
+        rows = [row for row in exclusions if (row.member, row.reference) == (member, reference)]
+        velocities = " and ".join(
+            f"{channel_title(row.velocity)} (p = {row.p_value:.1g})" for row in rows
+        )
+        sentences.append(
+            f"{member} is not used for {velocities}: on validation logs {reasons[reference]}"
+            " (paired t-test)"
+        )
+    return sentences
+
+
 class FitNotes(FileRecord):
     """models/<model>/fit.json: the notes on the fit of one model.
 
@@ -171,7 +210,9 @@ class FitNotes(FileRecord):
         validation_diverged: number of diverged validation windows.
         baseline: name of the baseline to which a head adds its residual.
         members: members of an ensemble.
-        excluded_velocities: velocities for which a member of an ensemble is not used.
+        excluded_members: names of models that are not in an ensemble, because they diverged or are
+            not used for any velocity.
+        exclusions: velocities for which a member of an ensemble is not used.
         parameters: number of fitted parameters.
         n_terms: number of basis functions; one number per axis if the axes differ.
         order: number of latent variables; one number per axis if the axes differ.
@@ -203,7 +244,8 @@ class FitNotes(FileRecord):
     validation_diverged: int = 0
     baseline: str = "baseline"
     members: tuple[str, ...] = ()
-    excluded_velocities: dict[str, tuple[str, ...]] = Field(default_factory=dict)
+    excluded_members: tuple[str, ...] = Field(default=(), alias="left_out")
+    exclusions: tuple[MemberExclusion, ...] = ()
     parameters: float | None = None
     n_terms: Hyperparameter | None = Field(default=None, alias="terms")
     order: Hyperparameter | None = None

@@ -20,7 +20,12 @@ from residnet.core.format import (
 from residnet.core.names import CHANNEL_UNITS
 from residnet.evaluation.records import GoodnessFile, GoodnessRow
 from residnet.evaluation.verdict import describe_divergence
-from residnet.identification.records import CoefficientRow, FitNotes, Hyperparameter
+from residnet.identification.records import (
+    CoefficientRow,
+    FitNotes,
+    Hyperparameter,
+    describe_exclusions,
+)
 from residnet.physics.terms import parse_term
 from residnet.report.blocks import Block, Cell, CellMark, Code, Section, Table, Text, build_table
 from residnet.report.figure import BLUE, Case, Curve, Figure, GlyphStyle, Panel, style_family
@@ -227,20 +232,37 @@ def _head_section(run: RunFiles) -> Section | None:
         "A head adds its residual to the accelerations of a baseline. Further baselines and"
         " ensembles have no baseline."
     )
+    remarks = [
+        f"{run.model_label(model)}: {sentence}."
+        for model, notes in notes_or_defaults.items()
+        for sentence in describe_excluded_members(notes)
+    ]
     return Section(
-        "Residual heads and further models", [Text(introduction, is_secondary=True), table]
+        "Residual heads and further models",
+        [Text(introduction, is_secondary=True), table, *([Text(remarks)] if remarks else [])],
     )
+
+
+def describe_excluded_members(notes: FitNotes) -> list[str]:
+    """Return sentences on models that an ensemble does not use, or not for all velocities."""
+    sentences = describe_exclusions(notes.exclusions)
+    evidence_names = {row.member for row in notes.exclusions}
+    sentences += [
+        f"{member} is not a member: it diverged on validation logs"
+        for member in notes.excluded_members
+        if member not in evidence_names
+    ]
+    return sentences
 
 
 def _inputs_text(settings: ModelSettings, notes: FitNotes) -> str:
     """Return the inputs and the baseline of a head, or the members of an ensemble."""
     if notes.members:
-        return "mean of " + ", ".join(
-            f"{name} (not for {', '.join(notes.excluded_velocities[name])})"
-            if name in notes.excluded_velocities
-            else name
-            for name in notes.members
-        )
+        texts = []
+        for name in notes.members:
+            velocities = [row.velocity for row in notes.exclusions if row.member == name]
+            texts.append(f"{name} (not for {', '.join(velocities)})" if velocities else name)
+        return "mean of " + ", ".join(texts)
     if settings.head is None:
         return "refitted through rollouts" if notes.refit is not None else "least squares"
     inputs = ", ".join(settings.head.features or ()) or "all channels"
