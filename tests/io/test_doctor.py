@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from known_logs import wavy
 from planted import FAULTS
+from simulated_motion import BOATS, simulate_motion
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
@@ -215,6 +216,40 @@ def test_estimate_position_causes_measures_lags_in_seconds(lag: float) -> None:
     )
     for finding in findings:
         assert finding.figures["value_1"] == pytest.approx(lag, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("boat", "delays"),
+    [
+        ("dinghy", (0.0, 0.0)),
+        ("catamaran", (0.0, 0.0)),
+        ("dinghy", (0.65, 0.65)),
+        ("dinghy", (1.2, 0.3)),
+        ("catamaran", (1.2, 0.3)),
+    ],
+)
+def test_estimate_position_causes_separates_clocks(boat: str, delays: tuple[float, float]) -> None:
+    estimates = []
+    t = np.arange(3.0, 300.0, 0.1)
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        motion = simulate_motion(BOATS[boat], random, duration=306.0)
+        channels = {name: motion.sample(name, t) for name in ("x", "y", "r")}
+        channels |= {name: motion.sample(name, t - delays[0]) for name in ("u", "v")}
+        channels["psi"] = motion.sample("psi", t - delays[1])
+        noise = {"x": 0.05, "y": 0.05, "psi": 0.005, "u": 0.02, "v": 0.02, "r": 0.003}
+        channels = {
+            name: values + noise[name] * random.standard_normal(t.size)
+            for name, values in channels.items()
+        }
+        causes = estimate_position_causes(LogStatistics(Log(boat, t, channels)))
+        assert any(delays) or causes == {}
+        sizes = {name: cause.estimates[0] for name, cause in causes.items()}
+        common = sizes.get("lag_xy", 0.0)
+        surge_delay = sizes.get("lag", 0.0) + sizes.get("lag_u", 0.0) - common
+        estimates.append((surge_delay, sizes.get("lag_psi", 0.0) - common))
+    median = np.median(estimates, axis=0)
+    assert median == pytest.approx(delays, abs=0.02, rel=0.1)
 
 
 def test_check_relative_wind_accepts_a_true_wind() -> None:

@@ -7,6 +7,11 @@ White noise on pose and velocities gives the increments a tridiagonal covariance
 whitened. The difference is explained by few causes, selected by orthogonal matching pursuit over
 groups of columns: each cause has columns with its effect on the increments. Standard errors are
 sandwich estimates over twenty sections of the log, because filtered errors are not white.
+
+A filter delays slow motions as another clock does, and faster ones by other times. The inverse of
+either is a series in the derivatives of the channel (Oppenheim and Schafer, Discrete-Time Signal
+Processing, sec. 5.1): the lag is the coefficient of the first one, that of motions slow against the
+filter. Terms of second and third order are selected beside a lag as nuisances.
 """
 
 from __future__ import annotations
@@ -40,6 +45,11 @@ from residnet.quality.statistics import (
 
 MIN_LAG = 0.2
 """Smallest lag in s that affects a rollout of a vessel."""
+_LAG_OF_CURVATURE = {
+    name.replace("lag", "curvature"): name
+    for name in ("lag", "lag_u", "lag_v", "lag_psi", "lag_xy")
+}
+"""Terms of second and third order -> lag without which they are not selected."""
 _MAX_CAUSES = 4
 """Largest number of causes; chosen by hand, because further ones are collinear."""
 # smallest reduction of the sum of squares by a cause in noise variances
@@ -111,6 +121,7 @@ def estimate_yaw_causes(log: LogStatistics) -> dict[str, KinematicCause]:
         columns = {
             "gain": [-_integrate_steps(dt, smoothed_rate)],
             "lag": [np.diff(smoothed_rate)],
+            "curvature": _differentiate_twice(smoothed_rate, t),
             **columns,
         }
     rate_noise = np.full(dt.size, log.noise_std("r"))
@@ -145,6 +156,9 @@ def estimate_position_causes(log: LogStatistics) -> dict[str, KinematicCause]:
         * np.diff(log.cached(_smooth_leaving_out_centre, "psi"))
         * (earth_velocity[1:] + earth_velocity[:-1])
     )
+    curvature_u = [mid_rotation * increments for increments in _differentiate_twice(u, log.t)]
+    curvature_v = [1j * mid_rotation * increments for increments in _differentiate_twice(v, log.t)]
+    mid_velocity = 0.5 * (u[1:] + u[:-1] + 1j * (v[1:] + v[:-1]))
     columns = {
         "gain_u": [-surge_increments],
         "gain_v": [-sway_increments],
@@ -155,6 +169,14 @@ def estimate_position_causes(log: LogStatistics) -> dict[str, KinematicCause]:
         "lag": [lag_u + lag_v],
         "lag_psi": [lag_psi],
         "lag_xy": [-(lag_u + lag_v + lag_psi)],
+        "curvature_u": curvature_u,
+        "curvature_v": curvature_v,
+        "curvature": [a + b for a, b in zip(curvature_u, curvature_v, strict=True)],
+        "curvature_psi": [
+            mid_velocity * increments
+            for increments in _differentiate_twice(heading_rotation, log.t)
+        ],
+        "curvature_xy": _differentiate_twice(earth_velocity, log.t),
         "lever_arm": [np.diff(heading_rotation), 1j * np.diff(heading_rotation)],
         "current": [dt + 0j, 1j * dt],
         "bias": [
@@ -190,6 +212,16 @@ _UNIDENTIFIABLE_CAUSES = {
     "v": ("gain_v", "lag_v"),
     "psi": ("lag_psi", "lever_arm", "lag_v"),
 }
+
+
+def _differentiate_twice(values: np.ndarray, t: np.ndarray) -> list[np.ndarray]:
+    """Return the steps [T - 1] of the first and the second derivative of values [T]; no NaN."""
+    derivative = interpolate_gaps(np.arange(values.size), values)
+    steps = []
+    for _ in range(2):
+        derivative = np.gradient(derivative, t)
+        steps.append(np.diff(derivative))
+    return steps
 
 
 def _integrate_steps(dt: np.ndarray, rates: np.ndarray) -> np.ndarray:
@@ -364,11 +396,12 @@ def _orthogonal_matching_pursuit(
     }
     selected_causes = list[str]()
     residual_energy = energy
-    while len(selected_causes) < _MAX_CAUSES:
+    while len([name for name in selected_causes if name not in _LAG_OF_CURVATURE]) < _MAX_CAUSES:
         residual_energy_by_cause = {
             name: compute_residual_energy([*selected_causes, name])
             for name in columns_by_cause
             if name not in selected_causes
+            and _LAG_OF_CURVATURE.get(name, name) in (name, *selected_causes)
         }
         # among equivalent causes (a lag of one channel, or of all others) the first counts;
         # rounding
@@ -386,8 +419,9 @@ def _orthogonal_matching_pursuit(
             break
         selected_causes = [*selected_causes, best_cause]
         residual_energy = residual_energy_by_cause[best_cause]
-    # backward elimination of causes that later ones made redundant
-    for name in list(selected_causes[:-1]):
+    # backward elimination of causes that later ones made redundant; a lag stays with its curvature
+    lags_with_curvature = {_LAG_OF_CURVATURE.get(name) for name in selected_causes}
+    for name in [name for name in selected_causes[:-1] if name not in lags_with_curvature]:
         reduced_causes = [cause for cause in selected_causes if cause != name]
         selected_causes = (
             reduced_causes
@@ -422,6 +456,7 @@ def _orthogonal_matching_pursuit(
     return {
         name: KinematicCause(estimates[names == name], standard_errors[names == name])
         for name in selected_causes
+        if name not in _LAG_OF_CURVATURE
     }
 
 
