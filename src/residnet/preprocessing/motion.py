@@ -25,6 +25,7 @@ from residnet.core.names import (
     STATE_NAMES,
     WIND_INPUTS,
 )
+from residnet.core.result_cache import cache_results
 from residnet.preprocessing.channel_values import (
     estimate_noise_std,
     find_hampel_outliers,
@@ -39,6 +40,8 @@ _JERK_LEVELS = 10.0 ** (0.5 * np.arange(-8, 5))
 """Candidate jerk intensities, in noise over the cube of the median position interval."""
 _MAX_TUNING_SAMPLES = 4000
 """Largest number of samples for the estimate of the jerk intensity."""
+_CACHE_BYTES = 50_000_000
+"""Largest total size of the stored results of `smooth_track`."""
 _PRODUCT_BLOCK = 1000
 """Number of samples whose transition matrices are computed at once."""
 
@@ -633,6 +636,7 @@ def smooth_measured_motion(
     )
 
 
+@cache_results(_CACHE_BYTES)
 def smooth_track(t: np.ndarray, measurements: np.ndarray, noise_std: ArrayLike) -> np.ndarray:
     """Smooth position, rate and acceleration along one or more axes by a Kalman smoother.
 

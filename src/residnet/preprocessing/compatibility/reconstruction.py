@@ -20,7 +20,9 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from residnet.core.errors import DataError
 from residnet.core.frames import unwrap_angle
+from residnet.core.result_cache import cache_results
 from residnet.preprocessing.compatibility.sensors import (
+    COMPLEX_STEP,
     CURRENT_NAMES,
     N_STATES,
     PSI,
@@ -35,10 +37,12 @@ from residnet.preprocessing.compatibility.sensors import (
     X,
     Y,
     compute_ground_velocity,
+    compute_hermite_weights,
+    differentiate_ground_velocity,
+    differentiate_interpolation,
+    interpolate_states,
 )
 
-_COMPLEX_STEP = 1e-20
-"""Imaginary step of complex-step derivatives, whose error is of the order of its square."""
 _STUDENT_DOF = 5.0
 """Degrees of freedom of the Student distribution of the measurement noise."""
 _MAX_ITERATIONS = 25
@@ -69,6 +73,8 @@ _MAX_GROWTH = 3.0
 """Largest growth of the standard error of an error that the sensors determine."""
 _MAX_NODES = 20_000
 """Largest number of nodes."""
+_CACHE_BYTES = 50_000_000
+"""Largest total size of the stored results of `reconstruct`."""
 _MIN_SAMPLES = 20
 """Smallest number of samples of a sensor."""
 _HEADING_WINDOW = 1.0
@@ -185,6 +191,7 @@ class Reconstruction:
         return self.deviance + len(self.errors) * float(np.log(max(self.n_measurements, 2)))
 
 
+@cache_results(_CACHE_BYTES)
 def reconstruct(
     sensors: Sequence[Sensor], errors: Mapping[str, Prior], step: float
 ) -> Reconstruction:
@@ -317,7 +324,9 @@ class _Problem:
         for iteration in range(_MAX_ITERATIONS):
             solver = self._factorize(residuals, errors)
             if iteration in _CURVATURE_ITERATIONS or n_calm == 1:
-                self.curvature_gradient = self._differentiate_curvature(states, errors, solver)
+                self.curvature_gradient = self._differentiate_curvature(
+                    states, errors, residuals, solver
+                )
                 solver = self._factorize(residuals, errors)
             error_step = np.zeros(errors.size)
             if errors.size:
@@ -510,17 +519,7 @@ class _Problem:
             for rows in (slice(-1), slice(1, None))
         ]
         current = [parameters.get(name, 0.0) for name in CURRENT_NAMES]
-        position_errors = _integrate_position(sides[0], sides[1], h, *current)
-        derivatives_by_axis: list[dict[int, np.ndarray]] = [{}, {}]
-        for side in (0, 1):
-            for state in (X, Y, PSI, U, V, R, U_DOT, V_DOT):
-                moved = [dict(sides[0]), dict(sides[1])]
-                moved[side][state] = moved[side][state] + 1j * _COMPLEX_STEP
-                for axis, error in enumerate(_integrate_position(moved[0], moved[1], h, *current)):
-                    if np.iscomplexobj(error):
-                        derivatives_by_axis[axis][side * N_STATES + state] = (
-                            np.imag(error) / _COMPLEX_STEP * position_weight
-                        )
+        position_errors, derivatives_by_axis = _integrate_position(sides[0], sides[1], h, *current)
         for axis, name in enumerate(CURRENT_NAMES):
             by_error = (
                 {self.names.index(name): -h * position_weight * ones} if name in self.names else {}
@@ -530,7 +529,10 @@ class _Problem:
                     "position",
                     nodes,
                     position_errors[axis] * position_weight,
-                    derivatives_by_axis[axis],
+                    {
+                        key: factor * position_weight * ones
+                        for key, factor in derivatives_by_axis[axis].items()
+                    },
                     by_error,
                 )
             )
@@ -592,36 +594,24 @@ class _Problem:
         """Return the residuals of a sensor by complex-step differentiation."""
         is_inside, nodes, fraction = self._locate(sensor, parameters)
         values = sensor.values[is_inside]
-        is_on_nodes = fraction is None
-        before = {key: states[nodes, key] for key in range(N_STATES)}
+        weights = None if fraction is None else compute_hermite_weights(self.step, fraction)
+        node_states = sensor.select_states(is_on_nodes=fraction is None)
+        before = {key: states[nodes, key] for key in node_states}
         next_nodes = np.minimum(nodes + 1, self.n_nodes - 1)
-        after = {key: states[next_nodes, key] for key in range(N_STATES)}
-        predicted = sensor.predict(parameters, before, after, self.step, fraction)
+        after = {key: states[next_nodes, key] for key in node_states}
+        sampled = interpolate_states(sensor.measured_states, before, after, weights, parameters)
+        predicted = sensor.measure(parameters, sampled)
         by_state: list[dict[int, np.ndarray]] = [{} for _ in predicted]
-        by_error: list[dict[int, np.ndarray]] = [{} for _ in predicted]
-
-        def store(
-            columns: Sequence[np.ndarray], targets: list[dict[int, np.ndarray]], key: int
-        ) -> None:
-            """Store the derivatives of the columns that a complex step has changed."""
-            for column, target in zip(columns, targets, strict=True):
-                if np.iscomplexobj(column):
-                    target[key] = np.imag(column) / (sensor.noise_std * _COMPLEX_STEP)
-
-        for side in (0,) if is_on_nodes else (0, 1):
-            for state in sensor.select_states(is_on_nodes=is_on_nodes):
-                moved = [dict(before), dict(after)]
-                moved[side][state] = moved[side][state] + 1j * _COMPLEX_STEP
-                columns = sensor.predict(parameters, moved[0], moved[1], self.step, fraction)
-                store(columns, by_state, side * N_STATES + state)
-        for name in {*sensor.error_names, *CURRENT_NAMES} & {*self.names}:
-            moved_parameters = {**parameters, name: parameters[name] + 1j * _COMPLEX_STEP}
-            columns = sensor.predict(moved_parameters, before, after, self.step, fraction)
-            store(columns, by_error, self.names.index(name))
-        if sensor.clock in self.names and fraction is not None:
-            moved_fraction = fraction + 1j * _COMPLEX_STEP / self.step
-            columns = sensor.predict(parameters, before, after, self.step, moved_fraction)
-            store(columns, by_error, self.names.index(sensor.clock))
+        # chain rule: by the states at the samples, which depend on those of the nodes
+        for state in sensor.measured_states:
+            moved = {**sampled, state: sampled[state] + 1j * COMPLEX_STEP}
+            interpolation = differentiate_interpolation(state, before, after, weights)
+            for target, column in zip(by_state, sensor.measure(parameters, moved), strict=True):
+                slope = np.imag(column) / (sensor.noise_std * COMPLEX_STEP)
+                if slope.any():
+                    for key, factor in interpolation.items():
+                        target[key] = target.get(key, 0.0) + slope * factor
+        by_error = self._differentiate_by_errors(sensor, parameters, before, after, fraction)
         differences = [
             sensor.subtract(column, values[:, k]) / sensor.noise_std
             for k, column in enumerate(predicted)
@@ -641,6 +631,35 @@ class _Problem:
             for k in range(len(differences))
         ]
 
+    def _differentiate_by_errors(
+        self,
+        sensor: Sensor,
+        parameters: Mapping[str, float],
+        before: NodeStates,
+        after: NodeStates,
+        fraction: np.ndarray | None,
+    ) -> list[dict[int, np.ndarray]]:
+        """Return the derivatives of whitened predictions by errors, for each column of a sensor."""
+        weights = None if fraction is None else compute_hermite_weights(self.step, fraction)
+        moved_predictions: dict[str, list[np.ndarray]] = {}
+        for name in {*sensor.error_names, *CURRENT_NAMES} & {*self.names}:
+            moved_parameters = {**parameters, name: parameters[name] + 1j * COMPLEX_STEP}
+            moved_predictions[name] = sensor.predict(moved_parameters, before, after, weights)
+        if sensor.clock in self.names and fraction is not None:
+            moved_fraction = fraction + 1j * COMPLEX_STEP / self.step
+            moved_weights = compute_hermite_weights(self.step, moved_fraction)
+            moved_predictions[sensor.clock] = sensor.predict(
+                parameters, before, after, moved_weights
+            )
+        derivatives: list[dict[int, np.ndarray]] = [{} for _ in range(sensor.values.shape[1])]
+        for name, columns in moved_predictions.items():
+            for target, column in zip(derivatives, columns, strict=True):
+                # a sensor through the water does not depend on the current
+                if np.iscomplexobj(column):
+                    slope = np.imag(column) / (sensor.noise_std * COMPLEX_STEP)
+                    target[self.names.index(name)] = slope
+        return derivatives
+
     def _compute_cost(self, residuals: Sequence[_Residuals], errors: np.ndarray) -> float:
         """Return minus twice the log-density, with the linearised curvature of the states."""
         prior = float((((errors - self.prior_means) / self.prior_stds) ** 2).sum())
@@ -648,7 +667,11 @@ class _Problem:
         return prior + curvature + sum(group.cost for group in residuals)
 
     def _differentiate_curvature(
-        self, states: np.ndarray, errors: np.ndarray, solver: _Solver
+        self,
+        states: np.ndarray,
+        errors: np.ndarray,
+        residuals: Sequence[_Residuals],
+        solver: _Solver,
     ) -> np.ndarray:
         """Return the gradient [P] of half the log-determinant of the states' Hessian.
 
@@ -657,13 +680,20 @@ class _Problem:
         """
         gradient = np.zeros(errors.size)
         log_determinant = float(np.log(solver.banded_factor[0]).sum())
-        scale_names = {sensor.scale for sensor in self.sensors}
         for index, name in enumerate(self.names):
-            if name not in scale_names:
+            scaled = {
+                f"sensor {k}": k for k, sensor in enumerate(self.sensors) if sensor.scale == name
+            }
+            if not scaled:
                 continue
             moved = errors.copy()
             moved[index] += _CURVATURE_STEP
-            factor = self._factorize(self._linearize(states, moved), moved).banded_factor
+            parameters = dict(zip(self.names, moved.tolist(), strict=True))
+            # other sensors and the dynamic equations do not depend on the scale
+            groups = [group for group in residuals if group.group not in scaled]
+            for k in scaled.values():
+                groups += self._linearize_sensor(k, self.sensors[k], states, parameters)
+            factor = self._factorize(groups, moved).banded_factor
             gradient[index] = (float(np.log(factor[0]).sum()) - log_determinant) / _CURVATURE_STEP
         return gradient
 
@@ -681,22 +711,26 @@ class _Problem:
         for group in residuals:
             weights = group.weights
             weighted = weights * group.values
-            nodes = group.nodes
-            for first, first_derivative in group.by_state.items():
+            # a dynamic equation belongs to each node but the last; a node may have several samples
+            n_targets = n_nodes if group.sensor is not None else n_nodes - 1
+            keys = np.array(sorted(group.by_state))
+            derivatives = np.array([group.by_state[key] for key in keys.tolist()])
+            for position, first in enumerate(keys.tolist()):
                 side, state = divmod(first, N_STATES)
-                target = slice(side, n_nodes + side)
-                gradient[target, state] += np.bincount(nodes, first_derivative * weighted, n_nodes)
+                target = slice(side, n_targets + side)
+                first_derivative = derivatives[position]
+                gradient[target, state] += _sum_by_node(group, first_derivative * weighted, n_nodes)
                 weighted_derivative = first_derivative * weights
-                for second, second_derivative in group.by_state.items():
-                    if second >= first:
-                        product = np.bincount(
-                            nodes, weighted_derivative * second_derivative, n_nodes
-                        )
-                        # a product of two states of the next node belongs to that node
-                        band[second - first, side:, state] += product[: n_nodes - side]
+                products = _sum_by_node(
+                    group, weighted_derivative * derivatives[position:], n_nodes
+                )
+                # a product of two states of the next node belongs to that node
+                n_products = min(n_targets, n_nodes - side)
+                offsets = keys[position:] - first
+                band[offsets, side : side + n_products, state] += products[:, :n_products]
                 for index, derivative in group.by_error.items():
-                    border[index, target, state] += np.bincount(
-                        nodes, weighted_derivative * derivative, n_nodes
+                    border[index, target, state] += _sum_by_node(
+                        group, weighted_derivative * derivative, n_nodes
                     )
             for index, derivative in group.by_error.items():
                 error_gradient[index] += float((derivative * weighted).sum())
@@ -841,7 +875,9 @@ class _Problem:
         for _ in range(_N_REESTIMATIONS):
             residuals = self._linearize(states, errors)
             solver = self._factorize(residuals, errors)
-            self.curvature_gradient = self._differentiate_curvature(states, errors, solver)
+            self.curvature_gradient = self._differentiate_curvature(
+                states, errors, residuals, solver
+            )
             solver = self._factorize(residuals, errors)
             reduced_gradient = solver.error_gradient - solver.border @ solver.state_solution
             error_step = -np.linalg.solve(solver.schur, reduced_gradient)
@@ -920,6 +956,18 @@ class _Problem:
         )
 
 
+def _sum_by_node(group: _Residuals, values: np.ndarray, n_nodes: int) -> np.ndarray:
+    """Sum values of the residuals [..., N] by node [..., K].
+
+    A dynamic equation has one value per node but the last.
+    """
+    if group.sensor is None:
+        return values
+    if values.ndim == 1:
+        return np.bincount(group.nodes, values, n_nodes)
+    return np.array([np.bincount(group.nodes, row, n_nodes) for row in values])
+
+
 def _linearize_score(group: _Residuals) -> _Residuals:
     """Return Gaussian residuals with the information and the scores of a group with weights.
 
@@ -978,15 +1026,39 @@ def _guess_noise(sensor: Sensor) -> Sensor:
 
 def _integrate_position(
     before: NodeStates, after: NodeStates, step: float, north: float, east: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the change of the position over a step beyond Simpson's rule, north and east."""
-    middle = {
-        state: 0.5 * (before[state] + after[state]) + step / 8.0 * (before[rate] - after[rate])
-        for state, rate in ((PSI, R), (U, U_DOT), (V, V_DOT))
+) -> tuple[list[np.ndarray], list[dict[int, np.ndarray | float]]]:
+    """Return the change of the position over a step beyond Simpson's rule, and its derivatives.
+
+    Returns:
+        The changes [N] north and east; and for each of them: state of a node (those of the next
+        node follow after the ninth) -> derivative [N].
+    """
+    rates = {PSI: R, U: U_DOT, V: V_DOT}
+    points = {
+        state: np.stack(
+            (
+                before[state],
+                0.5 * (before[state] + after[state]) + step / 8.0 * (before[rate] - after[rate]),
+                after[state],
+            )
+        )
+        for state, rate in rates.items()
     }
-    velocities = [compute_ground_velocity(node, north, east) for node in (before, middle, after)]
-    errors = []
+    velocities = compute_ground_velocity(points, north, east)
+    slopes_by_state = differentiate_ground_velocity(points)
+    errors: list[np.ndarray] = []
+    derivatives: list[dict[int, np.ndarray | float]] = []
     for axis, state in enumerate((X, Y)):
-        integral = velocities[0][axis] + 4.0 * velocities[1][axis] + velocities[2][axis]
+        velocity = velocities[axis]
+        integral = velocity[0] + 4.0 * velocity[1] + velocity[2]
         errors.append(after[state] - before[state] - step / 6.0 * integral)
-    return errors[0], errors[1]
+        by_state: dict[int, np.ndarray | float] = {state: -1.0, N_STATES + state: 1.0}
+        for velocity_state, rate in rates.items():
+            slope = slopes_by_state[velocity_state][axis]
+            by_middle = -step / 6.0 * 4.0 * slope[1]
+            by_state[velocity_state] = 0.5 * by_middle - step / 6.0 * slope[0]
+            by_state[N_STATES + velocity_state] = 0.5 * by_middle - step / 6.0 * slope[2]
+            by_state[rate] = step / 8.0 * by_middle
+            by_state[N_STATES + rate] = -step / 8.0 * by_middle
+        derivatives.append(by_state)
+    return errors, derivatives

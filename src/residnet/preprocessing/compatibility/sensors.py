@@ -6,7 +6,7 @@ derivatives. Between nodes they follow from cubic Hermite interpolation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,6 +15,8 @@ import numpy as np
 X, Y, PSI, U, V, R, U_DOT, V_DOT, R_DOT = range(9)
 N_STATES = 9
 """Number of states of a node: pose, velocities and accelerations of a planar vessel."""
+COMPLEX_STEP = 1e-20
+"""Imaginary step of complex-step derivatives, whose error is of the order of its square."""
 DERIVATIVE_OF = {PSI: R, U: U_DOT, V: V_DOT, R: R_DOT}
 
 SensorKind = Literal[
@@ -27,6 +29,8 @@ CURRENT_NAMES = ("current_north", "current_east")
 Parameters = Mapping[str, complex]
 NodeStates = Mapping[int, np.ndarray]
 """State -> values [N] at the node before or after each sample."""
+HermiteWeights = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Weights of the value and the rate at the start of a step, and of both at its end."""
 
 
 @dataclass(frozen=True)
@@ -93,83 +97,82 @@ class Sensor:
         angle = difference / self.factor
         return np.asarray((angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))) * self.factor)
 
+    @property
+    def measured_states(self) -> tuple[int, ...]:
+        """States at the time of a sample on which a measurement depends."""
+        if self.kind == "position":
+            return (X, Y, PSI)
+        if self.kind == "heading":
+            return (PSI,)
+        if self.kind == "yaw_rate":
+            return (R,)
+        return (PSI, U, V)
+
     def select_states(self, *, is_on_nodes: bool) -> tuple[int, ...]:
         """Return the states of a node on which a measurement depends."""
+        if is_on_nodes:
+            return self.measured_states
         if self.kind == "position":
-            return (X, Y, PSI) if is_on_nodes else (X, Y, PSI, U, V, R)
-        if self.kind == "heading":
-            return (PSI,) if is_on_nodes else (PSI, R)
-        if self.kind == "yaw_rate":
-            return (R,) if is_on_nodes else (R, R_DOT)
-        return (PSI, U, V) if is_on_nodes else (PSI, U, V, R, U_DOT, V_DOT)
+            return (X, Y, PSI, U, V, R)
+        rates = tuple(DERIVATIVE_OF[state] for state in self.measured_states)
+        return tuple(sorted({*self.measured_states, *rates}))
 
     def predict(
         self,
         parameters: Parameters,
         before: NodeStates,
         after: NodeStates,
-        step: float,
-        fraction: np.ndarray | None,
+        weights: HermiteWeights | None,
     ) -> list[np.ndarray]:
-        """Predict the measurements from the states.
-
-        Arguments may be complex, so that a caller can differentiate by the complex-step method.
+        """Predict the measurements from the states of the nodes.
 
         Args:
             parameters: name of an error -> value.
             before: states at the node before each sample.
             after: states at the node after each sample.
-            step: time between nodes in s.
-            fraction: position of each sample between its nodes, 0 to 1; None if all samples are on
-                their first node.
+            weights: weights of the interpolation; None if all samples are on their first node.
 
         Returns:
             One array [N] per column of the values.
         """
-        # once for all states: the weights cost as much as an interpolation
-        weights = None if fraction is None else compute_hermite_weights(step, fraction)
+        states = interpolate_states(self.measured_states, before, after, weights, parameters)
+        return self.measure(parameters, states)
 
-        def interpolate(state: int) -> np.ndarray:
-            rate = DERIVATIVE_OF[state]
-            if weights is None:
-                return before[state]
-            return interpolate_hermite(
-                before[state], before[rate], after[state], after[rate], weights
-            )
+    def measure(self, parameters: Parameters, states: NodeStates) -> list[np.ndarray]:
+        """Predict the measurements from the states at the times of the samples.
+
+        Arguments may be complex, so that a caller can differentiate by the complex-step method.
+
+        Args:
+            parameters: name of an error -> value.
+            states: `measured_states` at the times of the samples.
+
+        Returns:
+            One array [N] per column of the values.
+        """
 
         def get(name: str) -> complex:
             return parameters.get(name, 0.0) if name else 0.0
 
-        current_north, current_east = (get(name) for name in CURRENT_NAMES)
-        # the states of a yaw-rate sensor contain no heading, and its value needs none
-        heading = interpolate(PSI) if self.kind != "yaw_rate" else before[R]
         if self.kind == "position":
-            north = before[X]
-            east = before[Y]
-            if weights is not None:
-                rates = [
-                    compute_ground_velocity(node, current_north, current_east)
-                    for node in (before, after)
-                ]
-                north, east = (
-                    interpolate_hermite(
-                        before[state], rates[0][k], after[state], rates[1][k], weights
-                    )
-                    for k, state in enumerate((X, Y))
-                )
+            north = states[X]
+            east = states[Y]
             if self.lever_arm:
+                heading = states[PSI]
                 forward, starboard = (get(name) for name in self.lever_arm)
                 north = north + forward * np.cos(heading) - starboard * np.sin(heading)
                 east = east + forward * np.sin(heading) + starboard * np.cos(heading)
             return [north, east]
         if self.kind == "heading":
-            quantity = heading
+            quantity = states[PSI]
         elif self.kind == "yaw_rate":
-            quantity = interpolate(R)
+            quantity = states[R]
         else:
-            u = interpolate(U)
-            v = interpolate(V)
+            heading = states[PSI]
+            u = states[U]
+            v = states[V]
             if not self.is_through_water:
+                current_north, current_east = (get(name) for name in CURRENT_NAMES)
                 u = u + current_north * np.cos(heading) + current_east * np.sin(heading)
                 v = v - current_north * np.sin(heading) + current_east * np.cos(heading)
             quantity = self._select_component(u, v, heading)
@@ -213,10 +216,6 @@ def compute_ground_velocity(
     return north, node[U] * sine + node[V] * cosine + current_east
 
 
-HermiteWeights = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Weights of the value and the rate at the start of a step, and of both at its end."""
-
-
 def compute_hermite_weights(step: float, fraction: np.ndarray) -> HermiteWeights:
     """Return the weights of the cubic Hermite polynomial at fractions of a step."""
     square = fraction * fraction
@@ -240,3 +239,78 @@ def interpolate_hermite(
     from_start = weights[0] * start
     from_start = from_start + weights[1] * start_rate
     return np.asarray(from_start + weights[2] * end + weights[3] * end_rate)
+
+
+def interpolate_states(
+    names: Sequence[int],
+    before: NodeStates,
+    after: NodeStates,
+    weights: HermiteWeights | None,
+    parameters: Parameters,
+) -> dict[int, np.ndarray]:
+    """Return states at the times of the samples.
+
+    Args:
+        names: the states.
+        before: states at the node before each sample.
+        after: states at the node after each sample.
+        weights: weights of the interpolation; None if all samples are on their first node.
+        parameters: name of an error -> value, for the current.
+    """
+    if weights is None:
+        return {state: before[state] for state in names}
+    states = {}
+    if X in names:
+        current_north, current_east = (parameters.get(name, 0.0) for name in CURRENT_NAMES)
+        rates_before = compute_ground_velocity(before, current_north, current_east)
+        rates_after = compute_ground_velocity(after, current_north, current_east)
+        for axis, state in enumerate((X, Y)):
+            states[state] = interpolate_hermite(
+                before[state], rates_before[axis], after[state], rates_after[axis], weights
+            )
+    for state in names:
+        if state in DERIVATIVE_OF:
+            rate = DERIVATIVE_OF[state]
+            states[state] = interpolate_hermite(
+                before[state], before[rate], after[state], after[rate], weights
+            )
+    return states
+
+
+def differentiate_interpolation(
+    state: int, before: NodeStates, after: NodeStates, weights: HermiteWeights | None
+) -> dict[int, np.ndarray | float]:
+    """Return the derivatives of an interpolated state by the states of its nodes.
+
+    Args:
+        state: the state.
+        before: states at the node before each sample.
+        after: states at the node after each sample.
+        weights: weights of the interpolation; None if all samples are on their first node.
+
+    Returns:
+        State of a node (those of the next node follow after the ninth) -> derivative [N].
+    """
+    if weights is None:
+        return {state: 1.0}
+    if state in DERIVATIVE_OF:
+        rate = DERIVATIVE_OF[state]
+        keys = (state, rate, N_STATES + state, N_STATES + rate)
+        return dict(zip(keys, weights, strict=True))
+    derivatives: dict[int, np.ndarray | float] = {state: weights[0], N_STATES + state: weights[2]}
+    axis = (X, Y).index(state)
+    for side, node, weight in ((0, before, weights[1]), (1, after, weights[3])):
+        for key, slopes in differentiate_ground_velocity(node).items():
+            derivatives[side * N_STATES + key] = weight * slopes[axis]
+    return derivatives
+
+
+def differentiate_ground_velocity(node: NodeStates) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Return the derivatives of the velocity over ground, north and east, by heading, u and v."""
+    derivatives = {}
+    for state in (PSI, U, V):
+        moved = {key: node[key] for key in (PSI, U, V)}
+        moved[state] = moved[state] + 1j * COMPLEX_STEP
+        north, east = compute_ground_velocity(moved, 0.0, 0.0)
+        derivatives[state] = (np.imag(north) / COMPLEX_STEP, np.imag(east) / COMPLEX_STEP)
+    return derivatives
