@@ -103,7 +103,8 @@ class RegressorBaseline(ParametricBaseline):
 
     def term_columns(self, axis: int) -> list[int]:
         """Return the columns of the library that the equation of an axis contains."""
-        return [j for j in range(self.library.n_terms) if bool(self.term_mask[axis, j] > 0)]
+        columns: list[int] = torch.nonzero(self.term_mask[axis] > 0).flatten().tolist()
+        return columns
 
     def free_indices(self) -> Tensor:
         is_free = self.term_mask > 0

@@ -232,6 +232,8 @@ class _RegressionFit:
         variance: variances of the residuals [3].
         phi: regressors [N, J].
         group: index of the log of each sample [N].
+        grams: regularised Gram matrices of the regressors of each axis; empty if the coefficients
+            are known.
     """
 
     theta: Tensor
@@ -239,6 +241,7 @@ class _RegressionFit:
     variance: Tensor
     phi: Tensor
     group: Tensor
+    grams: tuple[Tensor, ...]
 
 
 class _SampleColumns(NamedTuple):
@@ -318,16 +321,18 @@ class _CurrentProblem:
         group = self._samples.log_index
         phi, target = self.regression(current[group])
         theta = torch.zeros_like(self.baseline.theta) if self.theta is None else self.theta
+        grams = []
         for axis in range(3) if self.theta is None else ():
             columns = self.baseline.term_columns(axis)
-            theta[axis, columns] = torch.linalg.solve(
-                _regularised_gram(phi[:, columns]), phi[:, columns].T @ target[:, axis]
-            )
+            axis_phi = phi[:, columns]
+            grams.append(_regularised_gram(axis_phi))
+            theta[axis, columns] = torch.linalg.solve(grams[-1], axis_phi.T @ target[:, axis])
         error = target - phi @ theta.T
         variance = error.square().mean(0).clamp(min=1e-300)
         log_likelihood = -0.5 * len(phi) * float(variance.log().sum())
         log_prior = -0.5 * self.precision * float(current.square().sum())
-        return -log_likelihood - log_prior, _RegressionFit(theta, error, variance, phi, group)
+        fit = _RegressionFit(theta, error, variance, phi, group, tuple(grams))
+        return -log_likelihood - log_prior, fit
 
     def gauss_newton_step(self, current: Tensor, fit: _RegressionFit) -> tuple[Tensor, Tensor]:
         """Return the Gauss-Newton step [L, 2] and covariance [2L, 2L] of the currents.
@@ -348,23 +353,30 @@ class _CurrentProblem:
         jacobian = torch.stack(gradients, dim=1)
         hessian = self.precision * torch.eye(2 * n_logs, dtype=torch.float64)
         gradient = self.precision * current
+        # samples are in the order of their logs: products of the rows of each log take a tenth of
+        # the time of sums over all rows by index
+        n_samples = torch.bincount(fit.group, minlength=n_logs).tolist()
         for axis in range(3):
             slope = jacobian[:, axis]
+            slopes = slope.split(n_samples)
             weight = 1.0 / fit.variance[axis]
-            blocks = torch.zeros(n_logs, 2, 2, dtype=torch.float64).index_add_(
-                0, fit.group, slope[:, :, None] * slope[:, None, :]
-            )
-            hessian += weight * torch.block_diag(*blocks)
+            hessian += weight * torch.block_diag(*(part.T @ part for part in slopes))
             if self.theta is None:
                 columns = self.baseline.term_columns(axis)
                 phi = fit.phi[:, columns]
-                mixed = torch.zeros(n_logs, len(columns), 2, dtype=torch.float64).index_add_(
-                    0, fit.group, phi[:, :, None] * slope[:, None, :]
+                mixed = torch.cat(
+                    [
+                        rows.T @ part
+                        for rows, part in zip(phi.split(n_samples), slopes, strict=True)
+                    ],
+                    dim=1,
                 )
-                mixed = mixed.permute(1, 0, 2).reshape(len(columns), 2 * n_logs)
-                hessian -= weight * (mixed.T @ torch.linalg.solve(_regularised_gram(phi), mixed))
-            gradient = gradient + weight * torch.zeros_like(current).index_add_(
-                0, fit.group, slope * fit.error[:, axis : axis + 1]
+                hessian -= weight * (mixed.T @ torch.linalg.solve(fit.grams[axis], mixed))
+            gradient = gradient + weight * torch.stack(
+                [
+                    part.T @ error
+                    for part, error in zip(slopes, fit.error[:, axis].split(n_samples), strict=True)
+                ]
             )
         covariance = torch.linalg.inv(hessian)
         return -(covariance @ gradient.flatten()).reshape(-1, 2), covariance
