@@ -6,9 +6,9 @@ keys are a contract with other programs; values are in SI units and rad.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, JsonValue, field_validator
 
 from residnet.core.layout import SIX_DOF_LAYOUT
 from residnet.core.model_names import FORMER_NAMES
@@ -870,7 +870,7 @@ class BookletRow(Record):
 
     name: str
     manoeuvre: str
-    demand: dict[str, Any]
+    demand: dict[str, JsonValue]
     split: str
     faults: int
     indices: dict[str, BookletIndex]

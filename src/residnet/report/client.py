@@ -179,7 +179,7 @@ def _draw_figures(run: RunFiles) -> Iterator[tuple[str, str, Any]]:
         if figure is not None and figure.name in _FIGURES:
             # two pictures and a table share a page; texts keep their size in narrower pictures
             map_height = _MAP_HEIGHTS.get(figure.name, 0.0)
-            canvas = render_matplotlib(figure, map_height=map_height)
+            canvas = render_matplotlib(figure, map_height=map_height, is_rasterized=False)
             yield figure.name, _FIGURES[figure.name], canvas
     derivatives = run.read_record(DerivativesFile, "derivatives.json")
     if derivatives is not None:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+
+from pydantic import JsonValue
 
 from residnet.core.format import DASH, display_unit, format_interval, format_number
 from residnet.core.run_records import SummaryFile
@@ -72,7 +73,7 @@ class ReportTable:
     caption: str = ""
     weights: Sequence[float] = ()
 
-    def to_data(self) -> dict[str, Any]:
+    def to_data(self) -> dict[str, JsonValue]:
         """Return header, rows, caption and column widths for the PDF template."""
         return {
             "kind": "table",
@@ -90,7 +91,7 @@ class ReportText:
     paragraphs: Sequence[str]
     is_list: bool = False
 
-    def to_data(self) -> dict[str, Any]:
+    def to_data(self) -> dict[str, JsonValue]:
         """Return the paragraphs, as text or list, for the PDF template."""
         return {"kind": "list" if self.is_list else "text", "paragraphs": list(self.paragraphs)}
 
@@ -109,7 +110,7 @@ class ReportPicture:
     caption: str
     width: float = 1.0
 
-    def to_data(self) -> dict[str, Any]:
+    def to_data(self) -> dict[str, JsonValue]:
         """Return the figure for a template."""
         return {"kind": "figure", "file": self.file, "caption": self.caption, "width": self.width}
 
@@ -124,7 +125,7 @@ class ReportSection:
     title: str
     blocks: list[ReportBlock] = field(default_factory=list)
 
-    def to_data(self) -> dict[str, Any]:
+    def to_data(self) -> dict[str, JsonValue]:
         """Return title and blocks for the PDF template."""
         return {"title": self.title, "blocks": [block.to_data() for block in self.blocks]}
 

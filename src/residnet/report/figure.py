@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from residnet.core.format import format_exponents
 from residnet.core.stretches import find_runs
@@ -252,14 +253,14 @@ class Figure:
         )
 
 
-def split_at_gaps(x: Any, y: Any) -> list[Curve]:
+def split_at_gaps(x: ArrayLike, y: ArrayLike) -> list[Curve]:
     """Split a curve into its parts between gaps (values that are not finite)."""
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     is_finite = np.isfinite(x) & np.isfinite(y)
     return [(x[a:b], y[a:b]) for a, b in zip(*find_runs(is_finite), strict=True)]
 
 
-def join_with_gaps(xy_pairs: Iterable[tuple[Any, Any]]) -> Curve:
+def join_with_gaps(xy_pairs: Iterable[tuple[ArrayLike, ArrayLike]]) -> Curve:
     """Join several curves to one, with a gap between each two."""
     gap = [np.nan]
     padded_curves = [
@@ -280,7 +281,7 @@ def subsample_indices(length: int, max_count: int) -> np.ndarray:
     return np.unique(np.linspace(0, length - 1, max_count).round().astype(int))
 
 
-def band_outline(x: Any, lower: Any, upper: Any) -> Curve:
+def band_outline(x: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Curve:
     """Return the outline of the area between two curves [T] over x [T], for a style `fill`."""
     lower = np.asarray(lower, dtype=float)
     upper = np.asarray(upper, dtype=float)
@@ -292,7 +293,9 @@ def band_outline(x: Any, lower: Any, upper: Any) -> Curve:
     )
 
 
-def bar_outlines(positions: Any, values: Any, thickness: float = 0.8) -> Curve:
+def bar_outlines(
+    positions: Iterable[float], values: Iterable[float], thickness: float = 0.8
+) -> Curve:
     """Return the outlines of vertical bars from zero, for a style `fill`.
 
     Exchange x and y of the result for horizontal bars.
@@ -306,7 +309,7 @@ def bar_outlines(positions: Any, values: Any, thickness: float = 0.8) -> Curve:
     )
 
 
-def error_bars(positions: Any, lower: Any, upper: Any) -> Curve:
+def error_bars(positions: Iterable[float], lower: Iterable[float], upper: Iterable[float]) -> Curve:
     """Return vertical lines from lower to upper values.
 
     Exchange x and y of the result for horizontal lines.
@@ -319,7 +322,7 @@ def error_bars(positions: Any, lower: Any, upper: Any) -> Curve:
     )
 
 
-def step_curve(x: Any, y: Any) -> Curve:
+def step_curve(x: ArrayLike, y: ArrayLike) -> Curve:
     """Return a step function that holds each value up to the next sample."""
     return np.repeat(np.asarray(x, dtype=float), 2)[1:], np.repeat(np.asarray(y, dtype=float), 2)[
         :-1

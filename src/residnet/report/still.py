@@ -77,6 +77,8 @@ def render_matplotlib(
     panel_numbers: Sequence[int] = (),
     width: float = FIGURE_WIDTH,
     map_height: float = 0.0,
+    *,
+    is_rasterized: bool = True,
 ) -> Any:
     """Return a matplotlib figure of a case: maps in one row, other panels below.
 
@@ -86,6 +88,7 @@ def render_matplotlib(
         panel_numbers: numbers of the panels to draw; all if empty.
         width: width in inches.
         map_height: height of a row of maps in inches; 0 for a height in proportion to the width.
+        is_rasterized: whether to draw the pixels, too; a vector graphic needs the layout only.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -140,9 +143,10 @@ def render_matplotlib(
         # the height includes a legend of two lines; more of them would cover the panels
         extra_height = _LEGEND_LINE_HEIGHT * max(n_legend_lines - 2, 0)
         canvas.set_figheight(canvas.get_figheight() + extra_height)
-        canvas.canvas.draw()
+        draw = canvas.canvas.draw if is_rasterized else canvas.draw_without_rendering
+        draw()
         if _wrap_axis_labels(canvas):
-            canvas.canvas.draw()
+            draw()
     return canvas
 
 
@@ -363,7 +367,9 @@ def draw_svg(figure: Figure) -> str:
     """
     from matplotlib import rc_context
 
-    canvas = render_matplotlib(figure, width=INLINE_WIDTH, map_height=_INLINE_MAP_HEIGHT)
+    canvas = render_matplotlib(
+        figure, width=INLINE_WIDTH, map_height=_INLINE_MAP_HEIGHT, is_rasterized=False
+    )
     stream = io.StringIO()
     with rc_context({"svg.fonttype": "none"}):
         canvas.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})

@@ -250,7 +250,7 @@ def _build_trials_table(content: SweepFile, rows: Sequence[SweepTrial]) -> Table
     )
 
 
-def format_value(value: Any) -> str:
+def format_value(value: object) -> str:
     """Return the value of a key as text, with four significant digits."""
     return f"{value:.4g}" if isinstance(value, float) else json.dumps(value)
 
