@@ -22,7 +22,7 @@ LENGTH = 3.2186
 
 def make_test(kind: str, angle_deg: float) -> Log:
     """Return a zigzag or a turning circle of a first-order ship, with a steering gear."""
-    dt = 0.1
+    dt = 0.2
     t = np.arange(0.0, 120.0, dt)
     command = np.zeros_like(t)
     u = np.full_like(t, 1.09)
