@@ -127,7 +127,8 @@ def made_roll(run: Path) -> Path:
         controllers.append({"model": model, "kind": kind, "gains": gains, **costs, "seconds": 9.0})
     comparison = {
         "policy": "learned", "classical": "both_trained", "tolerance": 0.02, "is_as_good": False,
-        "roll": {"value": -0.031, "interval": [-0.04, -0.02]}, "n_seas": 4, "n_less_roll": 3,
+        "roll": {"value": -0.031, "interval": [-0.04, -0.02]},
+        "n_seas": 4, "n_less_roll": 3, "n_larger_heading": 1,
         "heading": {"value": 0.048, "interval": [0.03, 0.06]},
     }  # fmt: skip
     content = {"schema": "residnet.metrics/1", "run": "made", "channels": {}, "speed": 7.71}
@@ -349,7 +350,8 @@ def test_a_roll_policy_with_a_larger_heading_error_is_not_as_good(
     page_of: Callable[[str], Path],
 ) -> None:
     metrics = RunFiles(page_of("roll").parent).read_task_metrics(RollMetricsFile)
-    first, figures, *_ = roll.verdict_texts(metrics)
+    first, figures, _, seas = roll.verdict_texts(metrics)
+    assert "combination in 3, and has a larger heading error in 1." in seas
     assert first.startswith("The learned policy is NOT at least as good as")
     assert "(+4.8 %, 95 % confidence interval +3.0 to +6.0 %)" in figures
 

@@ -446,6 +446,7 @@ class RollComparison(Record):
         is_as_good: whether the policy rolls at most as much with the same heading error.
         n_seas: number of judged seas.
         n_less_roll: number of judged seas in which the policy rolls less.
+        n_larger_heading: number of judged seas in which its heading error is larger.
     """
 
     policy: str
@@ -456,6 +457,7 @@ class RollComparison(Record):
     is_as_good: bool
     n_seas: int
     n_less_roll: int
+    n_larger_heading: int
 
 
 class RollMetricsFile(FileRecord):

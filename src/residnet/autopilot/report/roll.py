@@ -81,8 +81,9 @@ def verdict_texts(metrics: RollMetricsFile) -> list[str]:
     ]
     sentences.append(f"Against heading control alone it reduces roll by {join_list(reductions)}.")
     sentences.append(
-        f"It rolls less in {comparison.n_less_roll} of {comparison.n_seas} sea"
-        " states and directions of the waves."
+        f"Of {comparison.n_seas} sea states and directions of the waves, it rolls less than the"
+        f" classical combination in {comparison.n_less_roll}, and has a larger heading error in"
+        f" {comparison.n_larger_heading}."
     )
     return sentences
 

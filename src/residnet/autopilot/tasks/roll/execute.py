@@ -386,13 +386,12 @@ def compare_with_classical(
 
     roll = relative_change("roll")
     heading = relative_change("heading")
-    judged_rolls = {
-        (row.model, row.sea_state, row.direction): row.roll_rms for row in rows if row.is_judged
-    }
-    seas = [(state, direction) for name, state, direction in judged_rolls if name == LEARNED]
-    n_less_roll = sum(
-        judged_rolls[(LEARNED, *sea)] < judged_rolls[(best_classical, *sea)] for sea in seas
-    )
+    judged_rows = {(row.model, row.sea_state, row.direction): row for row in rows if row.is_judged}
+    row_pairs = [
+        (row, judged_rows[best_classical, state, direction])
+        for (name, state, direction), row in judged_rows.items()
+        if name == LEARNED
+    ]
     return RollComparison(
         policy=LEARNED,
         classical=best_classical,
@@ -400,8 +399,9 @@ def compare_with_classical(
         heading=heading,
         tolerance=config.judging.tolerance,
         is_as_good=roll.value <= 0.0 and heading.value <= config.judging.tolerance,
-        n_seas=len(seas),
-        n_less_roll=n_less_roll,
+        n_seas=len(row_pairs),
+        n_less_roll=sum(row.roll_rms < law_row.roll_rms for row, law_row in row_pairs),
+        n_larger_heading=sum(row.heading_rms > law_row.heading_rms for row, law_row in row_pairs),
     )
 
 
