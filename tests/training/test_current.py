@@ -20,8 +20,13 @@ from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
 from residnet.preprocessing.samples import make_samples
 from residnet.training import current as module
-from residnet.training.current import estimate_currents, through_water
+from residnet.training.current import (
+    estimate_currents,
+    is_explained_by_body_velocity,
+    through_water,
+)
 from residnet.training.current_config import CurrentConfig
+from residnet.training.records import CurrentRow
 
 SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal")
 PREPARE = PrepareConfig.model_validate(
@@ -190,3 +195,25 @@ def test_logs_kept_apart_change_nothing_and_a_narrow_prior_holds_currents_at_zer
     told = [[row.current_north, row.current_east] for row in table]
     np.testing.assert_array_equal(held, told)
     assert [row.log for row in table] == [log.log.name for log in logs[3:5]]
+
+
+@pytest.mark.parametrize(
+    ("mean_headings", "swing", "is_ambiguous"),
+    [((0.0, 0.05, -0.1), 0.3, True), ((0.0, 2.0, 4.0), 0.3, False), ((0.0, 0.0, 0.0), 3.1, False)],
+)
+def test_a_current_along_one_course_may_be_an_error_of_the_model(
+    mean_headings: tuple[float, ...], swing: float, is_ambiguous: bool
+) -> None:
+    headings = [mean + np.linspace(-swing, swing, 101) for mean in mean_headings]
+    rows = [
+        CurrentRow(
+            log=str(number),
+            fitted=True,
+            current_north=0.5,
+            current_east=0.1,
+            standard_error=(0.05, 0.05),
+            p_value=1e-8,
+        )
+        for number in range(len(headings))
+    ]
+    assert is_explained_by_body_velocity(rows, headings) is is_ambiguous

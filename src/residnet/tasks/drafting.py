@@ -17,7 +17,7 @@ import numpy as np
 from residnet.core.config import validate_config
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.files import write_owned
-from residnet.core.layout import ROLL_LAYOUT, SIX_DOF_LAYOUT, DegreesOfFreedom
+from residnet.core.layout import HEADING, ROLL_LAYOUT, SIX_DOF_LAYOUT, DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.core.names import BOW_WIND_CHANNELS, WIND_INPUTS
 from residnet.core.ownership import require_replaceable
@@ -360,7 +360,11 @@ def _has_current(settings: FitConfig, logs: Sequence[Log], draft_notes: DraftNot
     from residnet.baselines.regressors import RegressorBaseline
     from residnet.identification.prepared import prepare_splits
     from residnet.identification.recipe import SINGLE_MODEL_NAME
-    from residnet.training.current import estimate_currents, select_significant_currents
+    from residnet.training.current import (
+        estimate_currents,
+        is_explained_by_body_velocity,
+        select_significant_currents,
+    )
     from residnet.training.current_config import CurrentConfig
 
     signals = settings.signals.build()
@@ -385,6 +389,9 @@ def _has_current(settings: FitConfig, logs: Sequence[Log], draft_notes: DraftNot
     speeds = [float(np.nanmedian(np.hypot(log.log["u"], log.log["v"]))) for log in prepared]
     currents = select_significant_currents(rows, speeds)
     if len(currents) < _MIN_CURRENT_SHARE * len(rows):
+        return False
+    headings = [log.y[log.trainable, HEADING] for log in prepared]
+    if is_explained_by_body_velocity(rows, headings):
         return False
     listed = ", ".join(
         f"{row.log} {row.speed:.2g} m/s (p = {row.p_value:.1g})" for row in currents[:3]

@@ -38,6 +38,10 @@ _CONVERGED_STEP = 1e-4
 """Largest change of a current in m/s at which Gauss-Newton has converged."""
 _MAX_P_VALUE = 0.01
 """Largest p-value of a significant current, for all logs together (Bonferroni)."""
+_MAX_BODY_SPEED_RATIO = 2.0
+"""Largest ratio of a velocity in body axes to the currents that it explains: the ratio for logs
+whose headings have a mean resultant length of 0.5.
+"""
 _MIN_SPEED_SHARE = 0.02
 """Smallest speed of a significant current, as a share of the speed of the vessel."""
 
@@ -125,6 +129,42 @@ def select_significant_currents(
         and row.p_value * len(rows) < _MAX_P_VALUE
         and row.speed > _MIN_SPEED_SHARE * speed
     ]
+
+
+def is_explained_by_body_velocity(
+    rows: Sequence[CurrentRow], headings: Sequence[np.ndarray]
+) -> bool:
+    """Return whether one velocity in body axes explains the currents of all logs.
+
+    A term that the model lacks looks like a current that turns with the vessel. Where all logs have
+    about the same mean heading, it cannot be distinguished from a current in earth axes. The
+    velocity is estimated by weighted least squares; an F test of the remaining differences, with
+    the degrees of freedom of the standard errors, decides.
+
+    Args:
+        rows: currents of L logs with their standard errors.
+        headings: headings of each log [T] in rad.
+    """
+    estimates = np.array([[row.current_north, row.current_east] for row in rows])
+    standard_errors = np.array([row.standard_error for row in rows])
+    # a velocity that is constant in body axes, averaged over a log in earth axes
+    cosines = np.array([np.cos(heading).mean() for heading in headings])
+    sines = np.array([np.sin(heading).mean() for heading in headings])
+    rotations = np.stack(
+        (np.stack((cosines, -sines), axis=1), np.stack((sines, cosines), axis=1)), axis=1
+    )
+    weighted_rotations = (rotations / standard_errors[:, :, None]).reshape(-1, 2)
+    weighted_estimates = (estimates / standard_errors).ravel()
+    body_velocity = np.linalg.lstsq(weighted_rotations, weighted_estimates, rcond=None)[0]
+    residuals = weighted_estimates - weighted_rotations @ body_velocity
+    n_residuals = max(2.0 * len(rows) - 2.0, 1.0)
+    p_value = fdtrc(n_residuals, 2.0 * len(rows), float(np.square(residuals).sum()) / n_residuals)
+    # over logs that turn through all headings a body velocity averages out: it would have to be
+    # much larger than the currents that it explains
+    is_plausible = np.hypot(*body_velocity) <= _MAX_BODY_SPEED_RATIO * max(
+        row.speed for row in rows
+    )
+    return bool(is_plausible and p_value >= _MAX_P_VALUE)
 
 
 def _estimate(problem: _CurrentProblem, config: CurrentConfig) -> tuple[Tensor, Tensor, Tensor]:
