@@ -141,6 +141,28 @@ def test_sway_of_contradicting_surge_is_smoothed() -> None:
     assert "v_dot" not in complete_motion(wrong, MotionConfig()).channels
 
 
+@pytest.mark.parametrize("boat", BOATS)
+def test_surge_that_other_sensors_contradict_is_not_used(boat: str) -> None:
+    rng = np.random.default_rng(31)
+    motion = simulate_motion(BOATS[boat], rng)
+    t = np.arange(1.0, 119.0, 0.1)
+    stds = {"x": 0.3, "y": 0.3, "psi": 0.005, "u": 0.03, "r": 0.003}
+    channels = {
+        name: motion.sample(name, t) + std * rng.standard_normal(t.size)
+        for name, std in stds.items()
+    }
+    for name in ("x", "y"):
+        channels[name][np.arange(t.size) % 10 != 0] = np.nan
+    surge = channels["u"]
+    walk = np.cumsum(rng.standard_normal(t.size))
+    walk = surge.mean() + surge.std() * (walk - walk.mean()) / walk.std()
+    wrong_values = {"reversed": surge[::-1], "late": np.roll(surge, t.size // 3), "walk": walk}
+    for name, values in {"right": surge, **wrong_values}.items():
+        log = Log(name, t, {**channels, "u": values, "delta": channels["r"]})
+        completed = complete_motion(log, MotionConfig())
+        assert ("v_dot" in completed.channels) == (name == "right"), name
+
+
 def test_sway_beside_a_speed_log_is_smoothed() -> None:
     # surge through the water, in a current of 0.3 m/s to the north
     motion = simulate_motion(BOATS["dinghy"], np.random.default_rng(3))

@@ -8,7 +8,7 @@ from residnet.core.errors import DataError
 from residnet.core.names import STATE_NAMES
 from residnet.preprocessing.channel_values import nan_std
 from residnet.preprocessing.compatibility.hypotheses import MIN_MARGIN, Hypothesis, compare
-from residnet.preprocessing.compatibility.reconstruction import Prior
+from residnet.preprocessing.compatibility.reconstruction import Prior, reconstruct
 from residnet.preprocessing.compatibility.sensors import (
     CURRENT_NAMES,
     DERIVATIVE_OF,
@@ -51,6 +51,10 @@ def reconstruct_without_sway(
     and measured surge and yaw rate determine the remaining motion. An error of surge would become
     one of sway. The log is therefore not reconstructed if its BIC is smaller, by `MIN_MARGIN` or
     more, with a scale error and a current, as of a speed log that measures through the water.
+    Nor is it if the other sensors contradict surge: the surge that they reconstruct alone differs
+    more from measured surge than from its mean (skill score, Murphy 1988, Monthly Weather Review
+    116). Without measured sway a wrong surge leaves no residual: sway and the noise of the
+    positions absorb it.
 
     Args:
         t: times of the samples [T] in s.
@@ -80,6 +84,7 @@ def reconstruct_without_sway(
     }
     try:
         ranking = compare(hypotheses, step)
+        without_surge = reconstruct(other_sensors, {}, step)
     except (DataError, np.linalg.LinAlgError):
         return None
     without_error = next(ranked for ranked in ranking if ranked.name == "surge over ground")
@@ -88,6 +93,12 @@ def reconstruct_without_sway(
     motion = without_error.reconstruction
     surge_fit = motion.sensors.get("surge")
     if surge_fit is None or surge_fit.noise_std > _MAX_SURGE_NOISE * nan_std(surge):
+        return None
+    predicted_surge = np.interp(t, without_surge.t, without_surge.states[:, U])
+    error = float(np.nanmean((surge - predicted_surge) ** 2)) - surge_fit.noise_std**2
+    is_measured = np.isfinite(surge)
+    deviation = np.nanmean(surge) - predicted_surge[is_measured]
+    if error >= float(np.mean(deviation**2)):
         return None
     # values at the samples by cubic polynomials between nodes
     index = np.clip((t - motion.t[0]) / step, 0.0, len(motion.t) - 1.0)
