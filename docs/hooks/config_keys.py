@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import griffe
-from pydantic import BaseModel
+from pydantic import BaseModel, JsonValue
 from pydantic.fields import FieldInfo
 
 from residnet.core.config import Quantity
@@ -136,7 +136,7 @@ def describe_type(annotation: Any, metadata: typing.Sequence[object] = ()) -> st
     origin = typing.get_origin(annotation)
     arguments = typing.get_args(annotation)
     if (aliased := getattr(annotation, "__value__", None)) is not None:
-        return describe_type(aliased)
+        return "any value" if annotation is JsonValue else describe_type(aliased)
     if (union := find_plugin_union(metadata)) is not None:
         classes_by_kind = load_kinds(typing.Annotated[annotation, union])
         return " or ".join(describe_type(member) for member in classes_by_kind.values())

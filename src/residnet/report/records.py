@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, JsonValue
 
 from residnet.core.records import FileRecord, FileRows, Record
 
@@ -29,7 +29,7 @@ class SweepTrial(Record):
     value: float | None
     seconds: float
     fault: str
-    values: dict[str, object]
+    values: dict[str, JsonValue]
 
 
 class SweepFile(FileRecord):

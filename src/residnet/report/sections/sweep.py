@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
+from pydantic import JsonValue
 
 from residnet.core.format import format_number
 from residnet.report.blocks import Cell, Section, Table, Text, build_table
@@ -92,22 +92,25 @@ def slice_figure(content: SweepFile) -> Figure:
 
 
 def _slice_positions(
-    values: Sequence[Any], *, is_logarithmic: bool
+    values: Sequence[JsonValue], *, is_logarithmic: bool
 ) -> tuple[np.ndarray, dict[str, str]]:
     """Return the vertical positions of values [trials], and the names of the ticks by position.
 
     Numbers are their own positions and have no names, or are logarithms whose ends and middle have
     names. Few distinct numbers, and all other values, are numbered in order.
     """
-    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
-        distinct_numbers = sorted(set(values))
+    numbers = [
+        value for value in values if isinstance(value, int | float) and not isinstance(value, bool)
+    ]
+    if len(numbers) == len(values):
+        distinct_numbers = sorted(set(numbers))
         # few numbers are categories: a linear scale would put 0, 0.001 and 0.01 onto each other
         if len(distinct_numbers) <= _MAX_SLICES:
-            positions = [float(distinct_numbers.index(value)) for value in values]
+            positions = [float(distinct_numbers.index(value)) for value in numbers]
             return np.array(positions), tick_labels(f"{value:.4g}" for value in distinct_numbers)
         if not is_logarithmic:
-            return np.array(values, dtype=float), {}
-        logarithms = np.log10(np.array(values, dtype=float))
+            return np.array(numbers, dtype=float), {}
+        logarithms = np.log10(np.array(numbers, dtype=float))
         ticks = np.linspace(logarithms.min(), logarithms.max(), 3)
         return logarithms, {f"{tick:.6g}": f"{10.0**tick:.2g}" for tick in ticks}
     texts = [json.dumps(value) for value in values]
