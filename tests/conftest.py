@@ -23,6 +23,7 @@ DEAR = (
     "runs/test_untrusted_folders.py",
     "corpus/test_corpus.py",
     "io/test_consensus.py",
+    "io/test_basin_workbooks.py",
     "export/test_formats.py",
     "io/test_doctor_faults.py",
     "export/test_c_names.py",
