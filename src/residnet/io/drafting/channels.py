@@ -182,22 +182,25 @@ def estimate_motion(table: RawTable, unit: str, frame: PoseFrame) -> Motion | No
     window = max(5, 2 * round(0.5 * _MIN_WINDOW_SECONDS / time_step) + 1)
     if grid_times.size < 3 * window:
         return None
-
-    def differentiate(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-        return fit_local_polynomials(
-            np.interp(grid_times, t, values)[:, None], window, 2, time_step
-        )[1][:, 0]
-
-    speed_north = differentiate(position_times, table.columns[north][has_position])
-    speed_east = differentiate(position_times, table.columns[east][has_position])
+    speed_north = _differentiate(grid_times, position_times, table.columns[north][has_position])
+    speed_east = _differentiate(grid_times, position_times, table.columns[east][has_position])
     heading = np.interp(grid_times, table.t[has_heading], psi[has_heading])
     surge_velocity, sway_velocity = rotate(speed_north, speed_east, -heading)
     return Motion(
         grid_times,
         surge_velocity,
         sway_velocity,
-        differentiate(table.t[has_heading], psi[has_heading]),
+        _differentiate(grid_times, table.t[has_heading], psi[has_heading]),
     )
+
+
+def _differentiate(grid_times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the derivative [G] of values [T] at times [T], by local polynomials on a grid [G]."""
+    step = float(grid_times[1] - grid_times[0])
+    window = max(5, 2 * round(0.5 * _MIN_WINDOW_SECONDS / step) + 1)
+    return fit_local_polynomials(np.interp(grid_times, t, values)[:, None], window, 2, step)[1][
+        :, 0
+    ]
 
 
 def forward_alignment(motions: Sequence[Motion | None]) -> float:
@@ -1433,6 +1436,8 @@ class ChannelMapper:
             return entry | self._settle_rate(
                 name, self._fit_rate_to_angle("psi", self._psi_unit, name), "headings"
             )
+        if name in ("w", "p", "q") and (vertical_fit := self._fit_vertical_motion(name)):
+            return entry | self._settle_rate(name, vertical_fit, "positions and attitude")
         if name == "p" and "phi" in self._names:
             unit = self._infer_unit("phi", should_note=False)
             return entry | self._settle_rate(
@@ -1496,6 +1501,49 @@ class ChannelMapper:
             "r",
         )
 
+    def _fit_vertical_motion(self, name: str) -> ScaleFit | None:
+        """Regress the heave velocity, roll rate or pitch rate on a column.
+
+        The velocities along the axes of a vessel follow from those of its position by R^T, and its
+        angular velocity from the derivatives of its angles (Fossen 2021, equations 2.31 and 2.41).
+
+        Args:
+            name: `w`, `p` or `q`.
+
+        Returns:
+            The regression; None without position, depth and all angles.
+        """
+        if not {"x", "y", "z", "psi", "phi", "theta"} <= self._names.keys():
+            return None
+        factors = {
+            key: to_si(self._infer_unit(key, should_note=False), CHANNEL_UNITS[key])
+            for key in ("z", "phi", "theta")
+        }
+        tables = []
+        motions = []
+        for table, motion in zip(self._logs, self._motions, strict=True):
+            if motion is None or not {*factors, name} <= table.columns.keys():
+                continue
+            is_finite = np.isfinite([table.t, *(table.columns[key] for key in factors)]).all(axis=0)
+            if is_finite.sum() < 30:
+                continue
+            t = table.t[is_finite]
+            depth, roll, pitch = (factors[key] * table.columns[key][is_finite] for key in factors)
+            depth_rate, roll_rate, pitch_rate = (
+                _differentiate(motion.t, t, values) for values in (depth, roll, pitch)
+            )
+            roll, pitch = (np.interp(motion.t, t, angle) for angle in (roll, pitch))
+            expected = {
+                "w": np.cos(roll)
+                * (np.sin(pitch) * motion.surge_velocity + np.cos(pitch) * depth_rate)
+                - np.sin(roll) * motion.sway_velocity,
+                "p": roll_rate - np.sin(pitch) * motion.yaw_rate,
+                "q": np.cos(roll) * pitch_rate + np.sin(roll) * np.cos(pitch) * motion.yaw_rate,
+            }
+            tables.append(RawTable(table.t, {"r": table.columns[name]}))
+            motions.append(motion._replace(yaw_rate=expected[name]))
+        return fit_to_motion(tables, motions, "r") if tables else None
+
     def _settle_rate(self, name: str, fit: ScaleFit, reference: str) -> dict[str, Any]:
         """Return unit and sign of a velocity from its header and a regression.
 
@@ -1527,8 +1575,9 @@ class ChannelMapper:
         entry: dict[str, Any] = {"unit": unit}
         if fit.is_significant and fit.factor < 0.0:
             entry["sign"] = -1
-            direction = {"u": "astern", "v": "port", "r": "port", "p": "port"}[name]
-            text = f"positive to {direction} by {reference} (correlation {fit.correlation:.2f})"
+            directions = {"u": "astern", "w": "up", "q": "bow down"}
+            direction = directions.get(name, "to port")
+            text = f"positive {direction} by {reference} (correlation {fit.correlation:.2f})"
             self._draft_notes.add_guess(key, text)
         elif not fit.is_significant and self._conventional_sign(name) < 0:
             entry["sign"] = -1

@@ -10,10 +10,17 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.layout import DegreesOfFreedom
+from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import to_si
-from residnet.io.drafting.channels import CHANNELS_KEY, RawTable
+from residnet.io.drafting.channels import CHANNELS_KEY, RawTable, ScaleFit
 from residnet.io.drafting.questions import DraftNotes
-from residnet.io.header_vocabulary import infer_unit, match_depth_channel, parse_name
+from residnet.io.header_vocabulary import (
+    Scaling,
+    infer_unit,
+    match_depth_channel,
+    parse_header_unit,
+    parse_name,
+)
 from residnet.io.readers.quantities import (
     QUATERNION,
     normalize_quaternion,
@@ -26,6 +33,8 @@ VERTICAL_CHANNELS = ("z", "w", "q", "p")
 _MIN_TILT = 0.1
 """Angle in rad between the vertical and the vertical axis of a vessel, exceeded in 5 % of the
 samples, above which velocities along its axes differ from horizontal ones (by at least 0.5 %)."""
+_MIN_PITCH_COSINE = 0.1
+"""Smallest cosine of a pitch angle in the rate of the heading, which is singular at 90 deg."""
 _MAX_FLAT_SHARE = 0.02
 """Largest ratio of standard deviations of a vertical and a horizontal coordinate."""
 _N_PATH_SPANS = 100
@@ -120,12 +129,19 @@ def _extract_tilt(log: RawTable, names: Mapping[str, str]) -> tuple[np.ndarray, 
         return quaternion_tilt(*normalize_quaternion(*(log.columns[name] for name in QUATERNION)))
     if not {"phi", "theta"} <= log.columns.keys() & names.keys():
         return None
-    roll, pitch = (
-        log.columns[name]
-        * to_si(infer_unit(name, names[name], log.columns[name]).settings["unit"], "rad")
-        for name in ("phi", "theta")
-    )
-    return roll, pitch
+    return _convert_angle("phi", log, names), _convert_angle("theta", log, names)
+
+
+def _convert_angle(name: str, log: RawTable, names: Mapping[str, str]) -> np.ndarray:
+    """Return roll or pitch [T] in rad; without a unit it has the unit of the heading.
+
+    Small angles in deg have the size of angles in rad, whereas a heading has a large range.
+    """
+    reference = name
+    if parse_header_unit(names[name], "rad") is None and {"psi"} <= names.keys() & log.columns:
+        reference = "psi"
+    unit = infer_unit(reference, names[reference], log.columns[reference]).settings["unit"]
+    return np.asarray(log.columns[name] * to_si(unit, "rad"))
 
 
 def _project_log(
@@ -136,7 +152,7 @@ def _project_log(
 ) -> RawTable:
     """Return a log with horizontal velocities; see `project_on_horizontal`."""
     tilt = _extract_tilt(log, names)
-    if tilt is None or not {"u", "v"} <= log.columns.keys():
+    if tilt is None:
         return log
     roll, pitch = tilt
     z = table.get(candidates["z"], np.zeros(0))
@@ -145,8 +161,17 @@ def _project_log(
     cosine = np.cos(roll) * np.cos(pitch)
     if float(np.nanquantile(cosine, 0.05)) > np.cos(_MIN_TILT):
         return log
+    horizontal = {}
+    if "r" in log.columns:
+        # rate of the heading, Fossen 2021, equation (2.40)
+        pitch_rate = table.get(candidates.get("q", ""), np.zeros(0))
+        pitch_rate = pitch_rate if pitch_rate.size == z.size else np.zeros(z.size)
+        yaw_rate = pitch_rate * np.sin(roll) + log.columns["r"] * np.cos(roll)
+        horizontal["r"] = yaw_rate / np.maximum(np.cos(pitch), _MIN_PITCH_COSINE)
+    if "u" not in log.columns:
+        return RawTable(log.t, {**log.columns, **horizontal})
     u = log.columns["u"]
-    v = log.columns["v"]
+    v = log.columns.get("v", np.zeros(z.size))
     rate = np.gradient(z, log.t)
     rate_without_heave = v * np.cos(pitch) * np.sin(roll) - u * np.sin(pitch)
     w = table.get(candidates.get("w", ""), np.zeros(0))
@@ -154,15 +179,18 @@ def _project_log(
         # a velocity of the world frame is the rate of z itself
         body_error = np.nanmean((rate - rate_without_heave - cosine * w) ** 2)
         if np.nanmean((rate - w) ** 2) <= body_error:
-            return log
+            return RawTable(log.t, {**log.columns, **horizontal})
     else:
-        w = (rate - rate_without_heave) / cosine
+        # the unit of u may be unknown; a vessel that dives by pitch has little heave
+        is_finite = np.isfinite(rate) & np.isfinite(rate_without_heave)
+        fit = _regress(rate_without_heave[is_finite], rate[is_finite])
+        unit = fit.matching_unit("m/s") if fit.is_significant else None
+        w = (rate / to_si(unit or "m/s") - rate_without_heave) / cosine
     # R_y(pitch) R_x(roll) (u, v, w), Fossen 2021, equation (2.31) without the yaw
     cross_flow = v * np.sin(roll) + w * np.cos(roll)
-    horizontal = {
-        "u": u * np.cos(pitch) + cross_flow * np.sin(pitch),
-        "v": v * np.cos(roll) - w * np.sin(roll),
-    }
+    horizontal["u"] = u * np.cos(pitch) + cross_flow * np.sin(pitch)
+    if "v" in log.columns:
+        horizontal["v"] = v * np.cos(roll) - w * np.sin(roll)
     return RawTable(log.t, {**log.columns, **horizontal})
 
 
@@ -212,27 +240,19 @@ def draft_vertical_motion(
             has_velocities or {"x", "y"} <= log.columns.keys()
         ):
             return {}
-        parts = normalize_quaternion(*(log.columns[name] for name in QUATERNION))
-        roll, pitch = quaternion_tilt(*parts)
-        pitch = vertical_sign * pitch
         values = {name: table[column] for name, column in candidates.items()}
         if any(column.size != log.t.size for column in values.values()) or log.t.size < 10:
             continue
-        zeros = np.zeros(log.t.size)
-        u = log.columns["u"] if has_velocities else zeros
-        v = vertical_sign * log.columns["v"] if has_velocities else zeros
-        depth = vertical_sign * values["z"]
-        depth_rate = np.gradient(depth, log.t)
-        heave = depth_rate + u * np.sin(pitch) - v * np.cos(pitch) * np.sin(roll)
-        rates["w"].append((values.get("w", heave), heave / (np.cos(pitch) * np.cos(roll))))
-        rates["q"].append((values.get("q", heave), np.gradient(pitch, log.t)))
-        rates["p"].append((values.get("p", heave), np.gradient(np.unwrap(roll), log.t)))
-        yaw = np.unwrap(quaternion_yaw(*parts))
-        motion = {"x": log.columns.get("x", u), "y": log.columns.get("y", v), "psi": yaw}
-        motion |= {"z": depth, "phi": roll, "theta": pitch}
-        motion |= {"u": u, "v": v} if has_velocities else {}
+        motion = _estimate_vertical_motion(log, values["z"], channels, vertical_sign)
+        for name, pairs in rates.items():
+            pairs.append((values.get(name, motion[name]), motion[name]))
         if "w" in values:
-            motion["w"] = values["w"] * np.sign(np.nansum(values["w"] * heave))
+            scaling, sign = _settle_rate(
+                "w", candidates["w"], rates["w"][-1:], channels, vertical_sign
+            )
+            motion["w"] = sign * values["w"] * to_si(scaling.settings["unit"], "m/s")
+        else:
+            del motion["w"]
         is_submerged |= DegreesOfFreedom.from_channels(motion).is_six_dof
     if not is_submerged:
         draft_notes.add_note(
@@ -249,14 +269,14 @@ def draft_vertical_motion(
         return {}
     entries: dict[str, dict[str, Any]] = {}
     for name, column in candidates.items():
-        values_of_logs = np.concatenate([table[column] for table in tables])
-        scaling = infer_unit(name, column, values_of_logs)
-        sign = vertical_sign
-        if name != "z":
-            measured = np.concatenate([pair[0] for pair in rates[name]])
-            expected = np.concatenate([pair[1] for pair in rates[name]])
-            is_finite = np.isfinite(measured) & np.isfinite(expected)
-            sign = 1 if float(measured[is_finite] @ expected[is_finite]) >= 0.0 else -1
+        if name == "z":
+            depths = np.concatenate([table[column] for table in tables])
+            scaling = infer_unit(name, column, depths)
+            sign = vertical_sign
+        else:
+            # along the axes of a body in east-north-up a roll has the same direction
+            usual_sign = vertical_sign if name != "p" else 1
+            scaling, sign = _settle_rate(name, column, rates[name], channels, usual_sign)
         entries[name] = {"column": column, **scaling.settings, **({"sign": -1} if sign < 0 else {})}
         draft_notes.add_guess(
             (*CHANNELS_KEY, name),
@@ -265,3 +285,92 @@ def draft_vertical_motion(
             + (f"; {scaling.reason}" if scaling.reason else ""),
         )
     return entries
+
+
+def _estimate_vertical_motion(
+    log: RawTable,
+    vertical_position: np.ndarray,
+    channels: Mapping[str, Mapping[str, Any]],
+    vertical_sign: int,
+) -> dict[str, np.ndarray]:
+    """Return the pose, and the velocities w, q and p that follow from it, in NED and SI.
+
+    Args:
+        log: mapped columns of a table, with a quaternion.
+        vertical_position: column of the vertical position [T].
+        channels: channel -> entry of the planar motion, for the units of u and v.
+        vertical_sign: -1 if the axes of the file are east-north-up, 1 for north-east-down.
+    """
+    parts = normalize_quaternion(*(log.columns[name] for name in QUATERNION))
+    roll, pitch = quaternion_tilt(*parts)
+    pitch = vertical_sign * pitch
+    depth = vertical_sign * vertical_position
+    zeros = np.zeros(log.t.size)
+    velocities = {}
+    if {"u", "v"} <= log.columns.keys():
+        units = [str(channels.get(name, {}).get("unit", "m/s")) for name in ("u", "v")]
+        velocities["u"] = log.columns["u"] * to_si(units[0], "m/s")
+        velocities["v"] = vertical_sign * log.columns["v"] * to_si(units[1], "m/s")
+    u = velocities.get("u", zeros)
+    v = velocities.get("v", zeros)
+    heave = np.gradient(depth, log.t) + u * np.sin(pitch) - v * np.cos(pitch) * np.sin(roll)
+    pose = {
+        "x": log.columns.get("x", u),
+        "y": log.columns.get("y", v),
+        "z": depth,
+        "psi": np.unwrap(quaternion_yaw(*parts)),
+        "phi": roll,
+        "theta": pitch,
+    }
+    rates = {
+        "w": heave / (np.cos(pitch) * np.cos(roll)),
+        "q": np.gradient(pitch, log.t),
+        "p": np.gradient(np.unwrap(roll), log.t),
+    }
+    return {**pose, **velocities, **rates}
+
+
+def _settle_rate(
+    name: str,
+    column: str,
+    pairs: Sequence[tuple[np.ndarray, np.ndarray]],
+    channels: Mapping[str, Mapping[str, Any]],
+    usual_sign: int,
+) -> tuple[Scaling, int]:
+    """Return unit and sign of a column with a vertical velocity or a rate.
+
+    Args:
+        name: channel.
+        column: name of the column.
+        pairs: measured and expected values [T] of each table, the latter in SI.
+        channels: channel -> entry of the planar motion, whose units count if the values do not
+            determine the unit.
+        usual_sign: sign if the values do not determine it.
+    """
+    measured = np.concatenate([pair[0] for pair in pairs])
+    expected = np.concatenate([pair[1] for pair in pairs])
+    scaling = infer_unit(name, column, measured)
+    is_finite = np.isfinite(measured) & np.isfinite(expected)
+    fit = _regress(measured[is_finite], expected[is_finite])
+    if not fit.is_significant:
+        sibling = channels.get("u" if name == "w" else "r", {})
+        if scaling.reason and "unit" in sibling:
+            reason = f"the header has no unit; assumed that of '{sibling['column']}'"
+            scaling = Scaling({"unit": sibling["unit"]}, reason)
+        return scaling, usual_sign
+    unit = fit.matching_unit(CHANNEL_UNITS[name])
+    if scaling.reason and unit is not None:
+        reason = f"the header has no unit; depth and attitude give {unit}"
+        scaling = Scaling({"unit": unit}, reason)
+    return scaling, 1 if fit.factor > 0.0 else -1
+
+
+def _regress(measured: np.ndarray, expected: np.ndarray) -> ScaleFit:
+    """Regress expected values [T] on a column [T]; both are noisy (geometric mean regression)."""
+    covariance = float(measured @ expected)
+    measured_energy = float(measured @ measured)
+    expected_energy = float(expected @ expected)
+    if min(measured_energy, expected_energy) <= 0.0:
+        return ScaleFit(0.0, 0.0)
+    factor = float(np.sign(covariance) * np.sqrt(expected_energy / measured_energy))
+    return ScaleFit(factor, abs(covariance) / np.sqrt(measured_energy * expected_energy))
