@@ -121,12 +121,3 @@ def test_a_track_with_y_up_is_refused_and_a_dive_is_not(tmp_path: Path) -> None:
     with pytest.raises(ResidnetError, match=r"hover\.csv: column 'pos_y' is almost constant"):
         residnet.read_logs(tmp_path)
     refuse_vertical_y(tmp_path, [*table], [table | {"pos_x": angle}], {"x": "pos_x", "y": "pos_y"})
-
-
-def test_an_export_of_motion_capture_is_refused(tmp_path: Path) -> None:
-    head = "Format Version,1.23,Length Units,Meters\n\n,,Rigid Body,Rigid Body\n,,boat,boat\n"
-    rows = "".join(f"{k},{0.01 * k},{k},0.1,{-k}\n" for k in range(50))
-    text = f"{head},,Position,Position,Position\nFrame,Time (Seconds),X,Y,Z\n{rows}"
-    (tmp_path / "take.csv").write_text(text)
-    with pytest.raises(ResidnetError, match=r"take\.csv: row 6 \('Frame', \.\.\.\)"):
-        residnet.read_logs(tmp_path)

@@ -205,21 +205,45 @@ def draft_tables(
             "column": main_preview.original_name(entry["column"]),
             **column_settings.get(entry["column"], {}),
         }
-    reader_settings = {
-        # sheets are a list in YAML
-        key: list(value) if isinstance(value, tuple) else value
-        for key, value in main_preview.reader_settings.items()
-        if key != "kind"
-    }
-    time = dict(clock.settings)
-    if "column" in time:
-        time["column"] = main_preview.original_name(time["column"])
-    reader_config = {"kind": main_preview.reader_settings["kind"], **reader_settings}
-    reader_config |= {"names": list(names)} if names else {}
-    reader_config |= {"time": time, **({"select": select} if select else {})}
+    reader_config = _compose_reader_config(main_preview, clock, names, select, draft_notes)
     reader_config |= draft_manoeuvre_setting(files, draft_notes)
     _note_unused_columns(main_preview, column_by_channel, clock, draft_notes, {*select})
     return {**reader_config, "channels": channels}, errors
+
+
+def _compose_reader_config(
+    preview: TablePreview,
+    clock: TableClock,
+    names: Sequence[str],
+    select: Mapping[str, Any],
+    draft_notes: DraftNotes,
+) -> dict[str, Any]:
+    """Return the settings of the reader without its channels and manoeuvre.
+
+    Args:
+        preview: first rows of the table with the settings of most tables.
+        clock: clock of the tables.
+        names: names of all columns of files without a line of names.
+        select: column -> value of the rows of one vessel.
+        draft_notes: receives the guess of the axes of a motion-capture system.
+    """
+    settings = {
+        # sheets are a list in YAML
+        key: list(value) if isinstance(value, tuple) else value
+        for key, value in preview.reader_settings.items()
+    }
+    if "motive_up" in settings:
+        text = (
+            f"export of OptiTrack Motive, by the motion {settings['motive_up']} points up and"
+            f" {settings['motive_bow']} of the rigid body points forward; x is taken as north"
+        )
+        draft_notes.add_guess((*READER_KEY, "motive_up"), text)
+    time = dict(clock.settings)
+    if "column" in time:
+        time["column"] = preview.original_name(time["column"])
+    reader_config = {"kind": settings.pop("kind"), **settings}
+    reader_config |= {"names": list(names)} if names else {}
+    return reader_config | {"time": time, **({"select": select} if select else {})}
 
 
 def _detect_or_ask_clock(
@@ -432,7 +456,9 @@ def _preview_named_tables(
             answer = draft_notes.require_answer(key, text, refusal)
     else:
         answer = draft_notes.require_answer(key, "", DataError("the names are empty"))
-    names = [name for name in re.split(r"[\s,;]+", answer) if name]
+    # names with blanks are separated by commas
+    separator = r"[,;]" if re.search(r"[,;]", answer) else r"\s+"
+    names = [name.strip() for name in re.split(separator, answer) if name.strip()]
     return *_preview_tables(files, names), names
 
 
@@ -1414,7 +1440,8 @@ def detect_clock(preview: TablePreview) -> TableClock:
             raise MissingClockError(
                 f"{preview.path}: no column has a name of time or increases like a clock; if the"
                 " rows are evenly spaced, give the time between them: residnet new --step '0.1 s',"
-                " or time: {step: 0.1 s} of the reader in a config"
+                " or time: {step: 0.1 s} of the reader in a config; in Python"
+                " read_logs(files, time={'step': '0.1 s'})"
             )
         cells = [
             str(cell) for cell in preview.text_columns.get(time_columns[0], ()) if cell == cell

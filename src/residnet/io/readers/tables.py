@@ -38,6 +38,13 @@ from residnet.io.readers.clock_repair import find_unique_rows, repair_clock
 from residnet.io.readers.excel_tables import join_excel_sheets, read_excel_sheet
 from residnet.io.readers.json_tables import JsonObjectReader
 from residnet.io.readers.manoeuvre_kinds import resolve_manoeuvre
+from residnet.io.readers.motion_capture import (
+    BowAxis,
+    MotiveAxes,
+    VerticalAxis,
+    list_bow_axes,
+    read_motive,
+)
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
     EARTH_VELOCITIES,
@@ -581,6 +588,11 @@ class CsvConfig(TableConfig):
         decimal: decimal sign, `.` or `,`.
         encoding: encoding of the text, for example `cp1252` for files of older Windows programs;
             null detects it.
+        motive_up: axis that points up in an export of OptiTrack Motive with rigid bodies, `y` or
+            `z`; null for other tables. Positions are `north [m]` and `east [m]`, with x to the
+            north, and `height [m]`, or `depth [m]` of a vessel that dives; the quaternion is `q_x`
+            to `q_w`.
+        motive_bow: axis of the rigid body that points forward.
     """
 
     kind: Literal["csv"] = "csv"
@@ -588,6 +600,8 @@ class CsvConfig(TableConfig):
     delimiter: str = Field(default=",", min_length=1, max_length=1)
     decimal: Literal[".", ","] = "."
     encoding: str | None = None
+    motive_up: VerticalAxis | None = None
+    motive_bow: BowAxis = "x"
     row_format: ClassVar[str] = "line {1}"
 
     @field_validator("encoding")
@@ -603,7 +617,22 @@ class CsvConfig(TableConfig):
                 " cp932"
             ) from error
 
+    @model_validator(mode="after")
+    def _validate_motive_axes(self) -> CsvConfig:
+        if self.motive_up is not None and self.motive_bow not in list_bow_axes(self.motive_up):
+            axes = ", ".join(list_bow_axes(self.motive_up))
+            raise ValueError(
+                f"motive_bow: '{self.motive_bow}' is vertical with motive_up: {self.motive_up};"
+                f" expected one of {axes}"
+            )
+        return self
+
     def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
+        if self.motive_up is not None:
+            table = read_motive(path, MotiveAxes(self.motive_up, self.motive_bow))
+            selected = table.iloc[:, find_column_positions(path, list(table.columns), columns)]
+            selected.attrs = dict(table.attrs)
+            return selected
         return read_csv(
             path, columns, self.delimiter, self.decimal, self.encoding, advance, self.names
         )
@@ -837,6 +866,9 @@ def read_column_names(path: Path) -> tuple[str, ...]:
         return ()
     with path.open("rb") as stream:
         line = stream.readline(1 << 16).decode(errors="replace").strip()
+    if line.startswith("Format Version,"):
+        # the first line of an export of Motive has the name of the take
+        return ("Format Version",)
     # the numbers of tables without a line of names differ from file to file
     n_numbers = count_numbers(line)
     return (f"{n_numbers} columns of numbers" if n_numbers > 1 else line,)

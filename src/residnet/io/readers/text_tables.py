@@ -20,6 +20,11 @@ from residnet.io.header_vocabulary import (
     parse_name,
 )
 from residnet.io.readers.base import ProgressCallback
+from residnet.io.readers.motion_capture import (
+    detect_motive_axes,
+    parse_motive_header,
+    read_motive,
+)
 from residnet.io.readers.table_lines import (
     WHITESPACE_DELIMITER,
     Header,
@@ -364,8 +369,11 @@ def read_table_head(
                 " (`ros2 bag record`), or convert it to csv, in Python pandas.json_normalize("
                 "list(yaml.safe_load_all(open(file)))).to_csv('log.csv', index=False)"
             )
+        if column_names is None and parse_motive_header(path, lines) is not None:
+            axes = detect_motive_axes(file, rows)
+            motive_settings = {"motive_up": axes.up, "motive_bow": axes.bow}
+            return read_motive(file, axes, rows), {"kind": "csv", **motive_settings}
         if column_names is None:
-            _refuse_motion_capture_export(path, lines[:_N_MOTION_CAPTURE_LINES])
             delimiter, cells, (header_row, n_lines_above) = _detect_delimiter(path, lines)
             if header_row + 1 < n_lines_above:
                 _refuse_names_in_two_rows(path, cells[header_row], cells[header_row + 1])
@@ -732,26 +740,6 @@ def _refuse_names_in_two_rows(path: Path, upper: Sequence[str], lower: Sequence[
                 f" {', '.join(words)}; write the names in one row, for example '{name} {words[0]}',"
                 " or name all columns in order: residnet new --names t,x,y,..."
             )
-
-
-_N_MOTION_CAPTURE_LINES = 10
-"""Number of lines in which an export of a motion-capture system has its names."""
-
-
-def _refuse_motion_capture_export(path: Path, lines: Sequence[str]) -> None:
-    """Refuse an export of OptiTrack Motive, whose names stand in several rows.
-
-    Raises:
-        DataError: if the file is such an export.
-    """
-    names = next((number for number, line in enumerate(lines) if line.startswith("Frame,Time")), 0)
-    if any("Rigid Body" in line for line in lines[:names]):
-        raise DataError(
-            f"{path}: row {names + 1} ('Frame', ...) and the rows above together name the columns,"
-            " as in exports of OptiTrack Motive; write one row instead of them, such as frame, t"
-            " [s], qx, qy, qz, qw, x [m], y [m], z [m], and if y points up put -z and y for y and z"
-            " of position and quaternion"
-        )
 
 
 def _has_repeated_cells(row: Sequence[str]) -> bool:
