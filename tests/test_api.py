@@ -113,6 +113,27 @@ def test_logs_have_one_recipe_whoever_asks(trials: Path, data: residnet.Dataset)
     assert heard[-1].done == heard[-1].total == 10
 
 
+def test_tables_without_names_or_time_are_read(trials: Path, tmp_path: Path) -> None:
+    table = pd.read_csv(min(trials.glob("*.csv")))
+    table.drop(columns="time").to_csv(tmp_path / "no_time.csv", index=False)
+    table.to_csv(tmp_path / "no_names.csv", index=False, header=False)
+    with pytest.raises(ResidnetError, match=r"in Python read_logs\(files, time="):
+        residnet.read_logs(tmp_path / "no_time.csv")
+    with pytest.raises(ResidnetError, match=r"in Python read_logs\(files, names="):
+        residnet.read_logs(tmp_path / "no_names.csv")
+    (stepped,) = residnet.read_logs(tmp_path / "no_time.csv", time={"step": "0.1 s"})
+    (named,) = residnet.read_logs(tmp_path / "no_names.csv", names=list(table.columns))
+    (mapped,) = residnet.read_logs(
+        tmp_path / "no_names.csv",
+        names=list(table.columns),
+        channels={"u": CHANNELS["u"]},
+        time={"step": "0.1 s"},
+    )
+    for log in (stepped, named, mapped):
+        np.testing.assert_allclose(log["u"], table["surge"], atol=1e-9)
+        np.testing.assert_allclose(np.diff(log.t), 0.1, atol=1e-6)
+
+
 def test_inputs_that_move_as_others_are_unexcited(logs: list[residnet.Log]) -> None:
     alike = [
         log.replace(

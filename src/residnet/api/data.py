@@ -29,7 +29,8 @@ from residnet.core.progress import ProgressCallback, log_message, report_progres
 from residnet.evaluation.protocol import EvaluationConfig, longest_segment_length
 from residnet.identification.prepared import mask_unexplained_idle
 from residnet.identification.recipe import PreparationPlan, make_evaluation_settings
-from residnet.io.drafting.questions import DraftNotes, Question, dump_commented_yaml
+from residnet.io.drafting.channels import READER_KEY
+from residnet.io.drafting.questions import DraftNotes, Key, Question, dump_commented_yaml
 from residnet.io.drafting.reading import find_log_files, read_mixed_formats
 from residnet.io.readers import ReaderConfig
 from residnet.io.sources import DataConfig, MeasuredLogs
@@ -64,6 +65,7 @@ def read_logs(
     time: str | tuple[str, str] | Mapping[str, str] = "t",
     manoeuvre: str | None = None,
     reader: PartLike | None = None,
+    names: Sequence[str] | None = None,
     progress: ProgressCallback | None = None,
 ) -> list[Log]:
     """Read logs from files, patterns or folders.
@@ -76,9 +78,11 @@ def read_logs(
         source: a path, a pattern such as `trials/*.csv`, a folder, or a list of these.
         channels: channel -> (column, unit), for example `{"u": ("speed", "kn")}`, or a mapping with
             column, unit, sign and frame as in YAML.
-        time: name of the time column in s, or (column, unit).
+        time: name of the time column in s, or (column, unit); `{"step": "0.1 s"}` for tables
+            without a column of time, with or without `channels`.
         manoeuvre: kind of manoeuvre of all files; `folder` for the name of each file's folder.
         reader: kind or settings of a reader, instead of `channels`.
+        names: names of all columns in order, for tables without a line of names.
         progress: called with the progress of the reading.
 
     Returns:
@@ -116,10 +120,18 @@ def read_logs(
                     for name, source_entry in channels.items()
                 },
                 "manoeuvre": manoeuvre,
+                **({} if names is None else {"names": list(names)}),
             }
-        logs = _read_drafted_logs(files) if settings is None else _read_with(settings, files)
-    names = assign_log_names(logs)
-    return [logs[file].replace(name=names[file]) for file in files if file in logs]
+        answers: dict[Key, str] = {}
+        if isinstance(time, Mapping) and "step" in time:
+            answers[*READER_KEY, "time", "step"] = str(time["step"])
+        if names is not None:
+            answers[*READER_KEY, "names"] = ",".join(names)
+        logs = (
+            _read_drafted_logs(files, answers) if settings is None else _read_with(settings, files)
+        )
+    log_names = assign_log_names(logs)
+    return [logs[file].replace(name=log_names[file]) for file in files if file in logs]
 
 
 def _read_with(reader_settings: Any, files: Sequence[Path]) -> dict[Path, Log]:
@@ -133,10 +145,10 @@ def _read_with(reader_settings: Any, files: Sequence[Path]) -> dict[Path, Log]:
     return logs
 
 
-def _read_drafted_logs(files: Sequence[Path]) -> dict[Path, Log]:
+def _read_drafted_logs(files: Sequence[Path], answers: Mapping[Key, str]) -> dict[Path, Log]:
     """Read files with drafted readers, and log each channel map that was guessed."""
     logs = dict[Path, Log]()
-    for draft_result in read_mixed_formats(files):
+    for draft_result in read_mixed_formats(files, answers):
         for error in draft_result.errors.values():
             raise error
         # only these readers have a channel map; other formats describe their channels themselves

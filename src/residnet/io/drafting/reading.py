@@ -1205,10 +1205,16 @@ def _motion_channels(channels: Iterable[str]) -> set[str]:
     return {equivalent_channels.get(name, name) for name in channels} & {*STATE_NAMES, "phi", "p"}
 
 
-def read_mixed_formats(paths: Sequence[Path]) -> list[DraftResult]:
+def read_mixed_formats(
+    paths: Sequence[Path], answers: Mapping[Key, str] | None = None
+) -> list[DraftResult]:
     """Read logs of any formats with one drafted reader per format and set of columns.
 
     A group of logs without a readable one has the error in its result.
+
+    Args:
+        paths: files.
+        answers: answers that the user has given in advance, by key.
     """
     groups: dict[tuple[str, ...], list[Path]] = {}
     columns_by_path = {
@@ -1221,7 +1227,7 @@ def read_mixed_formats(paths: Sequence[Path]) -> list[DraftResult]:
         groups.setdefault((log_kind, *names), []).append(path)
     results = []
     for group in groups.values():
-        draft_notes = DraftNotes()
+        draft_notes = DraftNotes(answers=answers)
         try:
             results.append(read_drafted(group, draft_notes, is_gridded=False))
         except UnreadableLogsError as error:
