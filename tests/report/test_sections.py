@@ -19,7 +19,7 @@ from residnet_tasks.actuators import ActuatorsTaskConfig
 from residnet_tasks.import_logs import ImportConfig
 from tiny import write_yaml
 
-from residnet.autopilot.records import RollMetricsFile
+from residnet.autopilot.records import RelativeChange, RollMetricsFile
 from residnet.autopilot.report import course, roll
 from residnet.autopilot.report import heading as autopilot
 from residnet.core.errors import DataError
@@ -354,6 +354,18 @@ def test_a_roll_policy_with_a_larger_heading_error_is_not_as_good(
     assert "combination in 3, and has a larger heading error in 1." in seas
     assert first.startswith("The learned policy is NOT at least as good as")
     assert "(+4.8 %, 95 % confidence interval +3.0 to +6.0 %)" in figures
+
+
+def test_a_roll_policy_that_training_did_not_improve_is_named_as_the_law(
+    page_of: Callable[[str], Path],
+) -> None:
+    metrics = RunFiles(page_of("roll").parent).read_task_metrics(RollMetricsFile)
+    no_change = RelativeChange(value=0.0, interval=(0.0, 0.0))
+    comparison = metrics.comparison.model_copy(
+        update={"roll": no_change, "heading": no_change, "is_as_good": True}
+    )
+    first = roll.verdict_texts(metrics.model_copy(update={"comparison": comparison}))[0]
+    assert first.startswith("The training did not improve on the law it started from")
 
 
 def test_a_course_shows_what_was_missed(page_of: Callable[[str], Path]) -> None:

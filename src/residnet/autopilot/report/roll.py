@@ -51,6 +51,8 @@ LABELS = {
 }
 """Description of each controller."""
 _BAR_WIDTH = 0.36
+_SAME_RMS_CHANGE = 1e-5
+"""Relative difference of RMS values by which two controllers are the same but for rounding."""
 
 
 def verdict_texts(metrics: RollMetricsFile) -> list[str]:
@@ -69,6 +71,13 @@ def verdict_texts(metrics: RollMetricsFile) -> list[str]:
         f" ({_describe_change(comparison.heading)}); up to +{100 * comparison.tolerance:g} % counts"
         " as the same.",
     ]
+    bounds = (*comparison.roll.interval, *comparison.heading.interval)
+    if max(map(abs, bounds)) < _SAME_RMS_CHANGE:
+        # the best epoch is the start of the training, at which the network adds nothing
+        sentences[0] = (
+            "The training did not improve on the law it started from"
+            f" ({LABELS[comparison.classical]}): the learned policy is this law."
+        )
     states = [
         total.sea_state
         for total in metrics.totals
