@@ -259,6 +259,11 @@ def test_trainings_follow_from_the_logs_and_given_keys_override_them() -> None:
     longer = derived_training(plan, "mlp", replace(facts, n_samples=28_000))
     assert longer.steps == pytest.approx(1.4 * usual.steps, rel=0.02)
     assert derived_training(plan, "mlp", facts, 0.5).steps == pytest.approx(usual.steps / 2, abs=1)
+    # more channels have more products to learn: 56 up to degree 3 of five channels, 120 of seven
+    for n_channels, factor in ((4, 1.0), (5, 1.0), (7, 120 / 56), (20, 3.0)):
+        names = tuple(f"channel_{i}" for i in range(n_channels))
+        training = derived_training(plan, "mlp", replace(facts, channel_names=names))
+        assert training.steps == pytest.approx(factor * 97.7, abs=1)
     own = derived_training(plan, "mlp", facts, steps=7)
     assert own == usual.model_copy(update={"steps": 7})
     # a schedule of the user is taken as it is
