@@ -163,7 +163,8 @@ def test_models_that_are_read_back_are_judged_alike(
     """Killed after the last training: what is judged has been read from the folder."""
     out = tmp_path / "late"
     shutil.copytree(tiny_run / "models", out / "models")
-    shutil.copy(tiny_run / "resolved.yaml", out)
+    for name in ("resolved.yaml", "checksums.json"):
+        shutil.copy(tiny_run / name, out)
     assert command("run", tiny_config, "--out", out, "--resume").code == 0
     assert rows(out) == rows(tiny_run)
 
