@@ -404,6 +404,6 @@ def test_gradients_pass_through_the_model_in_single_precision() -> None:
 
 def test_a_model_without_rudder_is_refused() -> None:
     _, model = nomoto_model(GAIN, TIME, 0.1)
-    for inputs, said in ((("n_port",), "driven by 'delta'"), (("delta", "n"), "does not command")):
+    for inputs, said in ((("n_port",), "the input 'delta'"), (("delta", "n"), "does not command")):
         with pytest.raises(ConfigError, match=said):
             SteeredModel(model, inputs, "start", RATED)

@@ -169,7 +169,7 @@ def _project_log(
         yaw_rate = pitch_rate * np.sin(roll) + log.columns["r"] * np.cos(roll)
         horizontal["r"] = yaw_rate / np.maximum(np.cos(pitch), _MIN_PITCH_COSINE)
     if "u" not in log.columns:
-        return RawTable(log.t, {**log.columns, **horizontal})
+        return RawTable(log.t, {**log.columns, **horizontal}) if horizontal else log
     u = log.columns["u"]
     v = log.columns.get("v", np.zeros(z.size))
     rate = np.gradient(z, log.t)
@@ -179,7 +179,7 @@ def _project_log(
         # a velocity of the world frame is the rate of z itself
         body_error = np.nanmean((rate - rate_without_heave - cosine * w) ** 2)
         if np.nanmean((rate - w) ** 2) <= body_error:
-            return RawTable(log.t, {**log.columns, **horizontal})
+            return RawTable(log.t, {**log.columns, **horizontal}) if horizontal else log
     else:
         # the unit of u may be unknown; a vessel that dives by pitch has little heave
         is_finite = np.isfinite(rate) & np.isfinite(rate_without_heave)

@@ -77,7 +77,8 @@ class HeaderlessTableError(DataError):
         super().__init__(
             f"{path}: has {len(first_row)} columns of numbers without names (first row:"
             f" {truncate(' '.join(first_row), 80)}); name them once for all files, in order:"
-            " residnet new --names t,x,y,..., or the key `names` of the reader in a config"
+            " residnet new --names t,x,y,..., the key `names` of the reader in a config,"
+            " or in Python read_logs(files, names=[...])"
         )
 
 
