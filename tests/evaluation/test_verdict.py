@@ -180,6 +180,14 @@ def test_velocity_errors_are_compared_with_constant_velocity_and_the_baseline() 
     )
 
 
+def test_constant_velocity_is_selected_because_a_model_fails() -> None:
+    """Its errors at short horizons may be smaller, as the table next to the verdict shows."""
+    fault = "4 of its 4 validation windows diverged (T20)"
+    said = write_verdict(evidence(selected="constant_velocity", selection=selection("", fault)))[0]
+    assert said.startswith("Do not use: no sound model of this run is better than constant")
+    assert said.endswith(f"; mlp fails: {fault}.")
+
+
 def test_logs_that_trained_the_model_are_not_external_data() -> None:
     known = evidence(split="external", n_logs=2, n_logs_of_fit=2)
     sentences = write_verdict(known)

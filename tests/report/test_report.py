@@ -180,7 +180,7 @@ def five_answers(seen: str, level: str) -> bool:
         r"plsr \(selected\) \| 0.40.{,20}\| 0.57",
         r"constant_velocity \| 12.{,20}\| 12",
     )
-    doctor = "1 of 2 logs hold something that would mislead a fit: gaps"
+    doctor = "1 of 2 logs has faults that would mislead a fit: gaps"
     words = (*rows, re.escape(LEVEL_TEXTS[level]), re.escape(doctor))
     return all(re.search(pattern, seen) for pattern in words)
 

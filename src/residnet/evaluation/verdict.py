@@ -635,9 +635,16 @@ def is_useless(evidence: VerdictEvidence) -> bool:
 def _explain_uselessness(evidence: VerdictEvidence) -> str:
     """Return why the selected model is not shown to be better than constant velocity."""
     if evidence.selected == CONSTANT_VELOCITY:
-        return (
-            "no model of this run is better than constant velocity, which holds the initial"
-            " velocities of each free run"
+        candidates = () if evidence.selection is None else evidence.selection.models
+        # an unsound model may have smaller errors at short horizons, which needs an explanation
+        faults = [f"{row.model} fails: {row.faults[0]}" for row in candidates if row.faults]
+        subject = "no sound model" if faults else "no model"
+        return "; ".join(
+            [
+                f"{subject} of this run is better than constant velocity,"
+                " which holds the initial velocities of each free run",
+                *faults,
+            ]
         )
     selected_row = evidence.rows_by_model[evidence.selected]
     reference_nrmse = evidence.rows_by_model[CONSTANT_VELOCITY].mean_nrmse

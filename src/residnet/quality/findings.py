@@ -358,11 +358,12 @@ def summarize_inspection(inspection: InspectionFile) -> InspectionSummary:
         if n_omitted
         else ""
     )
-    count_text = "the log holds" if n_logs == 1 else f"{n_logs_with_problems} of {n_logs} logs hold"
+    have = "has" if n_logs_with_problems == 1 else "have"
+    count_text = "the log has" if n_logs == 1 else f"{n_logs_with_problems} of {n_logs} logs {have}"
     # a finding about the set of logs belongs to no single log
-    subject_text = count_text if n_logs_with_problems else "the logs together hold"
+    subject_text = count_text if n_logs_with_problems else "the logs as a set have"
     tally = (
-        f"Data doctor: {subject_text} something that would mislead a fit:"
+        f"Data doctor: {subject_text} faults that would mislead a fit:"
         f" {', '.join(kind_texts)}{omitted_text}."
     )
     name, first_finding = max(
