@@ -619,3 +619,40 @@ def test_check_rudder_sign_uses_samples_with_known_speed(*, slow: float) -> None
     (said,) = inspect_log(Log("log", t, channels)).find_by_code("rudder_sign")
     assert said.level == "note"
     assert said.figures["effect"] == pytest.approx(0.18 * slow**2, rel=0.2)
+
+
+@pytest.mark.parametrize("seed", [0, 14, 34, 35])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_check_rudder_sign_does_not_contradict_coarsely_sampled_turns(
+    seed: int, side: float
+) -> None:
+    """A sample each half second: the smoother spans the response of a small boat."""
+    random = np.random.default_rng(seed)
+    t = np.arange(0.0, 72.0, 0.05)
+    delta = np.repeat(random.uniform(-0.44, 0.44, 12), 120)
+    n = np.repeat(random.uniform(10.0, 25.0, 8), 180)
+    motion = np.zeros((t.size, 3))
+    motion[0, 0] = 1.2
+    for k in range(t.size - 1):
+        u, v, r = motion[k]
+        race = 0.6 * u * u + 0.002 * n[k] ** 2
+        surge = 0.0009 * n[k] ** 2 - 0.3 * u * abs(u) + 0.5 * v * r
+        sway = -0.9 * v - 0.6 * u * r - 0.25 * race * delta[k]
+        yaw = -r - 0.8 * r * abs(r) - 0.6 * u * v + 0.6 * race * delta[k]
+        motion[k + 1] = motion[k] + 0.05 * np.array([surge, sway, yaw])
+    u, v, r = motion[::10].T + random.normal(0.0, 0.004, (3, 144))
+    channels = {"u": u, "v": v, "r": r, "n": n[::10], "delta": side * delta[::10]}
+    found = inspect_log(Log("boat", t[::10], channels)).find_by_code("rudder_sign")
+    contradiction = "starboard" if side < 0.0 else "port"
+    assert not [finding for finding in found if contradiction in finding.text]
+
+
+def test_check_extrapolation_notes_channels_that_do_not_drive_the_vessel() -> None:
+    logs = [
+        changed(log, e_heading=np.full(2000, value)) for log, value in ((WHOLE, 0.0), (SAME, 1.0))
+    ]
+    splits = {logs[0].name: "train", "other": "test"}
+    logs[1] = logs[1].replace(name="other")
+    for inputs, level in ((["delta"], "note"), (["delta", "e_heading"], "will mislead")):
+        found = inspect_log_set(logs, inputs, splits).find_by_code("extrapolation")
+        assert [f.level for f in found if f.text.startswith("e_heading")] == [level]
