@@ -88,6 +88,10 @@ def test_the_page_has_the_table_of_seas(run: Path, metrics: RollMetricsFile) -> 
     page = Page(plain(run / "report.html"))
     totals, seas = page.tables[:2]
     assert totals[-1][0] == "learned policy"
+    # columns have the labels of the rows of the first table, not the names in metrics.json
+    columns = seas[1][1:]
+    assert columns[-1] == "learned policy"
+    assert set(columns) <= {line[0] for line in totals}
     beam = next(line for line in seas if line[0] == "4, 90 deg")
     row = find_row(metrics, "learned", BEAM)
     assert f"{100 * row.roll_reduction:.1f}".replace("-", "−") in beam[2:4]

@@ -269,11 +269,13 @@ def _rows_table(metrics: RollMetricsFile, models: Sequence[str]) -> Table:
     """Return a table of the seas with roll reduction and heading error of controllers."""
     rows = {(row.model, row.sea_state, row.direction): row for row in metrics.rows}
     table = Table(
-        ["sea state, direction", "RMS roll [deg]", *models, HEADING_ONLY, *models],
-        "RMS roll of heading control alone, its reduction, and the RMS heading error. "
-        + "; ".join(f"{model}: {LABELS[model]}" for model in (HEADING_ONLY, *models))
-        + ". Grey: the vessel rolls less than the noise of the sensors, so that there is no roll to"
-        " reduce.",
+        [
+            "sea state, direction",
+            "RMS roll [deg]",
+            *(LABELS[model] for model in (*models, HEADING_ONLY, *models)),
+        ],
+        "RMS roll of heading control alone, its reduction, and the RMS heading error. Grey: the"
+        " vessel rolls less than the noise of the sensors, so that there is no roll to reduce.",
         [
             (LABELS[HEADING_ONLY], 1),
             ("roll reduction [%]", len(models)),
