@@ -560,7 +560,7 @@ def check_contradicting_logs(logs: LogSet, make_finding: Check) -> Iterator[Find
     fleet = consensus.fleet
     n_inliers = len(consensus.inliers)
     for i in consensus.outliers:
-        if adequate is not consensus and not adequate.is_outlier(i):
+        if not adequate.is_contradicting(i):
             continue
         log = fleet.logs[i]
         hypotheses = rank_hypotheses(consensus, i)

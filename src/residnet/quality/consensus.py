@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import scipy
 
 from residnet.core.arrays.paged import MAX_SAMPLES_IN_MEMORY
 from residnet.core.layout import SIX_DOF_LAYOUT
@@ -70,6 +71,8 @@ MIN_SUSPICION = 0.5
 """Severity from which a log is left out in turn."""
 MAX_REFERENCES = 40
 """Largest number of inliers, evenly spread, that serve as the reference of a large fleet."""
+MAX_SPARSE_LOGS = 3
+"""Largest number of logs that predict each other too badly for a residual variance."""
 CV_FOLDS = 4
 """Folds of the cross-validation within a log, used if there are too few logs."""
 LTS_STEPS = 3
@@ -450,19 +453,25 @@ class Fleet:
         mse = {
             i: (
                 fits[i].compute_mse(self.data[i])
-                if members > 3
+                if members > MAX_SPARSE_LOGS
                 else cross_validate_mse(self.data[i])
             )
             for i in logs
         }
         return {i: np.maximum(mse[i] - self.data[i].noise_var, 0.0) for i in logs}
 
-    def score_logs(self, inliers: Sequence[int], of: Sequence[int]) -> dict[int, Score]:
+    def score_logs(
+        self,
+        inliers: Sequence[int],
+        of: Sequence[int],
+        min_variance: Mapping[int, np.ndarray] | None = None,
+    ) -> dict[int, Score]:
         """Compare logs with a fit to the inliers without them.
 
         Args:
             inliers: indices of the inliers.
             of: indices of the logs to compare.
+            min_variance: lower bounds on the expected residual variance [n], by log.
         """
         references = inliers[:: -(-len(inliers) // MAX_REFERENCES)]
         logs = [i for i in dict.fromkeys((*references, *of)) if len(inliers) > (i in inliers)]
@@ -473,6 +482,8 @@ class Fleet:
             i: np.median([excess[j] for j in references if j != i], axis=0) + self.data[i].noise_var
             for i in logs
         }
+        for i, variance in (min_variance or {}).items():
+            expected[i] = np.maximum(expected[i], variance)
         ratio = {i: np.sqrt(mse[i] / expected[i]) for i in logs}
         log_ratio = {i: np.log(np.maximum(ratio[i], 1e-6)) for i in logs}
         tests = {i: self.run_score_test(i, fits[i], expected[i]) for i in logs}
@@ -498,6 +509,24 @@ class Fleet:
             )
             for i in of
         }
+
+    def estimate_local_mse(self, inliers: Sequence[int], i: int) -> np.ndarray:
+        """Return the mean squared residual [n] of the inliers in the motions of another log.
+
+        Each block of the log is paired with the nearest block of the inliers, whose residual is
+        that of a model without its log. Near replicates measure the lack of fit where the log is
+        (Daniel and Wood 1980), which the median over all manoeuvres does not.
+        """
+        references = [j for j in inliers if j != i]
+        references = references[:: -(-len(references) // MAX_REFERENCES)]
+        fits = self.fit_leave_one_out(inliers, references)
+        squares = [
+            fits[j].compute_residuals(self.data[j]) ** 2
+            / (1.0 + fits[j].compute_leverage(self.data[j]))[:, None]
+            for j in references
+        ]
+        tree = scipy.spatial.cKDTree(np.concatenate([self.data[j].X for j in references]))
+        return np.asarray(np.concatenate(squares)[tree.query(self.data[i].X)[1]].mean(0))
 
     @cached_property
     def feature_groups(self) -> list[np.ndarray]:
@@ -643,6 +672,17 @@ class Consensus:
         """Return whether a log, or part of its data, contradicts the inliers."""
         fleet = self.fleet if data is None else self.fleet.with_data({i: data})
         return fleet.score_logs(self.inliers, [i])[i].severity > 1.0
+
+    def is_contradicting(self, i: int) -> bool:
+        """Return whether a log is an outlier among the agreeing logs of like motions.
+
+        Terms that the features lack matter in some manoeuvres only, where the residuals of the
+        agreeing logs are large too. Three logs or fewer predict too badly to measure this.
+        """
+        if len(self.inliers) <= MAX_SPARSE_LOGS:
+            return self.is_outlier(i)
+        min_variance = {i: self.fleet.estimate_local_mse(self.inliers, i)}
+        return self.fleet.score_logs(self.inliers, [i], min_variance)[i].severity > 1.0
 
     def compute_influence(self, i: int) -> float:
         """Return the relative change of the predictions by including a log in the fit."""
