@@ -92,3 +92,60 @@ def test_a_stop_or_a_water_jet_is_no_reversed_propeller(
     channels = {"u": u, "r": rng.normal(0.0, 0.01, t.size), "n": 4.0 + 0.0 * t}
     log = Log("astern", t, {**channels, channel: 0.1 * np.sin(t)})
     assert bool(inspect_log(log).find_by_code("propeller_sign")) == is_reported
+
+
+def drive(seed: int, index: int, *, inertia: float = 1.0) -> Log:
+    """Return a run of a catamaran whose propellers push less astern than ahead.
+
+    Args:
+        seed: seed of the fleet.
+        index: number of the run; every third one reverses the propellers.
+        inertia: factor on mass and moment of inertia.
+    """
+    rng = np.random.default_rng([seed, index])
+    t = np.arange(0.0, 100.0, 0.1)
+    lowest, difference = (-0.8, 0.6) if index % 3 == 1 else (0.6, 0.2)
+    steps = (t / 5.0).astype(int)
+    port, stbd = np.clip(
+        rng.uniform(lowest, 1.4, 20)[steps]
+        + np.array([[1.0], [-1.0]]) * difference * rng.uniform(-1.0, 1.0, 20)[steps],
+        -0.8,
+        1.4,
+    )
+    u, v, r = np.zeros((3, t.size))
+    u[0] = 1.5
+    for k in range(t.size - 1):
+        thrusts = [(0.5 if n >= 0.0 else 0.3) * n * abs(n) for n in (port[k], stbd[k])]
+        thrusts = [
+            thrust - 0.08 * abs(n) * (u[k] + side * r[k])
+            for thrust, n, side in zip(thrusts, (port[k], stbd[k]), (1.0, -1.0), strict=True)
+        ]
+        surge = sum(thrusts) - 0.1 * u[k] - 0.2 * u[k] * abs(u[k]) + v[k] * r[k]
+        sway = -0.4 * v[k] - 0.6 * v[k] * abs(v[k]) - 0.6 * u[k] * r[k]
+        yaw = 0.8 * (thrusts[0] - thrusts[1]) - 0.6 * r[k] - 0.9 * r[k] * abs(r[k])
+        for values, rate in ((u, surge), (v, sway), (r, yaw)):
+            values[k + 1] = values[k] + 0.1 * rate / inertia
+    psi = np.cumsum(r) * 0.1
+    position = np.cumsum((u + 1j * v) * np.exp(1j * psi)) * 0.1
+    channels = {"x": position.real, "y": position.imag, "psi": psi}
+    channels |= {
+        name: values + rng.normal(0.0, 0.005, t.size)
+        for name, values in (("u", u), ("v", v), ("r", r))
+    }
+    return Log(f"run{index}", t, {**channels, "n_port": port, "n_stbd": stbd})
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_terms_missing_in_few_manoeuvres_are_no_contradiction(seed: int) -> None:
+    """Four of twelve logs go astern, where the model lacks terms; the median log does not."""
+    report = inspect_log_set([drive(seed, k) for k in range(12)], ["n_port", "n_stbd"])
+    accusing = [f for f in report.findings if f.code.startswith("contradicts")]
+    assert [finding.line for finding in accusing] == []
+
+
+@pytest.mark.parametrize("heavy", [1, 3])
+def test_a_heavier_vessel_is_a_contradiction_where_terms_are_missing(heavy: int) -> None:
+    logs = [drive(0, k, inertia=1.5 if k == heavy else 1.0) for k in range(12)]
+    report = inspect_log_set(logs, ["n_port", "n_stbd"])
+    accusing = [f for f in report.findings if f.code.startswith("contradicts")]
+    assert [f.text.split(":")[0] for f in accusing] == [f"run{heavy}"]

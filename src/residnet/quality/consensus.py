@@ -345,6 +345,7 @@ class Fleet:
             if len(log) >= MIN_SAMPLES
         ]
         self.block_seconds = float(np.median(lengths)) if lengths else 1.0
+        self._enriched: Fleet | None = None
         errors = {form: self._standardize(homogeneous=form) for form in (False, True)}
         if errors[False] < POLYNOMIAL_PREFERENCE * errors[True]:
             self._standardize(homogeneous=False)
@@ -425,9 +426,10 @@ class Fleet:
 
     def enrich(self) -> Fleet:
         """Return the fleet with terms of third degree among the features."""
-        enriched_fleet = copy.copy(self)
-        enriched_fleet._standardize(homogeneous=self.homogeneous, enriched=True)
-        return enriched_fleet
+        if self._enriched is None:
+            self._enriched = copy.copy(self)
+            self._enriched._standardize(homogeneous=self.homogeneous, enriched=True)
+        return self._enriched
 
     def fit_leave_one_out(self, members: Sequence[int], of: Iterable[int]) -> dict[int, RidgeFit]:
         """Fit the members once for each log, without that log.
@@ -805,6 +807,12 @@ def find_consensus(logs: Sequence[LogStatistics], inputs: Sequence[str]) -> Cons
 def _partition_logs(fleet: Fleet, start: Sequence[int]) -> Consensus:
     """Partition logs: a start set grows by all agreeing logs, then loses the worst ones."""
     inliers = list(start)
+
+    def is_contradicting(i: int) -> bool:
+        # without the logs of like motions nothing would measure the lack of fit there
+        adequate = Consensus(fleet, [j for j in inliers if j != i]).adequate
+        return adequate is not None and adequate.is_contradicting(i)
+
     while remaining := [i for i in fleet.usable if i not in inliers]:
         agreeing = [i for i, s in fleet.score_logs(inliers, remaining).items() if s.severity <= 1.0]
         if not agreeing:
@@ -819,8 +827,11 @@ def _partition_logs(fleet: Fleet, start: Sequence[int]) -> Consensus:
             for i in suspects
             if severity[i] > MIN_SUSPICION
         }
-        worst = max(severity_without, key=lambda i: severity_without[i], default=-1)
-        if worst < 0 or severity_without[worst] <= 1.0:
+        by_severity = sorted(severity_without, key=lambda i: -severity_without[i])
+        worst = next(
+            (i for i in by_severity if severity_without[i] > 1.0 and is_contradicting(i)), -1
+        )
+        if worst < 0:
             break
         inliers.remove(worst)
     consensus = Consensus(fleet, inliers)
