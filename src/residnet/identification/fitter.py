@@ -739,11 +739,11 @@ def _resolve_settings(
     if settings.recipe is not None:
         settings = settings.with_parts(summary)
     has_enough_logs = has_enough_logs_for_networks(summary)
-    # masks, jumps of inputs among them, can exclude most of the samples
+    # masks, gaps and trimmed ends can exclude most of the samples
     recorded = sum(len(log.trainable) for log in training_logs) * summary.dt
     shortage = (
-        f"{summary.n_samples * summary.dt:.0f} s of the {recorded:.0f} s of the training logs are"
-        f" not masked, which is shorter than ten free runs of {summary.free_run_length:g} s"
+        f"{summary.n_samples * summary.dt:.0f} s of the {recorded:.0f} s of the training logs can"
+        f" be used in a fit, which is shorter than ten free runs of {summary.free_run_length:g} s"
     )
     if settings.recipe is not None and not has_enough_logs:
         log_message(f"  mlp and lstm are left out: {shortage}")
