@@ -107,6 +107,22 @@ def draft(table: dict[str, np.ndarray], path: Path) -> tuple[dict[str, dict[str,
     return reader["channels"], "; ".join(texts)
 
 
+def test_the_unit_of_a_drift_angle_is_no_unit_of_a_velocity(tmp_path: Path) -> None:
+    trip = TRUTH[0]
+    table = {name: trip[name] for name in ("t", "x", "y", "psi", "delta")}
+    table["V"] = np.hypot(trip["u"], trip["v"])
+    table["beta"] = np.degrees(-np.arctan2(trip["v"], trip["u"]))
+    path = tmp_path / "trip.csv"
+    pd.DataFrame(table).to_csv(path, index=False)
+    notes = DraftNotes()
+    draft_tables([path], notes)
+    texts = {
+        text for key, text in notes.guessed_values + notes.notes if key[-1] in ("drift_angle", "v")
+    }
+    assert any("deg" in text for text in texts)
+    assert not any("m/s" in text for text in texts)
+
+
 def test_the_symbol_u_is_the_speed_or_the_surge_velocity_by_the_track(tmp_path: Path) -> None:
     trip = TRUTH[0]
     beta = np.degrees(np.arctan2(-trip.v, trip.u))

@@ -24,6 +24,7 @@ from residnet.evaluation.metrics import MIN_LOGS_AS_BLOCKS
 from residnet.evaluation.protocol import Window
 
 SIGNIFICANCE_LEVEL = 0.05
+"""Level of the paired tests that exclude a member: the convention of such tests."""
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,7 @@ LABELS = {
 }
 """Description of each controller."""
 _BAR_WIDTH = 0.36
+"""Width of a bar in units of the spacing of directions: two bars and a gap fit into it."""
 _SAME_RMS_CHANGE = 1e-5
 """Relative difference of RMS values by which two controllers are the same but for rounding."""
 

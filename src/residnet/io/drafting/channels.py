@@ -837,7 +837,7 @@ def _restore_drift_angle(
     Args:
         entries: channel -> entry, with u and v of the drift angle unless these were left out.
         drift: columns and interpretation of the drift angle; None changes nothing.
-        draft_notes: notes on u and v become notes on speed and drift angle.
+        draft_notes: notes on u become notes on the speed; those on the derived v are discarded.
     """
     if drift is None:
         return entries
@@ -851,8 +851,9 @@ def _restore_drift_angle(
         return others
     speed_sign = entries["u"].get("sign", 1)
     angle_sign = drift.sign * speed_sign * entries["v"].get("sign", 1)
-    for name, channel in (("u", "speed"), ("v", "drift_angle")):
-        draft_notes.move_key((*CHANNELS_KEY, name), (*CHANNELS_KEY, channel))
+    draft_notes.move_key((*CHANNELS_KEY, "u"), (*CHANNELS_KEY, "speed"))
+    # v has the unit of the speed, so that a guess of its unit is no guess on the drift angle
+    draft_notes.discard_key((*CHANNELS_KEY, "v"))
     text = (
         f"u = U cos(beta) and v = -U sin(beta) follow from the speed U '{drift.speed_column}' and"
         f" the drift angle beta '{drift.angle_column}'"

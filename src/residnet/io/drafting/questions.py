@@ -130,6 +130,12 @@ class DraftNotes:
         self.guessed_values += other_notes.guessed_values
         self.notes += other_notes.notes
 
+    def discard_key(self, key: Key) -> None:
+        """Discard the guesses and notes of a key, and its children, that the config lacks."""
+        depth = len(key)
+        self.guessed_values = [item for item in self.guessed_values if item[0][:depth] != key]
+        self.notes = [item for item in self.notes if item[0][:depth] != key]
+
     def move_key(self, old_key: Key, new_key: Key) -> None:
         """Move the guesses and notes of a key and its children to another key."""
         depth = len(old_key)
