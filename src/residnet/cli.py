@@ -230,7 +230,7 @@ def new(
     Channels, units, frames, inputs, splits, protocols and models are proposed. Questions that the
     logs do not answer are asked on a terminal; otherwise the default is marked as a guess.
     """
-    from residnet.io.drafting.channels import READER_KEY
+    from residnet.io.drafting.questions import READER_KEY
     from residnet.tasks.drafting import STOP, write_new_config
     from residnet.tasks.naval_draft import NavalParticulars
 

@@ -25,8 +25,7 @@ import yaml
 import residnet
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
-from residnet.io.drafting.channels import READER_KEY
-from residnet.io.drafting.questions import Key
+from residnet.io.drafting.questions import READER_KEY, Key
 from residnet.tasks.drafting import write_new_config
 from residnet.tasks.inspection import inspect_logs
 from residnet.tasks.registry import load_task, open_finished_task

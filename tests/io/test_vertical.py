@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from residnet.io.drafting.channels import RawTable
+from residnet.io.drafting.motion_regression import RawTable
 from residnet.io.drafting.vertical import project_on_horizontal
 
 T = np.arange(0.0, 60.0, 0.05)

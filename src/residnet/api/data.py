@@ -29,8 +29,13 @@ from residnet.core.progress import ProgressCallback, log_message, report_progres
 from residnet.evaluation.protocol import EvaluationConfig, longest_segment_length
 from residnet.identification.prepared import mask_unexplained_idle
 from residnet.identification.recipe import PreparationPlan, make_evaluation_settings
-from residnet.io.drafting.channels import READER_KEY
-from residnet.io.drafting.questions import DraftNotes, Key, Question, dump_commented_yaml
+from residnet.io.drafting.questions import (
+    READER_KEY,
+    DraftNotes,
+    Key,
+    Question,
+    dump_commented_yaml,
+)
 from residnet.io.drafting.reading import find_log_files, read_mixed_formats
 from residnet.io.readers import ReaderConfig
 from residnet.io.sources import DataConfig, MeasuredLogs

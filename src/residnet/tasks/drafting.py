@@ -22,9 +22,9 @@ from residnet.core.log import Log
 from residnet.core.names import BOW_WIND_CHANNELS, WIND_INPUTS
 from residnet.core.ownership import require_replaceable
 from residnet.core.progress import log_message
-from residnet.io.drafting.channels import CHANNELS_KEY
 from residnet.io.drafting.problems import group_problems, label_files
 from residnet.io.drafting.questions import (
+    CHANNELS_KEY,
     TEXT_COLUMNS,
     UNMAPPED_COLUMNS,
     UNMAPPED_FIELDS,

@@ -13,6 +13,10 @@ from residnet.core.errors import DataError
 
 Key = tuple[str, ...]
 """Path of a key in the drafted config, for example `("data", "reader", "channels", "r")`."""
+READER_KEY = ("data", "reader")
+"""Key of the reader in a config."""
+CHANNELS_KEY = (*READER_KEY, "channels")
+"""Key of the channel map in a config."""
 
 
 @dataclass(frozen=True)

@@ -24,23 +24,23 @@ from residnet.core.layout import SIX_DOF_LAYOUT, DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, STATE_NAMES
 from residnet.core.progress import report_progress
-from residnet.io.drafting.channels import (
-    CHANNELS_KEY,
+from residnet.io.drafting.channel_map import draft_channel_map
+from residnet.io.drafting.motion_columns import (
+    choose_quaternion_order,
+    find_depth_channels,
+    find_quaternions,
+    is_vertical_axis_up,
+)
+from residnet.io.drafting.motion_regression import (
     MIN_STANDARD_ERRORS,
     POSE_FRAMES,
-    READER_KEY,
     Motion,
     RawTable,
     ScaleFit,
-    choose_quaternion_order,
-    draft_channel_map,
     estimate_motion,
     estimate_rudder_gain,
-    find_depth_channels,
-    find_quaternions,
     fit_to_motion,
     forward_alignment,
-    is_vertical_axis_up,
 )
 from residnet.io.drafting.problems import (
     UnreadableLogsError,
@@ -48,7 +48,13 @@ from residnet.io.drafting.problems import (
     raise_unreadable,
     without_channel_map,
 )
-from residnet.io.drafting.questions import UNMAPPED_FIELDS, DraftNotes, Key
+from residnet.io.drafting.questions import (
+    CHANNELS_KEY,
+    READER_KEY,
+    UNMAPPED_FIELDS,
+    DraftNotes,
+    Key,
+)
 from residnet.io.drafting.tables import (
     draft_manoeuvre_setting,
     draft_tables,

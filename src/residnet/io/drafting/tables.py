@@ -14,25 +14,29 @@ import numpy as np
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.names import CHANNEL_UNITS, get_si_unit, truncate
 from residnet.core.units import is_unit, si_unit, to_si
-from residnet.io.drafting.channels import (
-    CHANNELS_KEY,
+from residnet.io.drafting.channel_map import draft_channel_map
+from residnet.io.drafting.motion_columns import (
     MAGNETIC_PATTERN,
-    READER_KEY,
-    STATE_NAMES,
-    RawTable,
+    MOTION_AND_WIND_CHANNELS,
     choose_quaternion_order,
-    draft_channel_map,
     find_depth_channels,
     find_quaternions,
     find_sin_cos_pairs,
     is_vertical_axis_up,
 )
+from residnet.io.drafting.motion_regression import RawTable
 from residnet.io.drafting.problems import (
     UnreadableLogsError,
     raise_unreadable,
     strip_file_name,
 )
-from residnet.io.drafting.questions import TEXT_COLUMNS, UNMAPPED_COLUMNS, DraftNotes
+from residnet.io.drafting.questions import (
+    CHANNELS_KEY,
+    READER_KEY,
+    TEXT_COLUMNS,
+    UNMAPPED_COLUMNS,
+    DraftNotes,
+)
 from residnet.io.drafting.vertical import (
     VERTICAL_CHANNELS,
     draft_vertical_motion,
@@ -635,7 +639,7 @@ def _select_one_vessel(
         position_pair = next(
             (pair for pair in (("x", "y"), (*_MAX_ANGLE,)) if {*pair} <= channels.keys()), ()
         )
-        if not position_pair or not channels.keys() - {*STATE_NAMES, *_MAX_ANGLE}:
+        if not position_pair or not channels.keys() - {*MOTION_AND_WIND_CHANNELS, *_MAX_ANGLE}:
             continue
         for prefix, prefix_columns in same_suffix_groups.items():
             if any(
@@ -741,7 +745,10 @@ def match_channels(
                 " (positive with the flow from port)"
             )
         draft_notes.add_guess((*CHANNELS_KEY, "u"), text)
-    ordered_channels = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
+    ordered_channels = [
+        *MOTION_AND_WIND_CHANNELS,
+        *(name for name in names if name not in MOTION_AND_WIND_CHANNELS),
+    ]
     return {name: names[name] for name in ordered_channels if name in names}
 
 
@@ -831,7 +838,7 @@ def _assign_columns(
             # the capital V is the speed, next to which a sway velocity would have a surge velocity
             channel = "speed"
         unit = _find_other_unit(column, channel)
-        if channel in STATE_NAMES and unit is not None:
+        if channel in MOTION_AND_WIND_CHANNELS and unit is not None:
             draft_notes.add_note(
                 CHANNELS_KEY, f"'{column}' has the name of {channel}, but the unit {unit}"
             )
@@ -1110,7 +1117,7 @@ def _is_recorded_on_change(channel: str, logs: Sequence[RawTable]) -> bool:
 
     Such a channel has values in less than half of the rows, at irregular intervals.
     """
-    if channel in (*STATE_NAMES, *QUATERNION, *_MAX_ANGLE):
+    if channel in (*MOTION_AND_WIND_CHANNELS, *QUATERNION, *_MAX_ANGLE):
         return False
     filled_rows = [
         np.flatnonzero(np.isfinite(table.columns[channel]))

@@ -12,8 +12,8 @@ from residnet.core.errors import DataError
 from residnet.core.layout import DegreesOfFreedom
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import to_si
-from residnet.io.drafting.channels import CHANNELS_KEY, RawTable, ScaleFit
-from residnet.io.drafting.questions import DraftNotes
+from residnet.io.drafting.motion_regression import RawTable, ScaleFit
+from residnet.io.drafting.questions import CHANNELS_KEY, DraftNotes
 from residnet.io.header_vocabulary import (
     Scaling,
     infer_unit,

@@ -1,0 +1,304 @@
+"""Motion from positions and headings, and regressions of columns on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from residnet.core.frames import rotate, unwrap_angle
+from residnet.core.units import si_unit, to_si, unit_names
+from residnet.preprocessing.derivatives import fit_local_polynomials
+from residnet.preprocessing.motion import remove_pauses
+
+_MIN_WINDOW_SECONDS = 1.0
+"""Shortest window in s in which positions are differentiated."""
+_MAX_UNIT_RATIO = 1.35
+"""Largest ratio between an estimated factor and that of its unit."""
+MIN_STANDARD_ERRORS = 4.0
+"""Smallest estimate, in standard errors, from which a sign is determined."""
+MIN_CORRELATION = 0.6
+"""Smallest significant correlation."""
+
+
+class PoseFrame(NamedTuple):
+    """Frame of columns called x, y, psi.
+
+    Attributes:
+        is_swapped: whether x is east and y is north.
+        is_from_east: whether psi is counter-clockwise from east.
+    """
+
+    is_swapped: bool
+    is_from_east: bool
+
+
+POSE_FRAMES = (PoseFrame(False, False), PoseFrame(True, False), PoseFrame(False, True))
+"""Distinguishable frames; both changes together give a mirror image with equal consistency."""
+ROS_POSE_FRAMES = (PoseFrame(True, True), PoseFrame(True, False))
+"""Frames of a ROS pose, first that of REP 103: x east, y north, heading from east."""
+
+
+@dataclass(frozen=True)
+class RawTable:
+    """Columns of one log before any conversion.
+
+    Attributes:
+        t: times [T] in s.
+        columns: channel -> values [T] in the unit of the file.
+    """
+
+    t: np.ndarray
+    columns: Mapping[str, np.ndarray]
+
+
+class ScaleFit(NamedTuple):
+    """Regression of a quantity in SI on a column.
+
+    Attributes:
+        factor: factor from the column to SI; negative for the opposite direction.
+        correlation: absolute value of the correlation.
+    """
+
+    factor: float
+    correlation: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the correlation is significant."""
+        return (
+            self.correlation >= MIN_CORRELATION and np.isfinite(self.factor) and self.factor != 0.0
+        )
+
+    def matching_unit(self, expected: str) -> str | None:
+        """Return the unit with nearly this factor, or None.
+
+        Args:
+            expected: SI unit of the dimension.
+        """
+        excluded_units = ("rad/min", "m/min", "cm/s")
+        candidate_units = [
+            n for n in unit_names() if si_unit(n) == expected and n not in excluded_units
+        ]
+        closest_unit = min(
+            candidate_units, key=lambda name: abs(np.log(abs(self.factor) / to_si(name)))
+        )
+        ratio = abs(self.factor) / to_si(closest_unit)
+        return closest_unit if 1.0 / _MAX_UNIT_RATIO < ratio < _MAX_UNIT_RATIO else None
+
+
+class Motion(NamedTuple):
+    """Motion of one log from its positions and headings, on a uniform grid.
+
+    Attributes:
+        t: times [T] in s.
+        surge_velocity: velocity along the heading [T] in m/s.
+        sway_velocity: velocity to starboard [T] in m/s.
+        yaw_rate: derivative of the heading [T] in rad/s.
+    """
+
+    t: np.ndarray
+    surge_velocity: np.ndarray
+    sway_velocity: np.ndarray
+    yaw_rate: np.ndarray
+
+
+def convert_heading(table: RawTable, unit: str, frame: PoseFrame) -> np.ndarray:
+    """Return the heading of a table clockwise from north [T] in rad, unwrapped."""
+    psi = table.columns["psi"] * to_si(unit, "rad")
+    return unwrap_angle(np.pi / 2 - psi if frame.is_from_east else psi)
+
+
+def estimate_motion(table: RawTable, unit: str, frame: PoseFrame) -> Motion | None:
+    """Estimate the motion from position and heading by local polynomials.
+
+    Args:
+        table: table with the columns x, y, psi.
+        unit: assumed unit of psi.
+        frame: assumed frame.
+
+    Returns:
+        The motion; None if positions or headings are too few.
+    """
+    psi = convert_heading(table, unit, frame)
+    north, east = ("y", "x") if frame.is_swapped else ("x", "y")
+    has_position = (
+        np.isfinite(table.columns[north]) & np.isfinite(table.columns[east]) & np.isfinite(table.t)
+    )
+    has_heading = np.isfinite(psi) & np.isfinite(table.t)
+    if min(int(has_position.sum()), int(has_heading.sum())) < 30:
+        return None
+    position_times = table.t[has_position]
+    time_step = float(np.median(np.diff(position_times)))
+    if time_step <= 0.0 or (position_times[-1] - position_times[0]) / time_step > 1e6:
+        return None
+    grid_times = np.arange(position_times[0], position_times[-1], time_step)
+    window = max(5, 2 * round(0.5 * _MIN_WINDOW_SECONDS / time_step) + 1)
+    if grid_times.size < 3 * window:
+        return None
+    speed_north = differentiate_on_grid(
+        grid_times, position_times, table.columns[north][has_position]
+    )
+    speed_east = differentiate_on_grid(
+        grid_times, position_times, table.columns[east][has_position]
+    )
+    heading = np.interp(grid_times, table.t[has_heading], psi[has_heading])
+    surge_velocity, sway_velocity = rotate(speed_north, speed_east, -heading)
+    return Motion(
+        grid_times,
+        surge_velocity,
+        sway_velocity,
+        differentiate_on_grid(grid_times, table.t[has_heading], psi[has_heading]),
+    )
+
+
+def differentiate_on_grid(grid_times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the derivative [G] of values [T] at times [T], by local polynomials on a grid [G]."""
+    step = float(grid_times[1] - grid_times[0])
+    window = max(5, 2 * round(0.5 * _MIN_WINDOW_SECONDS / step) + 1)
+    return fit_local_polynomials(np.interp(grid_times, t, values)[:, None], window, 2, step)[1][
+        :, 0
+    ]
+
+
+def forward_alignment(motions: Sequence[Motion | None]) -> float:
+    """Return the mean alignment of velocity and heading, weighted by the squared speed.
+
+    It is 1 for motion ahead, 0 for random directions, and -1 for motion astern.
+    """
+    estimated_motions = [motion for motion in motions if motion is not None]
+    forward_sum = sum(
+        float((m.surge_velocity * np.hypot(m.surge_velocity, m.sway_velocity)).sum())
+        for m in estimated_motions
+    )
+    total_sum = sum(
+        float((m.surge_velocity**2 + m.sway_velocity**2).sum()) for m in estimated_motions
+    )
+    return forward_sum / total_sum if total_sum > 0.0 else 0.0
+
+
+def fit_to_motion(
+    logs: Sequence[RawTable], motions: Sequence[Motion | None], channel: str
+) -> ScaleFit:
+    """Regress a velocity of the motion on a column, over all logs with this column.
+
+    Args:
+        logs: tables.
+        motions: motions of the same tables.
+        channel: `u`, `v` or `r`.
+    """
+    component_index = {"u": 1, "v": 2, "r": 3}[channel]
+    covariance_sum = correlation_sum = column_sum = motion_sum = 0.0
+    for table, log_motion in zip(logs, motions, strict=True):
+        values = table.columns.get(channel)
+        if log_motion is None or values is None:
+            continue
+        is_finite = np.isfinite(values) & np.isfinite(table.t)
+        if is_finite.sum() < 30:
+            continue
+        column_values = np.interp(log_motion.t, table.t[is_finite], values[is_finite])
+        motion_values = log_motion[component_index]
+        # exclude jumps of positions and headings
+        is_plausible = (
+            np.abs(motion_values) <= 5.0 * float(np.quantile(np.abs(motion_values), 0.95)) + 1e-12
+        )
+        # v and r are centred, so that a bias has no effect; u is not, because a steady speed
+        # determines its factor
+        column_mean = 0.0 if channel == "u" else float(column_values[is_plausible].mean())
+        motion_mean = 0.0 if channel == "u" else float(motion_values[is_plausible].mean())
+        column_centred = column_values[is_plausible] - column_mean
+        motion_centred = motion_values[is_plausible] - motion_mean
+        covariance_sum += float(column_centred @ motion_centred)
+        # the sign of r may differ between logs, if a gyro was turned over
+        correlation_sum += (
+            abs(float(column_centred @ motion_centred))
+            if channel == "r"
+            else float(column_centred @ motion_centred)
+        )
+        column_sum += float(column_centred @ column_centred)
+        motion_sum += float(motion_centred @ motion_centred)
+    if min(column_sum, motion_sum) <= 0.0:
+        return ScaleFit(0.0, 0.0)
+    # both quantities are noisy: geometric mean of the factors of both regressions
+    correlation = correlation_sum / np.sqrt(column_sum * motion_sum)
+    return ScaleFit(
+        float(np.sign(covariance_sum) * np.sqrt(motion_sum / column_sum)), abs(float(correlation))
+    )
+
+
+def estimate_rudder_gain(
+    logs: Sequence[RawTable],
+    channel: str,
+    rates: Mapping[int, np.ndarray],
+    angle_column: str | None = None,
+) -> tuple[float, float]:
+    """Estimate the effect of a rudder on the yaw rate, or of planes on the pitch rate.
+
+    The change of the rate over two seconds is regressed on the mean rudder angle, on the initial
+    rate, and for planes on the pitch angle, which gives the restoring moment.
+
+    Args:
+        logs: tables.
+        channel: column of the rudder or the planes.
+        rates: index of a table -> yaw or pitch rate [T] in rad/s.
+        angle_column: column of the pitch angle; None for rudders.
+
+    Returns:
+        The coefficient of the rudder angle and its standard error.
+    """
+    rows = []
+    rate_changes = []
+    for log_index, table in enumerate(logs):
+        values = table.columns.get(channel)
+        rate_values = rates.get(log_index)
+        if values is None or rate_values is None:
+            continue
+        restoring_angle = (
+            np.zeros(table.t.size) if angle_column is None else table.columns[angle_column]
+        )
+        is_finite = (
+            np.isfinite(values)
+            & np.isfinite(rate_values)
+            & np.isfinite(table.t)
+            & np.isfinite(restoring_angle)
+        )
+        if is_finite.sum() < 50:
+            continue
+        t = remove_pauses(table.t[is_finite])
+        rudder_angles = values[is_finite]
+        rates_finite = rate_values[is_finite]
+        horizon = max(2.0, 3.0 * float(np.median(np.diff(t))))
+        start_times = np.arange(t[0], t[-1] - horizon, horizon / 4)
+        if start_times.size < 10:
+            continue
+        initial_rate = np.interp(start_times, t, rates_finite)
+        final_rate = np.interp(start_times + horizon, t, rates_finite)
+        mean_rudder_angle = np.mean(
+            [
+                np.interp(start_times + share * horizon, t, rudder_angles)
+                for share in (0.0, 0.25, 0.5, 0.75)
+            ],
+            0,
+        )
+        tilt_angle = np.interp(start_times, t, restoring_angle[is_finite])
+        rows.append(
+            np.stack(
+                (mean_rudder_angle, initial_rate, np.ones(start_times.size), tilt_angle), axis=1
+            )
+        )
+        rate_changes.append(final_rate - initial_rate)
+    if not rows:
+        return 0.0, 1.0
+    regressors = np.concatenate(rows)
+    response = np.concatenate(rate_changes)
+    scale = np.maximum(np.abs(regressors).max(axis=0), 1e-12)
+    solution, *_ = np.linalg.lstsq(regressors / scale, response, rcond=1e-9)
+    residual = response - (regressors / scale) @ solution
+    # rows overlap by three quarters, so that a quarter of them is independent
+    variance = 4.0 * float(residual @ residual) / max(response.size - 3, 1)
+    standard_error = float(
+        np.sqrt(variance * np.linalg.pinv((regressors / scale).T @ (regressors / scale))[0, 0])
+    )
+    return float(solution[0]), standard_error
