@@ -21,8 +21,9 @@ from residnet.dynamics.first_step import check_first_step
 from residnet.heads import HeadConfig
 from residnet.heads.module import register_module
 from residnet.identification.settings import FitSettings
+from residnet.io.drafting.log_files import find_log_files
 from residnet.io.drafting.questions import DraftNotes
-from residnet.io.drafting.reading import find_log_files, read_drafted
+from residnet.io.drafting.reading import read_drafted
 from residnet.io.readers import ReaderConfig
 from residnet.io.readers.detect import AutoConfig, detect_log_kind
 from residnet.io.split import find_logs

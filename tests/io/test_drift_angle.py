@@ -10,8 +10,9 @@ import pytest
 
 import residnet
 from residnet.core.log import Log
+from residnet.io.drafting.column_names import match_channels
 from residnet.io.drafting.questions import CHANNELS_KEY, DraftNotes
-from residnet.io.drafting.tables import draft_tables, match_channels
+from residnet.io.drafting.tables import draft_tables
 from residnet.io.header_vocabulary import is_drift_angle
 from residnet.io.readers.tables import CsvConfig
 from residnet.tasks.drafting import write_new_config

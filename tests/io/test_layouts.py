@@ -13,6 +13,8 @@ import residnet
 from residnet.core.errors import ConfigError, DataError, ResidnetError, UsageError
 from residnet.core.log import Log
 from residnet.core.units import to_si
+from residnet.io.drafting.column_names import match_channels
+from residnet.io.drafting.force_columns import find_wrench_columns
 from residnet.io.drafting.problems import (
     UnreadableLogsError,
     group_problems,
@@ -20,12 +22,7 @@ from residnet.io.drafting.problems import (
     without_channel_map,
 )
 from residnet.io.drafting.questions import DraftNotes
-from residnet.io.drafting.tables import (
-    draft_manoeuvre_setting,
-    draft_tables,
-    find_wrench_columns,
-    match_channels,
-)
+from residnet.io.drafting.tables import draft_manoeuvre_setting, draft_tables
 from residnet.io.header_vocabulary import match_input_channel, match_state_channel, parse_name
 from residnet.io.readers.clock_repair import repair_clock
 from residnet.io.readers.excel_tables import read_excel_sheet

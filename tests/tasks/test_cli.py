@@ -22,7 +22,7 @@ from residnet.core.files import find_shipped_configs
 from residnet.core.progress import log_message
 from residnet.core.version import __version__
 from residnet.export import vessel
-from residnet.io.drafting.reading import find_log_files
+from residnet.io.drafting.log_files import find_log_files
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import TaskOutcome
 from residnet.tasks.simulate.config import SimulateConfig

@@ -29,6 +29,7 @@ from residnet.core.progress import ProgressCallback, log_message, report_progres
 from residnet.evaluation.protocol import EvaluationConfig, longest_segment_length
 from residnet.identification.prepared import mask_unexplained_idle
 from residnet.identification.recipe import PreparationPlan, make_evaluation_settings
+from residnet.io.drafting.log_files import find_log_files
 from residnet.io.drafting.questions import (
     READER_KEY,
     DraftNotes,
@@ -36,7 +37,7 @@ from residnet.io.drafting.questions import (
     Question,
     dump_commented_yaml,
 )
-from residnet.io.drafting.reading import find_log_files, read_mixed_formats
+from residnet.io.drafting.reading import read_mixed_formats
 from residnet.io.readers import ReaderConfig
 from residnet.io.sources import DataConfig, MeasuredLogs
 from residnet.io.sources import read_split_logs as read_splits

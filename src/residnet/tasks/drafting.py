@@ -22,9 +22,11 @@ from residnet.core.log import Log
 from residnet.core.names import BOW_WIND_CHANNELS, WIND_INPUTS
 from residnet.core.ownership import require_replaceable
 from residnet.core.progress import log_message
+from residnet.io.drafting.log_files import find_log_files
 from residnet.io.drafting.problems import group_problems, label_files
 from residnet.io.drafting.questions import (
     CHANNELS_KEY,
+    INPUTS_KEY,
     TEXT_COLUMNS,
     UNMAPPED_COLUMNS,
     UNMAPPED_FIELDS,
@@ -33,7 +35,7 @@ from residnet.io.drafting.questions import (
     Key,
     dump_commented_yaml,
 )
-from residnet.io.drafting.reading import INPUTS_KEY, find_log_files, read_drafted
+from residnet.io.drafting.reading import read_drafted
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
     QUATERNION,

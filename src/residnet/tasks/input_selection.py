@@ -15,8 +15,7 @@ from residnet.core.names import (
     STATE_NAMES,
     WIND_INPUTS,
 )
-from residnet.io.drafting.questions import DraftNotes
-from residnet.io.drafting.reading import INPUTS_KEY
+from residnet.io.drafting.questions import INPUTS_KEY, DraftNotes
 from residnet.io.header_vocabulary import (
     PLANE_PATTERN,
     match_input_channel,

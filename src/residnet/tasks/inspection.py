@@ -13,9 +13,10 @@ from residnet.core.errors import ConfigError, DataError, ResidnetError, UsageErr
 from residnet.core.files import write_owned
 from residnet.core.log import Log
 from residnet.core.progress import report_progress
+from residnet.io.drafting.log_files import find_log_files
 from residnet.io.drafting.problems import group_problems, strip_file_name
 from residnet.io.drafting.questions import dump_commented_yaml
-from residnet.io.drafting.reading import find_log_files, read_mixed_formats
+from residnet.io.drafting.reading import read_mixed_formats
 from residnet.io.split import assign_log_names
 from residnet.quality import (
     Finding,

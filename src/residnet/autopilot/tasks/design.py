@@ -41,8 +41,9 @@ from residnet.core.log import Log
 from residnet.core.names import SET_POINT_CHANNELS
 from residnet.core.ownership import require_replaceable
 from residnet.core.progress import log_message
+from residnet.io.drafting.log_files import find_log_files
 from residnet.io.drafting.questions import DraftNotes
-from residnet.io.drafting.reading import find_log_files, read_drafted
+from residnet.io.drafting.reading import read_drafted
 from residnet.preprocessing.channel_values import estimate_noise_std
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.quality.feedback import InputFeedback, detect_feedback

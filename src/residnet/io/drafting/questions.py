@@ -17,6 +17,8 @@ READER_KEY = ("data", "reader")
 """Key of the reader in a config."""
 CHANNELS_KEY = (*READER_KEY, "channels")
 """Key of the channel map in a config."""
+INPUTS_KEY = ("signals", "inputs")
+"""Key of the inputs in a config."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from residnet.evaluation.metrics import LIMITS_SCHEMA, build_metrics_file, write
 from residnet.evaluation.records import DataQualityFile, LimitsFile, LogQuality
 from residnet.identification.identified import SplitEvaluation
 from residnet.identification.prepared import compute_velocity_limits
-from residnet.io.drafting.reading import find_log_files
+from residnet.io.drafting.log_files import find_log_files
 from residnet.io.readers.base import CanonicalConfig
 from residnet.io.sources import MeasuredLogs
 from residnet.io.split import assign_log_names

@@ -1,0 +1,328 @@
+"""Sources of the motion in series without message types, by the names of their fields."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from residnet.core.errors import DataError
+from residnet.core.layout import SIX_DOF_LAYOUT
+from residnet.io.drafting.channel_map import draft_channel_map
+from residnet.io.drafting.column_names import match_channels, rename_pulsed_drives
+from residnet.io.drafting.motion_columns import (
+    choose_quaternion_order,
+    find_depth_channels,
+    find_quaternions,
+    is_vertical_axis_up,
+)
+from residnet.io.drafting.motion_regression import RawTable
+from residnet.io.drafting.motion_sources import MIN_MOTION_ROWS, MotionSources, median_series_step
+from residnet.io.drafting.questions import CHANNELS_KEY, READER_KEY, UNMAPPED_FIELDS, DraftNotes
+from residnet.io.drafting.vertical import draft_vertical_motion, project_on_horizontal
+from residnet.io.header_vocabulary import MOTION_CHANNELS, match_state_channel, parse_name
+from residnet.io.readers.quantities import QUATERNION
+from residnet.io.readers.recording import Recording
+
+
+def find_named_table(
+    recordings: Sequence[Recording], draft_notes: DraftNotes, *, needs_pose: bool
+) -> MotionSources | None:
+    """Return the motion and inputs of series without message type, or None.
+
+    Such series are MATLAB structs, HDF5 groups and csv files of topics. Their fields have names
+    like columns of a table, and units, signs and frames are determined in the same way. Position,
+    heading and velocities may be in one series or in several.
+
+    Args:
+        recordings: recordings with aligned clocks.
+        draft_notes: receives guesses and notes.
+        needs_pose: whether standard messages give no pose; only then are several series combined.
+
+    Raises:
+        DataError: if several series have the same columns.
+    """
+    sources, base_topic = _choose_named_fields(recordings[0], needs_pose=needs_pose)
+    if not sources:
+        return None
+    tables = [
+        _tabulate_fields(recording, sources, base_topic)
+        for recording in recordings
+        if base_topic in recording.series
+    ]
+    # fields with finite values in all recordings; increasing times are no channels
+    fields = [
+        name
+        for name in sources
+        if all(name in table.columns and np.isfinite(table.columns[name]).any() for table in tables)
+        and not (
+            parse_name(name).has_all("time")
+            and bool((np.diff(tables[0].columns[name]) > 0.0).all())
+        )
+    ]
+    attitudes = find_quaternions(fields)
+    compound_fields = {field for attitude in attitudes for field in attitude.values()}
+    simple_fields = [name for name in fields if name not in compound_fields]
+    names = match_channels(simple_fields, draft_notes)
+    names = rename_pulsed_drives(names, [table.columns for table in tables])
+    names |= find_depth_channels(simple_fields, names)
+    if "psi" not in names:
+        names |= choose_quaternion_order(attitudes, [table.columns for table in tables])
+    has_attitude = "psi" in names or "qw" in names
+    has_position = {"x", "y"} <= {*names} or {"latitude", "longitude"} <= {*names}
+    if not (has_attitude and has_position):
+        return None
+    logs = [
+        RawTable(table.t, {name: table.columns[field] for name, field in names.items()})
+        for table in tables
+    ]
+    columns = [table.columns for table in tables]
+    entries = draft_channel_map(
+        names,
+        project_on_horizontal(simple_fields, columns, logs, names),
+        draft_notes,
+        is_up_positive=is_vertical_axis_up(simple_fields, names, columns),
+    )
+    entries |= draft_vertical_motion(simple_fields, columns, logs, entries, draft_notes)
+    used_columns = {entry["column"] for entry in entries.values()} | {*names.values()}
+    unused_fields = [name for name in fields if name not in used_columns]
+    if unused_fields:
+        draft_notes.add_note(CHANNELS_KEY, f"{UNMAPPED_FIELDS}: {', '.join(unused_fields[:20])}")
+    settings = _convert_entries(entries, sources, base_topic)
+    setting_names = dict.fromkeys(("x", "y"), "position")
+    setting_names |= dict.fromkeys(("psi", *QUATERNION), "heading")
+    if "velocity" in settings:
+        setting_names |= {"u": "velocity", "v": "velocity"}
+    for name, setting_name in setting_names.items():
+        draft_notes.move_key((*CHANNELS_KEY, name), (*READER_KEY, setting_name))
+    base_series = recordings[0].series[base_topic]
+    return MotionSources(settings, {*sources.values()}, median_series_step(base_series))
+
+
+def _choose_named_fields(
+    recording: Recording, *, needs_pose: bool
+) -> tuple[dict[str, tuple[str, str]], str]:
+    """Choose the series without message type that have position and heading.
+
+    Args:
+        recording: recording with aligned clocks.
+        needs_pose: whether several series may be combined.
+
+    Returns:
+        Name -> topic and field, and the topic whose clock is used; empty if there are none.
+
+    Raises:
+        DataError: if several series have the same columns.
+    """
+    candidates = []
+    for series in recording.series.values():
+        channels = {
+            match_state_channel(parse_name(name)) for name in _name_vector_parts(series.fields)
+        }
+        has_attitude = "psi" in channels or bool(find_quaternions([*series.fields]))
+        has_position = {"x", "y"} <= channels or {"latitude", "longitude"} <= channels
+        if (
+            not series.message_type
+            and len(series) >= MIN_MOTION_ROWS
+            and has_attitude
+            and has_position
+        ):
+            candidates.append(series)
+    if len({frozenset(series.fields) for series in candidates}) < len(candidates):
+        table_names = ", ".join(series.name for series in candidates)
+        raise DataError(
+            f"{recording.path}: contains {len(candidates)} tables of the same columns"
+            f" ({table_names[:120]}), each a separate log; write each to a file, in Python"
+            " pandas.DataFrame({name: column for name, column in table.items()}).to_csv(...)"
+        )
+    if len(candidates) > 1:
+        return {}, ""
+    if candidates:
+        topic = candidates[0].name
+        fields = _name_vector_parts(candidates[0].fields)
+        combined = _find_named_topics(recording) if needs_pose else {}
+        if not _velocity_channels(combined) <= _velocity_channels(fields):
+            return combined, _find_base_topic(recording, combined)
+        return {name: (topic, field) for name, field in fields.items()}, topic
+    sources = _find_named_topics(recording) if needs_pose else {}
+    return sources, _find_base_topic(recording, sources) if sources else ""
+
+
+def _velocity_channels(names: Iterable[str]) -> set[str | None]:
+    """Return the velocities of the planar motion among the names of fields."""
+    channels = {match_state_channel(parse_name(name)) for name in names}
+    return channels & {"u", "v", "r"}
+
+
+def _convert_entries(
+    entries: dict[str, dict[str, Any]], sources: Mapping[str, tuple[str, str]], base_topic: str
+) -> dict[str, Any]:
+    """Convert the channel map of a table to the settings of a reader of recordings.
+
+    Args:
+        entries: channel -> entry; those of the pose are removed.
+        sources: column -> topic and field.
+        base_topic: topic whose clock is used.
+    """
+    settings: dict[str, Any] = {"standard_messages": False}
+    for position_kind, channel_pair, keys in (
+        ("local", ("x", "y"), ("north", "east")),
+        ("geodetic", ("latitude", "longitude"), ("latitude", "longitude")),
+    ):
+        if set(channel_pair) <= set(entries):
+            first_entry, second_entry = (entries.pop(name) for name in channel_pair)
+            topic, first_field = sources[first_entry["column"]]
+            position_settings = {"kind": position_kind, "topic": topic, keys[0]: first_field}
+            settings["position"] = position_settings | {
+                keys[1]: sources[second_entry["column"]][1],
+                "unit": first_entry["unit"],
+            }
+    if entries.get("u", {}).get("frame") == "ned":
+        north, east = (entries.pop(name) for name in ("u", "v"))
+        topic, north_field = sources[north["column"]]
+        velocity = {"kind": "earth_fixed", "topic": topic, "unit": north["unit"]}
+        velocity |= {"north": north_field, "east": sources[east["column"]][1]}
+        settings["velocity"] = velocity
+    if "psi" in entries:
+        heading = entries.pop("psi")
+        topic, heading_field = sources[heading["column"]]
+        settings["heading"] = {"kind": "angle", "topic": topic, "field": heading_field}
+        settings["heading"] |= {"unit": heading["unit"], "frame": heading.get("frame", "ned")}
+    else:
+        quaternion = {name: entries.pop(name) for name in QUATERNION if name in entries}
+        topic, _ = sources[quaternion["qw"]["column"]]
+        parts = [sources[entry["column"]][1] for entry in quaternion.values()]
+        settings["heading"] = {"kind": "quaternion", "topic": topic, "field": parts}
+        settings["heading"] |= {"frame": quaternion["qw"].get("frame", "ned")}
+        settings["heading"] |= {"roll": len(quaternion) == len(QUATERNION)}
+    settings["channels"] = {}
+    for name, entry in entries.items():
+        topic, field = sources[entry.pop("column")]
+        # a command of another topic applies until the next one
+        is_motion = name in (*MOTION_CHANNELS, *SIX_DOF_LAYOUT.state_names)
+        hold = {} if topic == base_topic or is_motion else {"hold": True}
+        settings["channels"][name] = {"topic": topic, "field": field, **entry, **hold}
+    return settings
+
+
+def _find_named_topics(recording: Recording) -> dict[str, tuple[str, str]]:
+    """Return the fields of the series without message type: name -> topic and field.
+
+    A field that several series have, such as `data`, is named with its topic. Empty if position
+    and heading are not among the names, or if the position is in several series.
+    """
+    series_by_topic = {
+        topic: series
+        for topic, series in recording.series.items()
+        if not series.message_type and len(series) > 1
+    }
+    names_by_topic = {
+        topic: _name_vector_parts(series.fields) for topic, series in series_by_topic.items()
+    }
+    counts = Counter(name for names in names_by_topic.values() for name in names)
+    sources = {
+        name if counts[name] == 1 and name != "data" else f"{topic} {name}": (topic, field)
+        for topic, names in names_by_topic.items()
+        for name, field in names.items()
+    }
+    channels = match_channels([*sources], DraftNotes())
+    position = next(
+        (pair for pair in (("x", "y"), ("latitude", "longitude")) if {*pair} <= channels.keys()),
+        None,
+    )
+    attitude = _attitude_fields(channels, sources)
+    if position is None or not attitude:
+        return {}
+    first_topic, second_topic = (sources[channels[name]][0] for name in position)
+    topics = {sources[name][0] for name in (*(channels[axis] for axis in position), *attitude)}
+    has_rows = all(len(series_by_topic[topic]) >= MIN_MOTION_ROWS for topic in topics)
+    return sources if first_topic == second_topic and has_rows else {}
+
+
+_VECTOR_PART_PATTERN = re.compile(r"(?P<stem>.*[^\W\d])(?:\.|\[)(?P<index>\d)\]?")
+_VECTOR_STATES = {
+    ("eta", 3): ("x", "y", "psi"),
+    ("eta", 6): ("x", "y", "z", "phi", "theta", "psi"),
+    ("nu", 3): ("u", "v", "r"),
+    ("nu", 6): ("u", "v", "w", "p", "q", "r"),
+    ("tau", 3): ("tau_x", "tau_y", "tau_n"),
+}
+"""Name and length of a vector in Fossen's notation (2021, table 2.1) -> names of its parts."""
+_SPATIAL_VECTOR_PATTERN = re.compile(
+    r"(?:^|[\W_])(?:pos|position|linear|angular|vel|velocity|lin_?vel|ang_?vel|omega|gyro|force)s?"
+    r"(?:$|[\W_])",
+    re.IGNORECASE,
+)
+
+
+def _name_vector_parts(fields: Iterable[str]) -> dict[str, str]:
+    """Name the columns of matrices of positions, velocities and forces by their axes.
+
+    Args:
+        fields: fields; those of a matrix end in `.0`, `.1`, ... or `[0]`, `[1]`, ...
+
+    Returns:
+        Name -> field, in the order of the fields.
+    """
+    names = {field: field for field in fields}
+    parts_by_stem: dict[str, dict[int, str]] = {}
+    for field in names:
+        if match := _VECTOR_PART_PATTERN.fullmatch(field):
+            parts_by_stem.setdefault(match["stem"], {})[int(match["index"])] = field
+    for stem, parts in parts_by_stem.items():
+        length = len(parts)
+        if sorted(parts) != list(range(length)):
+            continue
+        parent, separator, last_name = stem.rpartition(".")
+        labels = _VECTOR_STATES.get((last_name.lower(), length), ())
+        if labels:
+            labels = tuple(f"{parent}{separator}{label}" for label in labels)
+        elif length in (2, 3) and _SPATIAL_VECTOR_PATTERN.search(stem):
+            labels = tuple(f"{stem}_{axis}" for axis in "xyz"[:length])
+        names |= {parts[index]: label for index, label in enumerate(labels)}
+    return {name: field for field, name in names.items()}
+
+
+def _attitude_fields(
+    channels: Mapping[str, str], sources: Mapping[str, tuple[str, str]]
+) -> list[str]:
+    """Return the name of the heading, or the names of a quaternion's parts in one topic."""
+    if "psi" in channels:
+        return [channels["psi"]]
+    for parts in find_quaternions([*sources]):
+        if len({sources[name][0] for name in parts.values()}) == 1:
+            return [*parts.values()]
+    return []
+
+
+def _find_base_topic(recording: Recording, sources: Mapping[str, tuple[str, str]]) -> str:
+    """Return the topic of position or heading with more rows."""
+    channels = match_channels([*sources], DraftNotes())
+    position = "x" if "x" in channels else "latitude"
+    names = [channels[position], *_attitude_fields(channels, sources)[:1]]
+    topics = [sources[name][0] for name in names]
+    return max(topics, key=lambda topic: len(recording.series[topic]))
+
+
+def _tabulate_fields(
+    recording: Recording, sources: Mapping[str, tuple[str, str]], base_topic: str
+) -> RawTable:
+    """Return fields of several topics on the clock of one of them, by the nearest sample.
+
+    Angles cannot be interpolated before their unit is known.
+    """
+    clock = recording.series[base_topic].clock
+    columns = {}
+    for name, (topic, field) in sources.items():
+        series = recording.series.get(topic)
+        if series is None or not series.has_field(field) or not len(series):
+            continue
+        values = series[field]
+        if topic != base_topic:
+            midpoints = 0.5 * (series.clock[1:] + series.clock[:-1])
+            values = values[np.searchsorted(midpoints, clock)]
+        columns[name] = values
+    return RawTable(clock, columns)
