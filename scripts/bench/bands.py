@@ -6,7 +6,7 @@ folds. With `--kinds` a fold has all logs of a kind of manoeuvre, so that no int
 on the kind for which it is evaluated. With `--alone`, models that the evaluated one does not need
 are removed from these fits: networks take most of the time.
 
-With `--draws`, simulated vessels are drawn: two shipped ones in turn, with random parameters, a
+With `--draws`, simulated vessels are drawn: shipped ones in turn, with random parameters, a
 mixture of manoeuvres, noise, random forces and currents. `--logs` of them calibrate the intervals
 of three models; `--test` further ones of each kind are for the evaluation, with `--others` of kinds
 that were not used for fit or calibration. Tables are means over draws and models. The differences
@@ -15,7 +15,7 @@ of coverage among single logs indicate the accuracy of the coverage.
     python scripts/bench/bands.py RUN [--model physics]
     python scripts/bench/bands.py --cross CONFIG [--model physics] [--alone] [--kinds] [-s K=V]
     python scripts/bench/bands.py --draws 12 [--seed 0] [--logs 40] [--test 25] [--others]
-        [--calibrated 2] [--level 0.95]
+        [--calibrated 2] [--level 0.95] [--vessels wam_v_cal example_rudder_boat milliampere]
 """
 
 from __future__ import annotations
@@ -59,7 +59,9 @@ FAMILY_SETTINGS: dict[str, dict[str, Any]] = {
     "random_steps": {"band": [0.02, 0.2]},
     "turning_circle": {"steer": [0.3, 1.0]},
 }
-MAX_FORCE_STD = {"wam_v_cal": (20, 20, 20), "example_rudder_boat": (40, 40, 80)}
+MAX_FORCE_STD = {
+    "wam_v_cal": (20, 20, 20), "example_rudder_boat": (40, 40, 80), "milliampere": (40, 40, 60),
+}  # fmt: skip
 """Largest standard deviations of the random forces on each vessel in N and N m."""
 _COVERAGE_TOLERANCE = 0.02
 """Accepted difference of the mean coverage from its level."""
@@ -369,14 +371,14 @@ def main() -> None:
     options = bench.options(
         __doc__, run=("runs/esso_osaka",), cross=None, model=None, alone=False, kinds=False, s=[],
         draws=0, seed=0, logs=40, test=25, others=False, calibrated=2,
-        level=0.95,
+        level=0.95, vessels=["wam_v_cal", "example_rudder_boat"],
     )  # fmt: skip
     if options.draws:
         runs_by_model = RunsByModel()
         for number in range(options.draws):
             start_time = time.process_time()
             random = np.random.default_rng([options.seed, number])
-            vessel = list(MAX_FORCE_STD)[number % len(MAX_FORCE_STD)]
+            vessel = options.vessels[number % len(options.vessels)]
             logs = simulate_drawn_logs(
                 vessel, random, options.logs, options.test, options.others, options.calibrated
             )

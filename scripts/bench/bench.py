@@ -27,6 +27,7 @@ SIGNALS: dict[str, dict[str, Any]] = {
     "wam_v_cal": {"inputs": ["n_port", "n_stbd"], "forces": "wam_v_cal"},
     "wam_v_vrx": {"inputs": ["n_port", "n_stbd"], "forces": "wam_v_vrx"},
     "example_rudder_boat": {"inputs": ["n", "delta"]},
+    "milliampere": {"inputs": ["tau_x", "tau_n"]},
 }
 """What models of some shipped vessels are told."""
 
@@ -89,7 +90,8 @@ def scattered(vessel: str, random: np.random.Generator, folder: Path) -> str:
             return {key: value if key in words else moved(value) for key, value in part.items()}
         return float(part * np.exp(0.2 * random.standard_normal()))
 
-    for section in ("added_mass", "damping"):
+    # vessels with a mass matrix do not list their added masses
+    for section in ("added_mass" if "added_mass" in content else "mass", "damping"):
         content[section] = moved(content[section])
     file = folder / "scattered.yaml"
     file.write_text(yaml.safe_dump({**content, "name": "scattered"}, sort_keys=False))

@@ -127,6 +127,37 @@ class Unit:
         self.unit.doStep(currentCommunicationPoint=point, communicationStepSize=size)
 
 
+def test_an_ensemble_starts_all_members_from_the_start_values(tmp_path: Path) -> None:
+    """Its memory then has no prediction, also after a reset in the middle of a free run."""
+    spec, model = built("mean")
+    get_exporter("fmu2").export(ExportedVessel(spec, model), tmp_path / "boat.fmu")
+    model = model.double()
+    names = ("x", "y", "psi", "u", "v", "r")
+    inputs = torch.tensor([list(INPUTS.values())], dtype=torch.float64).unsqueeze(1)
+    unit = Unit(tmp_path)
+    x0 = torch.tensor([[1.0, -2.0, 0.3, 1.0, 0.1, -0.05]], dtype=torch.float64)
+    for _ in range(2):
+        unit.initialize(0.0)
+        for name, value in zip(names, x0[0].tolist(), strict=True):
+            unit.set(f"{name}_start", value)
+        for name, value in INPUTS.items():
+            unit.set(name, value)
+        unit.unit.exitInitializationMode()
+        with torch.no_grad():
+            states, _, _ = Rollout(model)(
+                x0, inputs.expand(-1, 40, -1), model.initial_state(1).double()
+            )
+        for k in range(1, 41):
+            unit.step(0.1 * (k - 1), 0.1)
+            computed = [unit.value(name) for name in names]
+            np.testing.assert_allclose(computed, states[0, k].numpy(), rtol=0, atol=1e-12)
+        unit.unit.reset()
+        # the next run starts from the state that the members would have continued from
+        x0 = states[:, -1]
+    unit.unit.terminate()
+    unit.unit.freeInstance()
+
+
 def test_simulation_time_may_be_unix_time(tmp_path: Path) -> None:
     """Steps that are differences of rounded times, as an importer computes them."""
     ends = []

@@ -18,8 +18,9 @@ from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
 from residnet.dynamics.ensemble import MeanOfTrajectories
-from residnet.dynamics.hybrid import HybridDynamics
-from residnet.engine.rollout import Rollout, trace_step
+from residnet.dynamics.hybrid import HybridDynamics, MeasuredPast
+from residnet.engine import free_runs
+from residnet.engine.rollout import TRAINING_STEPS, Rollout, trace_step
 from residnet.heads.base import ResidualHead
 from residnet.heads.lstm import LSTMCell, LstmHead
 from residnet.heads.lstm_config import LstmConfig
@@ -309,6 +310,48 @@ def test_the_mean_is_that_of_networks_that_run_by_themselves(config: dict[str, s
         each = Rollout(single)(y[:, -1].repeat(3, 1), w[:, 8:].repeat(3, 1, 1), part)[0]
     wanted = each[..., 3:].unflatten(0, (3, 2)).mean(0)
     torch.testing.assert_close(found[..., 3:], wanted, rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize("is_past", [False, True])
+@pytest.mark.parametrize("config", [{}, {"cell": "lstm"}, {"encoder": "measurements"}])
+def test_a_compiled_ensemble_has_the_free_runs_and_gradients_of_torch(
+    config: dict[str, str], is_past: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Along predicted states, and along measured ones, which the encoder reads."""
+    monkeypatch.setattr(free_runs, "_COMPILED", {})
+    signals = SignalsConfig(inputs=("n", "delta")).build()
+    baseline = ZeroBaselineConfig().build(signals.names)
+    head = networks(members=3, hidden_size=9, **config)
+    head.is_decoding_only = not is_past
+    model = HybridDynamics(signals, baseline, head, 0.5, "heun").double()
+    rollout = Rollout(MeasuredPast(model) if is_past else model)
+    x0 = 0.1 * torch.randn(12, 6, dtype=torch.float64)
+    w = torch.randn(12, 20, 8 if is_past else 2, dtype=torch.float64)
+    memory = 0.1 * torch.rand(12, rollout.model.n_state, dtype=torch.float64)
+    compiled = free_runs.compile_rollout(rollout, TRAINING_STEPS)
+    trained = [p for p in head.parameters() if p.requires_grad]
+    for _ in range(2):
+        memory.requires_grad_(True)
+        gradients = []
+        states = []
+        for run in (rollout, compiled):
+            result = run(x0, w, memory)
+            states.append(result[0])
+            loss = result[0].square().mean() + result[2].square().mean()
+            gradients.append(torch.autograd.grad(loss, [*trained, memory], allow_unused=True))
+        torch.testing.assert_close(states[1], states[0], rtol=0, atol=1e-12)
+        if is_past:
+            zero = torch.zeros_like(memory)
+            expected_memory = model.warmup(w[:, :, :6], w[:, :, 6:])
+            torch.testing.assert_close(compiled(x0, w, zero)[2], expected_memory)
+        for expected, computed in zip(*gradients, strict=True):
+            if expected is not None:
+                torch.testing.assert_close(computed, expected, rtol=1e-9, atol=1e-14)
+        # the program runs with the parameters of the moment
+        with torch.no_grad():
+            for parameter in trained:
+                parameter.add_(0.05 * torch.randn_like(parameter))
+    assert [bool(program) for program in free_runs._COMPILED.values()] == [True]
 
 
 def test_a_measurement_starts_all_members_from_it() -> None:

@@ -409,3 +409,34 @@ class HybridDynamics(Dynamics):
             return lower, upper
         filter_lower, filter_upper = self.innovation_filter.memory_bounds()
         return torch.cat((lower.double(), filter_lower)), torch.cat((upper.double(), filter_upper))
+
+
+@final
+class MeasuredPast(Dynamics):
+    """A model along measured states, which its inputs contain: only the memory changes.
+
+    Args:
+        model: the model whose memory is computed.
+    """
+
+    def __init__(self, model: HybridDynamics) -> None:
+        super().__init__(model.dt, model.integrator)
+        self.model = model
+        self.n_state = model.n_state
+        self.dof = model.dof
+
+    @property
+    def head(self) -> ResidualHead:
+        """Head of the model."""
+        return self.model.head
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the state x [B, nx] unchanged and the memory after a measured state.
+
+        Args:
+            x: any states [B, nx].
+            w: measured states, then inputs [B, nx + m].
+            s: memory [B, n_state].
+        """
+        measured, inputs = w.split([x.shape[-1], w.shape[-1] - x.shape[-1]], dim=-1)
+        return x, self.model.step(measured, inputs, s)[1]

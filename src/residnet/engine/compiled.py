@@ -87,7 +87,7 @@ class CompiledRollout:
         self.max_gradient_ratio = max_gradient_ratio
         # traced in float64; the C code has the precision of the runs
         reference = copy.deepcopy(rollout).double()
-        tensors = _named_tensors(reference)
+        tensors = named_tensors(reference)
         self.shared_names = [
             name
             for name, part in tensors.items()
@@ -176,7 +176,12 @@ class CompiledRollout:
 
     def __call__(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return states, applied inputs and the final memory, as `Rollout.forward`."""
-        tensors = _named_tensors(self.rollout)
+        return self.run_with_tensors(named_tensors(self.rollout), x, w, s)
+
+    def run_with_tensors(
+        self, tensors: Mapping[str, Tensor], x: Tensor, w: Tensor, s: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the result of `__call__` with the parameters and buffers `tensors` by name."""
         rows = self._row_tensors(tensors, len(x) if self.row_tensor_names else 1).expand(len(x), -1)
         q = self.rollout.source.initial(x)
         with torch.set_grad_enabled(self.trained_indices is not None and torch.is_grad_enabled()):
@@ -400,7 +405,7 @@ def _clip_row_gradients(gradients: Tensor, cotangent_norm: Tensor, max_ratio: fl
     return torch.where(torch.isfinite(gradient_norm)[:, None], gradients * factor[:, None], 0.0)
 
 
-def _named_tensors(rollout: Rollout) -> dict[str, Tensor]:
+def named_tensors(rollout: Rollout) -> dict[str, Tensor]:
     """Return the parameters and buffers of a rollout by name."""
     # `named_parameters` and `named_buffers` would take half the time of a short run
     return {

@@ -163,6 +163,13 @@ class GRUEnsembleHead(RenamedStateModule, ResidualHead):
                 weight.mul_(ratio.to(weight))
         self.training_gain = gain
 
+    def keep_first_member(self) -> None:
+        """Remove all networks but the first one."""
+        for name, parameter in list(self.named_parameters(recurse=False)):
+            first = nn.Parameter(parameter.detach()[:1].clone(), parameter.requires_grad)
+            setattr(self, name, first)
+        self.batch_ensemble_size = 1
+
     def clip_member_gradients(self, max_norm: float) -> None:
         """Limit the norm of the gradient of each network.
 

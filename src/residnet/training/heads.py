@@ -14,7 +14,7 @@ from residnet.baselines.given import FixedBaseline
 from residnet.core.arrays import paged
 from residnet.core.columns import all_but_pose, dynamic_states, pose
 from residnet.core.samples import Samples
-from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.hybrid import HybridDynamics, MeasuredPast
 from residnet.dynamics.time_steps import Integrator
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import TRAINING_STEPS, FreeRun, Rollout
@@ -192,6 +192,7 @@ class HeadTraining(EpochTraining):
         self._validated_models = (model,)
         self.rollout = Rollout(model)
         self._compiled: FreeRun | None = None
+        self._compiled_past: FreeRun | None = None
         self.scales = scales
         self.validate = validate
         self.stages = config.windows(model.dt)
@@ -313,7 +314,7 @@ class HeadTraining(EpochTraining):
         if self.mirror is not None:
             windows = [self.mirror.mirror_alternate(part) for part in windows]
         for number, part in enumerate(windows):
-            memories.append(self.model.warmup(part.past_y, part.past_w))
+            memories.append(self._read_past(part.past_y, part.past_w))
             x0 = part.smoothed[:, 0]
             if number == 1:
                 # windows at the start of a segment begin like a free run there, for which no
@@ -358,6 +359,20 @@ class HeadTraining(EpochTraining):
         finally:
             head.is_decoding_only = False
         return torch.cat((x0[:, None], states), dim=1), w, memory
+
+    def _read_past(self, past_y: Tensor, past_w: Tensor) -> Tensor:
+        """Return the memory [B, n_state] after measured states [B, T, 3 + n] and inputs [B, T, m].
+
+        The step of an ensemble runs as compiled C here too: in torch it took a fifth of a training.
+        """
+        if not isinstance(self.model.head, GRUEnsembleHead) or past_y.shape[1] == 0:
+            return self.model.warmup(past_y, past_w)
+        if self._compiled_past is None:
+            past = MeasuredPast(self.model)
+            self._compiled_past = compile_rollout(Rollout(past), TRAINING_STEPS)
+        memory = past_y.new_zeros(len(past_y), self.model.n_state)
+        rows = torch.cat((past_y, past_w), dim=-1)
+        return self._compiled_past(past_y[:, 0], rows, memory)[2]
 
     def _draw_noise(self, stage: int) -> Tensor:
         """Draw standard normal numbers [B, n] for the windows of this process.
