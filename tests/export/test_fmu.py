@@ -154,7 +154,6 @@ def test_an_ensemble_starts_all_members_from_the_start_values(tmp_path: Path) ->
         unit.unit.reset()
         # the next run starts from the state that the members would have continued from
         x0 = states[:, -1]
-    unit.unit.terminate()
     unit.unit.freeInstance()
 
 
