@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,16 @@ _HEADER_SEARCH_ROWS = 60
 """Rows of a sheet in which the header is searched."""
 _MIN_TABLE_COLUMNS = 3
 """Smallest number of columns of a table that occurs several times in a sheet."""
+_MAX_CACHED_WORKBOOKS = 1_000
+"""Largest number of files whose names of sheets are in the cache."""
+_MAX_CACHED_CELLS = 1_000_000
+"""Largest number of cells in the cache of sheets, about 40 MB."""
+
+_FileVersion = tuple[str, int, int, int]
+"""Path, inode, size in bytes and time of the last change in ns of a file."""
+# a draft reads each sheet three times: the preview, the guesses and the check of the channel map
+_cached_cells: OrderedDict[tuple[_FileVersion, str], pd.DataFrame] = OrderedDict()
+_cached_sheet_names: OrderedDict[_FileVersion, list[str]] = OrderedDict()
 
 
 def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.DataFrame:
@@ -43,10 +54,7 @@ def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> 
     names = list_sheet_names(path)
     if sheet is not None and sheet not in names:
         raise UsageError(f"{path}: no sheet '{sheet}'{suggest_name(sheet, names)}")
-    with wrap_read_errors(path, "an Excel file"):
-        cells = pd.read_excel(
-            path, sheet_name=sheet or 0, nrows=rows, engine="openpyxl", header=None
-        )
+    cells = _read_cells(path, sheet if sheet is not None else names[0], rows)
     head_rows = [
         ["" if pd.isna(cell) else str(cell).strip() for cell in row]
         for row in cells.head(_HEADER_SEARCH_ROWS).itertuples(index=False)
@@ -67,6 +75,38 @@ def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> 
         "unit_rows": unit_rows,
     }
     return table
+
+
+def _read_cells(path: Path, sheet: str, rows: int | None) -> pd.DataFrame:
+    """Return the cells of a sheet, from the cache if the file has not changed since.
+
+    Args:
+        path: Excel file.
+        sheet: name of the sheet.
+        rows: largest number of rows to read; None reads all.
+    """
+    import pandas as pd
+
+    with wrap_read_errors(path, "an Excel file"):
+        key = (_get_file_version(path), sheet)
+        if key in _cached_cells:
+            _cached_cells.move_to_end(key)
+            return _cached_cells[key].head(rows) if rows is not None else _cached_cells[key]
+        cells: pd.DataFrame = pd.read_excel(
+            path, sheet_name=sheet, nrows=rows, engine="openpyxl", header=None
+        )
+    is_complete = rows is None or len(cells) < rows
+    if is_complete and cells.size <= _MAX_CACHED_CELLS:
+        _cached_cells[key] = cells
+        while sum(sheet_cells.size for sheet_cells in _cached_cells.values()) > _MAX_CACHED_CELLS:
+            _cached_cells.popitem(last=False)
+    return cells
+
+
+def _get_file_version(path: Path) -> _FileVersion:
+    """Return what identifies the content of a file."""
+    status = path.stat()
+    return (str(path.absolute()), status.st_ino, status.st_size, status.st_mtime_ns)
 
 
 def _refuse_several_tables(
@@ -240,4 +280,12 @@ def list_sheet_names(path: Path) -> list[str]:
     with optional_import("excel", "openpyxl", "an Excel sheet"):
         import openpyxl
     with wrap_read_errors(path, "an Excel file"):
-        return [str(name) for name in openpyxl.load_workbook(path, read_only=True).sheetnames]
+        version = _get_file_version(path)
+        if version not in _cached_sheet_names:
+            # a workbook that is not closed keeps the file open
+            workbook = openpyxl.load_workbook(path, read_only=True)
+            _cached_sheet_names[version] = [str(sheet.title) for sheet in workbook.worksheets]
+            workbook.close()
+        if len(_cached_sheet_names) > _MAX_CACHED_WORKBOOKS:
+            _cached_sheet_names.popitem(last=False)
+        return list(_cached_sheet_names[version])
