@@ -11,7 +11,7 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -48,40 +48,68 @@ def vessel(scale: float = 1.0) -> ExportedVessel:
 MAIN = """
 #include <stdio.h>
 #include "steer.h"
-#include "my-boat 2.h"
+#include "2nd Öl.h"
 
 int main(void)
 {
     float x[STEER_STATES] = {0, 0, 0, 1, 0, 0}, w[STEER_INPUTS] = {9, 9, 3, 1}, s[1] = {0};
-    float y[MY_BOAT_2_STATES] = {0, 0, 0, 1, 0, 0};
+    float y[M_2ND__L_STATES] = {0, 0, 0, 1, 0, 0};
     steer_step(x, w, s, x, s);
-    my_boat_2_step(y, w, s, y, s);
-    printf("%.9g %.9g %s %s", x[3], y[3], STEER_BUILD, MY_BOAT_2_BUILD);
+    m_2nd__l_step(y, w, s, y, s);
+    printf("%.9g %.9g %s %s", x[3], y[3], STEER_BUILD, M_2ND__L_BUILD);
     return 0;
 }
 """
 LINKS = {
-    "objects": [["{cc}", "-c", "steer.c", "my-boat 2.c"],
-                ["{cc}", "main.c", "steer.o", "my-boat 2.o", "-o", "main", "-lm"]],
-    "static libraries": [["{cc}", "-c", "steer.c", "my-boat 2.c"],
+    "objects": [["{cc}", "-c", "steer.c", "2nd Öl.c"],
+                ["{cc}", "main.c", "steer.o", "2nd Öl.o", "-o", "main", "-lm"]],
+    "static libraries": [["{cc}", "-c", "steer.c", "2nd Öl.c"],
                          ["ar", "rcs", "liba.a", "steer.o"],
-                         ["ar", "rcs", "libb.a", "my-boat 2.o"],
+                         ["ar", "rcs", "libb.a", "2nd Öl.o"],
                          ["{cc}", "main.c", "-L.", "-la", "-lb", "-o", "main", "-lm"]],
     "one translation unit": [["{cc}", "all.c", "-o", "main", "-lm"]],
 }  # fmt: skip
 
 
-MODELS = {"steer.c": 1.0, "my-boat 2.c": 0.5}
+MODELS = {"steer.c": 1.0, "2nd Öl.c": 0.5}
 """Scale of the coefficients of the model in each file."""
+WARNED = "2nd Öl.c"
+"""File whose export exceeds the limits of stack and code."""
+
+
+class TwoExports(NamedTuple):
+    """The folder of the C files of `MODELS`, their cards, and the messages of each export.
+
+    A message has a flag that says whether the file existed by then.
+    """
+
+    folder: Path
+    cards: dict[str, dict[str, Any]]
+    messages: dict[str, list[tuple[str, bool]]]
 
 
 @pytest.fixture(scope="module")
-def two_exports(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the C files of `MODELS`."""
+def two_exports(tmp_path_factory: pytest.TempPathFactory) -> TwoExports:
+    """The exports of `MODELS`; the limits of the second one are so small that it warns."""
     folder = tmp_path_factory.mktemp("two_exports")
+    exports = TwoExports(folder, {}, {})
     for name, scale in MODELS.items():
-        export_quickly(vessel(scale), folder / name)
-    return folder
+        messages: list[tuple[str, bool]] = []
+
+        def add_message(
+            progress: Progress,
+            messages: list[tuple[str, bool]] = messages,
+            file: Path = folder / name,
+        ) -> None:
+            messages.append((progress.message, file.exists()))
+
+        with pytest.MonkeyPatch.context() as patch, on_progress(add_message):
+            if name == WARNED:
+                patch.setattr(c, "STACK_LIMIT", 10)
+                patch.setattr(c, "CODE_LIMIT", 20)
+            exports.cards[name] = export_quickly(vessel(scale), folder / name)
+        exports.messages[name] = messages
+    return exports
 
 
 @pytest.fixture(scope="module")
@@ -92,22 +120,26 @@ def lstm_export(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def export_quickly(made: ExportedVessel, file: Path) -> None:
-    """Write a C file; few steps are compared with the model, as in `short_parity`."""
+def export_quickly(made: ExportedVessel, file: Path) -> dict[str, Any]:
+    """Write a C file, compared with the model over few steps as in `short_parity`.
+
+    Returns:
+        The card of the file.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(exported_vessel, "PARITY_STEPS", 60)
-        get_exporter("c").export(made, file)
+        return dict(get_exporter("c").export(made, file))
 
 
 @pytest.mark.parametrize("way", LINKS)
 def test_two_exports_of_one_model_name_serve_one_program(
-    way: str, two_exports: Path, tmp_path: Path
+    way: str, two_exports: TwoExports, tmp_path: Path
 ) -> None:
-    shutil.copytree(two_exports, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(two_exports.folder, tmp_path, dirs_exist_ok=True)
     models = [vessel(scale) for scale in MODELS.values()]
     cards = [json.loads((tmp_path / name).with_suffix(".card.json").read_text()) for name in MODELS]
     (tmp_path / "main.c").write_text(MAIN)
-    parts = ("steer.c", "my-boat 2.c", "main.c")
+    parts = ("steer.c", "2nd Öl.c", "main.c")
     (tmp_path / "all.c").write_text("".join(f'#include "{part}"\n' for part in parts))
     for command in LINKS[way]:
         call = [word.format(cc=find_compiler()) for word in command]
@@ -129,13 +161,13 @@ def defined_symbols(library: Path) -> set[str]:
     return set(re.findall(r" [TDBRC] (\w+)", lines))
 
 
-def test_every_name_begins_with_that_of_the_file(tmp_path: Path) -> None:
-    get_exporter("c").export(vessel(), tmp_path / "2nd Öl.c")
-    subprocess.run([find_compiler(), "-c", "2nd Öl.c", "-o", "boat.o"], cwd=tmp_path, check=True)
+def test_every_name_begins_with_that_of_the_file(two_exports: TwoExports, tmp_path: Path) -> None:
+    call = [find_compiler(), "-c", "2nd Öl.c", "-o", str(tmp_path / "boat.o")]
+    subprocess.run(call, cwd=two_exports.folder, check=True)
     symbols = defined_symbols(tmp_path / "boat.o")
     assert f"{to_c_identifier('2nd Öl')}_step" in symbols
     assert all(name.startswith("m_2nd__l_") for name in symbols)
-    header = (tmp_path / "2nd Öl.h").read_text()
+    header = (two_exports.folder / "2nd Öl.h").read_text()
     assert "#ifndef M_2ND__L_H\n#define M_2ND__L_H\n" in header
     macros = re.findall(r"^#define (\w+)", header, re.M)
     assert all(name.startswith("M_2ND__L_") for name in macros)
@@ -144,45 +176,37 @@ def test_every_name_begins_with_that_of_the_file(tmp_path: Path) -> None:
     assert not (tmp_path / "math.c").exists()
 
 
-def test_the_build_identity_is_of_the_model_and_the_version(tmp_path: Path) -> None:
+def test_the_build_identity_is_of_the_model_and_the_version(
+    two_exports: TwoExports, tmp_path: Path
+) -> None:
     first = vessel().build()
     second = vessel(0.5).build()
     assert first == vessel().build()
     assert first["model_sha256"] != second["model_sha256"]
     assert first["identity"] == f"{__version__}+{first['model_sha256'][:16]}"
-    for name, made in (("a", vessel()), ("b", vessel(0.5))):
-        card = get_exporter("c").export(made, tmp_path / f"{name}.c")
-        held = json.loads((tmp_path / f"{name}.card.json").read_text())
-        assert held["build"] == card["build"] == made.build()
-        for end in ("c", "h"):
-            assert card["build"]["identity"] in (tmp_path / f"{name}.{end}").read_text()
+    for name, build in zip(MODELS, (first, second), strict=True):
+        file = two_exports.folder / name
+        stored_card = json.loads(file.with_suffix(".card.json").read_text())
+        assert stored_card["build"] == two_exports.cards[name]["build"] == build
+        for suffix in (".c", ".h"):
+            assert build["identity"] in file.with_suffix(suffix).read_text()
     # a header of another export is refused by the compiler
-    header = (tmp_path / "b.h").read_text().replace("B_", "A_").replace("b_", "a_")
-    (tmp_path / "a.h").write_text(header)
-    call = [find_compiler(), "-c", "a.c"]
+    header = (two_exports.folder / "2nd Öl.h").read_text()
+    header = header.replace("M_2ND__L_", "STEER_").replace("m_2nd__l_", "steer_")
+    (tmp_path / "steer.h").write_text(header)
+    shutil.copy(two_exports.folder / "steer.c", tmp_path)
+    call = [find_compiler(), "-c", "steer.c"]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode != 0
-    assert "a.h belongs to another export than this file" in done.stderr
-
-
-def listened(file: Path, made: ExportedVessel) -> list[tuple[str, bool]]:
-    """Messages of an export to C, each with whether the file stood by then."""
-    heard: list[tuple[str, bool]] = []
-
-    def hear(progress: Progress) -> None:
-        heard.append((progress.message, file.exists()))
-
-    with on_progress(hear):
-        get_exporter("c").export(made, file)
-    return heard
+    assert "steer.h belongs to another export than this file" in done.stderr
 
 
 def test_stack_and_size_are_reported_before_the_file_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    two_exports: TwoExports,
 ) -> None:
-    heard = listened(tmp_path / "boat.c", vessel())
+    heard = two_exports.messages["steer.c"]
     assert len(heard) == 1
-    card = json.loads((tmp_path / "boat.card.json").read_text())["size"]
+    card = two_exports.cards["steer.c"]["size"]
     stack = card["largest_stack_bytes"]
     code = card["code_bytes"]
     for word in (f"{stack:,} bytes of stack", f"{code:,} bytes of code", "-fstack-usage", "size"):
@@ -194,13 +218,11 @@ def test_stack_and_size_are_reported_before_the_file_is_written(
     assert card["warnings"] == []
     # warmup calls measured and step, when there is a memory; here step alone is the deepest
     assert stack == max(card["stack_bytes"].values())
-    monkeypatch.setattr(c, "STACK_LIMIT", 10)
-    monkeypatch.setattr(c, "CODE_LIMIT", 20)
-    heard = listened(tmp_path / "again.c", vessel())
+    heard = two_exports.messages[WARNED]
     assert [stood for _, stood in heard] == [False] * 3
     assert "bytes of stack exceed 10" in heard[1][0]
     assert "of code and constants exceed 20" in heard[2][0]
-    warnings = json.loads((tmp_path / "again.card.json").read_text())["size"]["warnings"]
+    warnings = two_exports.cards[WARNED]["size"]["warnings"]
     assert [f"  warning: {warning}" for warning in warnings] == [text for text, _ in heard[1:]]
 
 
@@ -273,7 +295,6 @@ def test_what_the_tools_do_not_measure_is_estimated_and_said_so(
         assert 0.5 * measured[key] <= size[key] <= 4.0 * measured[key], key
 
 
-FORMATS = ("torchscript", "c", "casadi", "fmu2")
 KNOWN = Assessment(
     level="limited",
     verdict=("After a 40 s free run the position error is 8.6 m.", "Two logs were checked."),
@@ -291,11 +312,11 @@ KNOWN = Assessment(
 )
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_every_card_holds_verdict_findings_and_split(name: str, tmp_path: Path) -> None:
+def test_a_card_has_verdict_findings_and_split() -> None:
+    """Of an assessment; `test_cards` reads them in the file of every format."""
     made = vessel()
     made.assessment = KNOWN
-    card = get_exporter(name).export(made, tmp_path / f"boat{get_exporter(name).suffix}")
+    card = made.build_card()
     assert (card["level"], card["verdict"]) == ("limited", list(KNOWN.verdict))
     assert card["findings"] == [dict(row) for row in KNOWN.findings or ()]
     assert card["split"] == {

@@ -320,11 +320,11 @@ int main(void) {{
 """Program that repeats a step at zero state and inputs for at least 20 ms."""
 
 
-def measure_step_time(source: Path, function: str, sizes: Sequence[int]) -> float | None:
+def measure_step_time(library: Path, function: str, sizes: Sequence[int]) -> float | None:
     """Return the seconds of one call of a C function on this machine; None without POSIX clocks.
 
     Args:
-        source: the C file.
+        library: the compiled C file, a shared library.
         function: name of the function.
         sizes: number of entries of each array that the function takes, in order.
     """
@@ -341,7 +341,7 @@ def measure_step_time(source: Path, function: str, sizes: Sequence[int]) -> floa
         )
         program = Path(folder) / "timing"
         # the header of the clock is POSIX, not C99
-        command = [find_compiler(), "-std=gnu99", "-O2", "-w", str(main), str(source)]
+        command = [find_compiler(), "-std=gnu99", "-O2", "-w", str(main), str(library.resolve())]
         compiled = subprocess.run([*command, "-o", str(program), "-lm"], capture_output=True)
         if compiled.returncode:
             return None
@@ -693,6 +693,7 @@ class CExporter(Exporter):
             "safety": "The file is source code: compile only what you trust.",
         }
         step_sizes: list[int] = []
+        libraries: list[Path] = []
         with tempfile.TemporaryDirectory() as name:
             temporary_path = Path(name) / file.name
 
@@ -708,12 +709,14 @@ class CExporter(Exporter):
                 header.write_text(c_files.header)
                 double_flags = [f"-D{c_files.prefix.upper()}_DOUBLE"]
                 parity = {}
+                libraries.clear()
                 for checked_dtype in exported.precisions[exported.precisions.index(dtype) :]:
                     precision = "double" if checked_dtype == torch.float64 else "single"
                     library = temporary_path.with_name(f"{precision}.so")
                     compile_shared_library(
                         [temporary_path], library, double_flags if precision == "double" else []
                     )
+                    libraries.append(library)
                     compiled = CompiledModel(library, exported, checked_dtype, prefix)
                     step_sizes[:] = compiled.step_sizes
                     parity[precision] = exported.check_parity(
@@ -728,7 +731,8 @@ class CExporter(Exporter):
                 card |= {"dtype": get_dtype_name(dtype)}
             size = measure_footprint(temporary_path)
             size["memory_bytes"] = measure_memory(exported)
-            size["step_seconds"] = measure_step_time(temporary_path, f"{prefix}_step", step_sizes)
+            # the first library has the precision that the file has without a macro
+            size["step_seconds"] = measure_step_time(libraries[0], f"{prefix}_step", step_sizes)
             size["warnings"] = report_footprint(file.name, size)
             card |= {"size": size, "parity": parity}
             write_card(file, card)
