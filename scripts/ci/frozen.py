@@ -124,12 +124,13 @@ def extract_page_text(page: str) -> list[str]:
 
 def run_short_configs(folder: Path) -> Iterator[tuple[str, Any]]:
     """Run shortened configs; yield metrics, summary and the text of their pages."""
-    from short_configs import SHORT
+    from short_configs import shorten_config
 
     for name in RUNS:
         run = folder / "runs" / name.replace("/", "_")
         overrides = [
-            override.replace("{runs}", str(folder / "runs")) for override in SHORT[name].overrides
+            override.replace("{runs}", str(folder / "runs"))
+            for override in shorten_config(name).overrides
         ]
         arguments = ["run", ROOT / "configs" / f"{name}.yaml", "--out", run, "--overwrite"]
         completed = run_residnet(*arguments, *(part for o in overrides for part in ("-s", o)))

@@ -10,6 +10,7 @@ data are absent are reported as skipped; a run that takes longer than `TIME_LIMI
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import multiprocessing
 import os
@@ -243,6 +244,7 @@ def list_shipped_configs() -> list[str]:
     return sorted(path.relative_to(CONFIGS).with_suffix("").as_posix() for path in files)
 
 
+@functools.cache
 def shorten_config(name: str) -> ShortConfig:
     """Return the shortened form of a config."""
     file = CONFIGS / f"{name}.yaml"
@@ -251,10 +253,6 @@ def shorten_config(name: str) -> ShortConfig:
     data_match = re.search(r"\$\{RESIDNET_DATA\}/(\w+)", base.read_text(encoding="utf-8"))
     overrides = (*shorten_parts(content), *SPECIFIC_OVERRIDES.get(name, ()))
     return ShortConfig(overrides, data_match[1] if data_match else "", AFTER.get(name, ""))
-
-
-SHORT = {name: shorten_config(name) for name in list_shipped_configs()}
-"""Shortened form of each shipped config by name."""
 
 
 class Result(NamedTuple):
@@ -274,7 +272,7 @@ def run_config(name: str, runs: Path) -> Result:
 
     The run is a fork of this process, which has loaded the libraries: it saves ten seconds.
     """
-    short_config = SHORT[name]
+    short_config = shorten_config(name)
     start_time = time.monotonic()
     folder = runs / name.replace("/", "_")
     data_folder = Path(os.environ.get("RESIDNET_DATA", "")) / short_config.data
@@ -338,7 +336,8 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2, help="number of parallel runs")
     parser.add_argument("--out", type=Path, help="folder for the runs; a temporary one otherwise")
     arguments = parser.parse_args()
-    if unknown_names := sorted({*SPECIFIC_OVERRIDES, *AFTER} - set(SHORT)):
+    shipped_names = list_shipped_configs()
+    if unknown_names := sorted({*SPECIFIC_OVERRIDES, *AFTER} - set(shipped_names)):
         raise SystemExit(f"{Path(__file__).name} has unknown configs: {', '.join(unknown_names)}")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     import lightning  # noqa: F401  (every run that trains loads it; forks have it already)
@@ -346,14 +345,14 @@ def main() -> int:
     import residnet.tasks.registry  # noqa: F401
 
     start_time = time.monotonic()
-    selected_names = set(arguments.names or SHORT)
-    selected_names |= {SHORT[name].after for name in selected_names if SHORT[name].after}
+    selected_names = set(arguments.names or shipped_names)
+    selected_names |= {AFTER[name] for name in selected_names if name in AFTER}
     results: list[Result] = []
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(arguments.jobs) as pool:
         runs = arguments.out or Path(temporary)
         # configs whose runs are used by others come first
         for uses_other_run in (False, True):
-            names = sorted(n for n in selected_names if bool(SHORT[n].after) == uses_other_run)
+            names = sorted(n for n in selected_names if (n in AFTER) == uses_other_run)
             results += pool.map(lambda name: run_config(name, runs), names)
     failed = sum(result.state == "FAILED" for result in results)
     skipped = sum(result.state == "skipped" for result in results)
