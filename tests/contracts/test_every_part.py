@@ -234,7 +234,7 @@ def test_a_head_flies_in_c_as_it_does_in_torch(kind: str, dtype: torch.dtype) ->
     z = z[torch.arange(3)[:, None] * 100 + torch.arange(100)]
     given = (
         torch.cat((torch.zeros_like(z[:, 0, :3]), z[:, 0, :3]), dim=1),
-        z[..., 3 : 3 + model.signals.n_inputs].repeat(1, 6, 1),
+        z[..., 3 : 3 + model.signals.n_inputs].repeat(1, 2, 1),
         0.1 * torch.rand(3, model.n_state).double(),
     )
     trained = [p for p in model.head.parameters() if p.requires_grad]

@@ -72,7 +72,7 @@ def test_an_optional_head_is_left_out_where_its_package_is_absent(
     bred = {"kind": "genetic", "evolution": {"population": 10, "generations": 1}, "optional": True}
     said: list[str] = []
     with on_progress(lambda event: said.append(str(event))):
-        assert list(fit_models(logs, settings_of(heads={"bred": bred}))) == [
+        assert list(fit_models(logs, settings_of(heads={"bred": bred}, bands=None))) == [
             "constant_velocity",
             "baseline",
         ]

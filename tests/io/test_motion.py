@@ -141,7 +141,10 @@ def test_sway_of_contradicting_surge_is_smoothed() -> None:
     assert "v_dot" not in complete_motion(wrong, MotionConfig()).channels
 
 
-@pytest.mark.parametrize("boat", BOATS)
+@pytest.mark.parametrize(
+    "boat",
+    [pytest.param(boat, marks=[] if boat == "catamaran" else [pytest.mark.long]) for boat in BOATS],
+)
 def test_surge_that_other_sensors_contradict_is_not_used(boat: str) -> None:
     rng = np.random.default_rng(31)
     motion = simulate_motion(BOATS[boat], rng)

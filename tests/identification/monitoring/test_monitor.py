@@ -12,7 +12,8 @@ import torch
 from residnet.core.errors import DataError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.engine.rollout import Rollout
+from residnet.engine.free_runs import compile_rollout
+from residnet.engine.rollout import Rollout, trace_rollout
 from residnet.identification.change_scores import (
     GroupScores,
     ScoreDistribution,
@@ -53,10 +54,14 @@ def logs(
     x0 = np.zeros((count, 6))
     x0[:, 2] = random.uniform(-3, 3, size=count)
     x0[:, 3] = 1.0
+    # an unchanged vessel can be compiled; rows of a changed one depend on their block
+    rollout = (
+        compile_rollout(Rollout(model), steps)
+        if change.sensor or change is NONE
+        else trace_rollout(Rollout(PerturbedDynamics(model, [change], count, 2)), steps)
+    )
     with torch.no_grad():
-        states, _, _ = Rollout(PerturbedDynamics(model, [change], count, 2))(
-            torch.from_numpy(x0), torch.from_numpy(held), torch.zeros(count, 0)
-        )
+        states, _, _ = rollout(torch.from_numpy(x0), torch.from_numpy(held), torch.zeros(count, 0))
     y = states.numpy() + NOISE * random.normal(size=states.shape)
     if change.sensor == "gyro_scale":
         y[:, :, 5] *= 1.0 + change.size
