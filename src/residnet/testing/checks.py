@@ -695,7 +695,7 @@ def check_vessel(name: str, time_step: float = 0.1) -> None:
     w[:, : plant.n_commands] = plant.commands_for_demand(half_drive, 0.2 * half_drive)
     initial_state = x.clone()
     memory = dynamics.initial_state(3).to(x.dtype)
-    with torch.no_grad():
+    with torch.inference_mode():
         for _ in range(100):
             x, memory = dynamics.step(x, w, memory)
         assert_finite(x, f"{subject}: its motion is not finite")
