@@ -288,8 +288,8 @@ def test_the_verdict_refuses_a_single_head_that_diverges() -> None:
         (
             [horizon(10, errors(0.5, 2.0)), horizon(30, errors(9.0, 5.0))],
             "limited",
-            "the upper limit of its position error is 9.9 m, 16 % of the distance travelled"
-            " (good: at most 10 %)",
+            "Limited for 30 s, good up to 10 s: the upper limit of its position error is 9.9 m,"
+            " 16 % of the distance travelled (good: at most 10 %)",
         ),
         (
             [horizon(10, errors(0.5, 2.0)), horizon(30, errors(9.0, 5.0), windows=5)],
@@ -307,6 +307,25 @@ def test_the_verdict_refuses_a_single_head_that_diverges() -> None:
             [horizon(10, errors(3.0, 5.0)), horizon(30, errors(25.0, 25.0))],
             "do not use",
             "46 % of the distance travelled (limited: at most 25 %)",
+        ),
+        (
+            [
+                horizon(10, errors(0.5, 2.0)),
+                horizon(20, errors(6.0, 5.0)),
+                horizon(30, errors(25.0, 25.0)),
+            ],
+            "do not use",
+            "Do not use for 30 s, good up to 10 s and limited up to 20 s: its position error is",
+        ),
+        # a level that fails at a shorter horizon does not hold up to a longer one
+        (
+            [
+                horizon(10, errors(1.9, 5.0)),
+                horizon(20, errors(2.0, 5.0)),
+                horizon(30, errors(9.0, 5.0)),
+            ],
+            "limited",
+            "Limited: the upper limit of its position error is 9.9 m",
         ),
         # the upper limit of the prediction interval counts; without one there is no rating
         (

@@ -477,10 +477,12 @@ def describe_main_horizon(evidence: VerdictEvidence, main: ProtocolHorizon) -> l
             f" of {format_count(row.logs, 'log')}, at least {_MIN_WINDOWS} of"
             f" {MIN_LOGS_FOR_INTERVAL} logs are needed.",
         ]
+    shorter_text = _describe_shorter_horizons(evidence, row)
     if level == DO_NOT_USE:
-        return [errors_text, f"Do not use: {'; '.join(list_shortfalls_of_limited(evidence, row))}."]
+        shortfalls = list_shortfalls_of_limited(evidence, row)
+        return [errors_text, f"Do not use{shorter_text}: {'; '.join(shortfalls)}."]
     if shortfalls := [*list_shortfalls_of_good(evidence, row), *list_limitations(evidence)]:
-        return [errors_text, f"Limited: {'; '.join(shortfalls)}."]
+        return [errors_text, f"Limited{shorter_text}: {'; '.join(shortfalls)}."]
     limits_by_unit = {
         "m": f"{100.0 * _MAX_DISTANCE_SHARE:.0f} % of the distance travelled",
         "rad": f"{math.degrees(_MAX_ANGLE_ERROR):.0f} deg",
@@ -495,6 +497,30 @@ def describe_main_horizon(evidence: VerdictEvidence, main: ProtocolHorizon) -> l
         errors_text,
         f"Good: upper limits within {join_list(list(limits))}{comparison}, no divergence.",
     ]
+
+
+def _describe_shorter_horizons(evidence: VerdictEvidence, row: HorizonRow) -> str:
+    """Return up to which shorter horizons a better level than at this one holds; may be empty.
+
+    A level holds up to a horizon if no shorter one has a worse level.
+    """
+    levels = list(LEVEL_TEXTS)
+    ranks = [
+        (horizon.row.seconds, levels.index(rate_horizon(evidence, horizon.row)))
+        for horizon in known_horizons(evidence)
+        if horizon.row.seconds < row.seconds and _is_sufficient(horizon.row, evidence.selected)
+    ]
+    texts = []
+    previous_seconds = 0.0
+    for rank in range(levels.index(rate_horizon(evidence, row))):
+        n_holding = next((i for i, (_, other) in enumerate(ranks) if other > rank), len(ranks))
+        seconds = ranks[n_holding - 1][0] if n_holding else 0.0
+        if seconds > previous_seconds:
+            texts.append(f"{levels[rank]} up to {format_number(seconds, 2)} s")
+            previous_seconds = seconds
+    if not texts:
+        return ""
+    return f" for {format_number(row.seconds, 2)} s, {join_list(texts)}"
 
 
 def _describe_errors(model: str, row: HorizonRow) -> str:
