@@ -200,6 +200,10 @@ def simulate_drawn_logs(
             logs_by_split.setdefault("test" if log.manoeuvre in test_kinds else split, []).append(
                 log
             )
+    if test_kinds:
+        logs_by_split["test"] = [
+            log for log in logs_by_split["test"] if log.manoeuvre in test_kinds
+        ]
     return logs_by_split
 
 
