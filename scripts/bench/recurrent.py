@@ -41,8 +41,6 @@ ARMS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "encoder_twice": ("constant_velocity", {"encoder": "measurements"}, {"steps": 30}),
     "encoder_margin": ("constant_velocity", {"encoder": "measurements", "margin": 0.5}, {}),
     "hull_margin": ("hull", {"margin": 0.5}, {}),
-    "hull_half": ("hull", {}, {"steps": 8}),
-    "encoder_half": ("constant_velocity", {"encoder": "measurements", "margin": 0.5}, {"steps": 8}),
 }
 """Baseline, changed keys of the head and of its training for each arm of the ablation."""
 PLAIN: dict[str, dict[str, Any]] = {
@@ -80,8 +78,7 @@ MEANS = (
     ("hull", "hull_network", "innovations"), ("hull", "hull_network", "encoder"),
     ("hull", "hull_network", "lstm"), ("hull", "hull_network", "encoder_twice"),
     ("hull", "encoder_margin"), ("hull", "hull_margin"), ("hull", "hull_margin", "encoder_margin"),
-    ("hull", "hull_network", "encoder_margin"), ("hull", "hull_half"),
-    ("hull", "hull_half", "encoder_margin"), ("hull", "hull_half", "encoder_half"),
+    ("hull", "hull_network", "encoder_margin"),
     ("hull", "hull_encoder", "encoder"), ("hull", "hull_network", "innovations", "encoder"),
 )  # fmt: skip
 """Means of trajectories that are compared; the first is the reference."""
