@@ -14,6 +14,8 @@ from residnet.baselines.given_config import ZeroBaselineConfig
 from residnet.baselines.regressors_config import RegressorsConfig
 from residnet.core.errors import ConfigError, UsageError
 from residnet.dynamics.store import ModelSpec, load_model, model_names, rebuild_module, save_model
+from residnet.heads.lstm_config import LstmConfig
+from residnet.heads.mirror import Tanh
 from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
@@ -91,6 +93,23 @@ def test_a_rebuilt_model_is_the_loaded_one_bit_for_bit(tmp_path: Path) -> None:
         other = loaded.get_parameter(name) if name not in theirs else theirs[name]
         assert value.dtype == other.dtype, name
         assert torch.equal(value, other), name
+
+
+def test_readouts_of_earlier_versions_are_tanh(tmp_path: Path) -> None:
+    head = {"kind": "lstm", "hidden_size": 3, "readout": 4}
+    kept = saved(tmp_path / "m", head={**head, "readout_activation": "tanh"})
+    content = json.loads((tmp_path / "m" / "model.json").read_text())
+    del content["head"]["readout_activation"]
+    edited(tmp_path / "m", head=content["head"])
+    loaded, model = load_model(tmp_path / "m")
+    assert loaded == kept
+    readouts = [module for module in model.modules() if isinstance(module, Tanh | torch.nn.SiLU)]
+    assert [type(module) for module in readouts] == [Tanh]
+    # a new head has a readout that does not saturate
+    new_config = LstmConfig(hidden_size=3, readout=4)
+    assert any(
+        isinstance(m, torch.nn.SiLU) for m in new_config.build(kept.signals.build().names).modules()
+    )
 
 
 def test_zero_has_no_numbers(tmp_path: Path) -> None:

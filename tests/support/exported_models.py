@@ -33,7 +33,7 @@ KINDS: dict[str, type[Any]] = load_kinds(HeadConfig)
 # smaller than the defaults, for the sake of time
 SIZES: dict[str, dict[str, Any]] = {
     "mlp": {"hidden": (8,)},
-    "lstm": {"hidden_size": 6},
+    "lstm": {"hidden_size": 6, "readout_activation": "silu"},
     "recurrent": {"hidden_size": 6},
 }
 VARIANTS: dict[str, dict[str, Any]] = {

@@ -311,7 +311,22 @@ def read_spec(folder: Path, kind: type[SpecT]) -> SpecT:
             f"{folder / _DESCRIPTION}: holds '{content.get('schema')}', expected"
             f" '{expected_schema}'; give a folder of this kind"
         )
+    _add_earlier_defaults(content)
     return validate_config(content, kind, str(folder / _DESCRIPTION))
+
+
+def _add_earlier_defaults(content: dict[str, Any]) -> None:
+    """Add keys of heads that earlier versions had no choice of, to a description and its members.
+
+    The readout of an LSTM was always `tanh`, which is no longer the default.
+    """
+    head = content.get("head")
+    if isinstance(head, dict) and head.get("kind") == "lstm":
+        head.setdefault("readout_activation", "tanh")
+    members = content.get("members")
+    for member in members if isinstance(members, list) else ():
+        if isinstance(member, dict):
+            _add_earlier_defaults(member)
 
 
 def read_weights(folder: Path, module: nn.Module) -> None:

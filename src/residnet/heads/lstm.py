@@ -173,7 +173,8 @@ class LstmNetwork(RenamedStateModule):
             output_layer.bias.zero_()
         hidden_layers = (
             nn.Sequential(
-                nn.Linear(config.hidden_size + self.features.n_features, config.readout), Tanh()
+                nn.Linear(config.hidden_size + self.features.n_features, config.readout),
+                nn.SiLU() if config.readout_activation == "silu" else Tanh(),
             )
             if self.has_hidden_readout_layer
             else nn.Sequential()

@@ -20,8 +20,10 @@ class LstmConfig(NetworkConfig):
 
     Attributes:
         hidden_size: number of hidden units.
-        readout: number of units of a tanh layer between (hidden state, features) and the residual;
-            0 for a linear readout of the hidden state, as in Woo et al. 2018.
+        readout: number of units of a layer between (hidden state, features) and the residual; 0 for
+            a linear readout of the hidden state, as in Woo et al. 2018.
+        readout_activation: activation function of this layer. `silu` does not saturate, and
+            approximates products and squares of channels with fewer units than `tanh`.
         memory: features that the LSTM receives; empty for all. An LSTM of the commands only has the
             same states in a free run and in teacher forcing: it can represent actuator dynamics but
             not infer measured accelerations. Needs `readout`, which receives all features.
@@ -38,6 +40,7 @@ class LstmConfig(NetworkConfig):
     kind: Literal["lstm"] = "lstm"
     hidden_size: int = Field(default=32, ge=1, le=10_000)
     readout: int = Field(default=32, ge=0, le=10_000)
+    readout_activation: Literal["tanh", "silu"] = "silu"
     memory: tuple[str, ...] = ()
     activation: Literal["tanh", "softsign"] = "tanh"
     dropout: float = Field(default=0.0, ge=0, lt=1)

@@ -23,14 +23,15 @@ class MlpConfig(NetworkConfig):
 
     Attributes:
         hidden: number of units of each hidden layer.
-        activation: activation function of the hidden layers.
+        activation: activation function of the hidden layers. `silu` does not saturate, and
+            approximates products and squares of channels with fewer units than `tanh`.
         dropout: dropout probability of the hidden units.
         mirror: whether the residual is mirror-symmetric between port and starboard by construction.
     """
 
     kind: Literal["mlp"] = "mlp"
     hidden: tuple[_UnitCount, ...] = Field(default=(64, 64), min_length=1, max_length=100)
-    activation: Literal["tanh", "silu", "relu", "softsign"] = "tanh"
+    activation: Literal["tanh", "silu", "relu", "softsign"] = "silu"
     dropout: float = Field(default=0.0, ge=0, lt=1)
     mirror: bool = False
 
