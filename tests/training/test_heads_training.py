@@ -144,7 +144,9 @@ def test_one_step_loss_is_the_mean_square_over_what_counts() -> None:
         for k in range(STEPS):
             if COUNTED[b, k]:
                 z = np.concatenate((Y[b, k, 3:].numpy(), W[b, k].numpy()))
-                hidden = np.tanh(first.weight.detach().numpy() @ z + first.bias.detach().numpy())
+                hidden = first.weight.detach().numpy() @ z + first.bias.detach().numpy()
+                # SiLU, the default activation
+                hidden = hidden / (1.0 + np.exp(-hidden))
                 rho = last.weight.detach().numpy() @ hidden + last.bias.detach().numpy()
                 error = NU_DOT[b, k].numpy() - A @ z[:3] - B @ z[3:] - C - rho
                 total = total + float(np.sum((error / UNITS.numpy()) ** 2))
