@@ -81,7 +81,9 @@ def _set_thread_limits(
         os.environ.setdefault(name, "1")
 
 
-QuietOption = Annotated[bool, typer.Option("--quiet", help="Show no progress, the result only.")]
+QuietOption = Annotated[
+    bool, typer.Option("--quiet", help="Print only the result, without progress.")
+]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
 OverridesOption = Annotated[
     list[str] | None,
@@ -94,11 +96,15 @@ OverridesOption = Annotated[
 ]
 LogArguments = Annotated[
     list[Path] | None,
-    typer.Argument(metavar="[PATH]...", help="Logs in the order of time: files or folders."),
+    typer.Argument(metavar="[PATH]...", help="Logs in chronological order: files or folders."),
 ]
 LogOptions = Annotated[
     list[Path] | None,
-    typer.Option("--logs", metavar="PATH", help="The same, one at a time; may be repeated."),
+    typer.Option(
+        "--logs",
+        metavar="PATH",
+        help="A log file or folder, as alternative to PATH; may be repeated.",
+    ),
 ]
 
 
@@ -116,11 +122,11 @@ TrustOption = Annotated[
     typer.Option(
         "--trust",
         callback=_allow_untrusted_parts,
-        help="Make and load parts that are not stored as data, such as other classes of"
-        " scikit-learn. They can run code: only for configs and runs whose source you trust.",
+        help="Allow parts that can execute code, such as unlisted classes of scikit-learn."
+        " Use it only for configs and runs whose source you trust.",
     ),
 ]
-_CONFIG_HELP = "YAML file of one run, or the name of a config that comes with residnet."
+_CONFIG_HELP = "YAML file of one run, or the name of a shipped config (`residnet list configs`)."
 
 
 @app.command()
@@ -129,7 +135,7 @@ def run(
     overrides: OverridesOption = None,
     output_folder: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="Run folder; runs/<name> if not given."),
+        typer.Option("--out", metavar="DIR", help="Run folder; default: runs/<name>."),
     ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted run in its folder.")
@@ -143,19 +149,19 @@ def run(
             min=1,
             max=1024,
             metavar="N",
-            help="Models that are fitted in parallel; the number of cores if not given.",
+            help="Number of models fitted in parallel; default: number of cores.",
         ),
     ] = None,
     trust: TrustOption = False,
     quiet: QuietOption = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print summary.json and the run's folder, for machines.")
+        bool, typer.Option("--json", help="Print summary.json and the run folder as JSON.")
     ] = False,
     verbose: Annotated[
-        bool, typer.Option("-v", "--verbose", help="Write all progress into RUN/log.txt.")
+        bool, typer.Option("-v", "--verbose", help="Write all progress messages to RUN/log.txt.")
     ] = False,
 ) -> None:
-    """Run a task: fit, evaluate, report and export, or any other task."""
+    """Run a config: fit, evaluate, report and export."""
     from residnet.core.processes import worker_limit
     from residnet.tasks.registry import load_task, resolve_config_file
 
@@ -185,24 +191,30 @@ def run(
 @app.command()
 def new(
     logs: Annotated[
-        list[Path], typer.Argument(metavar="LOGS...", help="Files, folders and bags of any format.")
+        list[Path],
+        typer.Argument(
+            metavar="LOGS...", help="Log files, folders or bags in any supported format."
+        ),
     ],
     output_file: Annotated[
         Path | None,
-        typer.Option("--out", metavar="CONFIG", help="File to write; my_boat.yaml if not given."),
+        typer.Option("--out", metavar="CONFIG", help="Config to write; default: my_boat.yaml."),
     ] = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an earlier config of this name.")
+        bool, typer.Option("--overwrite", help="Replace an existing config.")
     ] = False,
     defaults: Annotated[
-        bool, typer.Option("--defaults", help="Ask nothing: use defaults and mark them as guesses.")
+        bool,
+        typer.Option(
+            "--defaults", help="Do not ask questions; use defaults and mark them as guesses."
+        ),
     ] = False,
     names: Annotated[
         str | None,
         typer.Option(
             "--names",
             metavar="T,X,Y,...",
-            help="Names of all columns in order, for tables without a line of names.",
+            help="Names of all columns in order, for tables without a header line.",
         ),
     ] = None,
     step: Annotated[
@@ -210,25 +222,39 @@ def new(
         typer.Option(
             "--step",
             metavar="TIME",
-            help="Time between two rows, such as '0.1 s', for tables without a column of time.",
+            help="Time between two rows, such as '0.1 s', for tables without a time column.",
         ),
     ] = None,
     length: Annotated[
         str | None,
-        typer.Option(help="Length of the vessel in the logs; drafts a booklet and derivatives."),
+        typer.Option(
+            metavar="LENGTH",
+            help="Length of the vessel in the logs, such as '3.2 m'; adds a manoeuvring booklet"
+            " and derivatives.",
+        ),
     ] = None,
     scale: Annotated[
-        float | None, typer.Option(help="Length of the ship divided by that in the logs.")
+        float | None,
+        typer.Option(
+            metavar="RATIO", help="Scale ratio: length of the ship divided by length of the model."
+        ),
     ] = None,
-    beam: Annotated[str | None, typer.Option(help="Beam in the scale of the logs.")] = None,
-    draught: Annotated[str | None, typer.Option(help="Draught in the scale of the logs.")] = None,
-    mass: Annotated[str | None, typer.Option(help="Displacement in the scale of the logs.")] = None,
+    beam: Annotated[
+        str | None, typer.Option(metavar="BEAM", help="Beam of the vessel in the logs.")
+    ] = None,
+    draught: Annotated[
+        str | None, typer.Option(metavar="DRAUGHT", help="Draught of the vessel in the logs.")
+    ] = None,
+    mass: Annotated[
+        str | None,
+        typer.Option(metavar="MASS", help="Mass displacement of the vessel in the logs."),
+    ] = None,
     quiet: QuietOption = False,
 ) -> None:
-    """Draft a complete config for `residnet run` from logs.
+    """Draft a config for `residnet run` from logs.
 
-    Channels, units, frames, inputs, splits, protocols and models are proposed. Questions that the
-    logs do not answer are asked on a terminal; otherwise the default is marked as a guess.
+    The draft has channels, units, frames, inputs, splits, protocols and models. In a terminal, the
+    command asks what the logs do not answer; otherwise it uses a default and marks it as a guess.
     """
     from residnet.io.drafting.questions import READER_KEY
     from residnet.tasks.drafting import STOP, write_new_config
@@ -252,15 +278,15 @@ def new(
 
 @app.command()
 def demo(
-    folder: Annotated[
-        Path, typer.Argument(metavar="[DIR]", help="Folder to write into; demo if not given.")
-    ] = Path("demo"),
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Folder of the logs.")] = Path(
+        "demo"
+    ),
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the logs of an earlier demo.")
+        bool, typer.Option("--overwrite", help="Replace existing demo logs.")
     ] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Write example logs of a simulated boat in several layouts."""
+    """Write example logs of a simulated boat in several formats."""
     from residnet.tasks.demo import write_demo
 
     with show_progress(quiet=quiet):
@@ -275,7 +301,7 @@ def check(
     trust: TrustOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Validate a config and its files, models and packages, without running it."""
+    """Validate a config, its files and packages without a run."""
     from residnet.tasks.registry import load_task
 
     with show_progress(quiet=quiet):
@@ -290,29 +316,26 @@ def inspect(
         list[Path],
         typer.Argument(
             metavar="LOG...",
-            help="Logs: canonical Parquet, or any format that the reader of the config supports.",
+            help="Logs in any format that the reader of the config supports; without --config, any"
+            " format that `residnet new` reads.",
         ),
     ],
     config: Annotated[
         Path | None,
-        typer.Option(
-            "--config", metavar="CONFIG", help="A run whose channel map reads these logs."
-        ),
+        typer.Option("--config", metavar="CONFIG", help="Config whose channel map reads the logs."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="Also write the findings to a file as JSON."),
+        typer.Option("--out", metavar="FILE", help="Also write the findings to a JSON file."),
     ] = None,
     trust: TrustOption = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the findings as JSON, for machines.")
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
     quiet: QuietOption = False,
 ) -> None:
     """Check logs for errors that would mislead a fit.
 
-    Clocks, gaps, jumps, frozen channels, reference frames, lags, copied channels and excitation
-    are checked. The exit code is 1 if a fit would be misled.
+    The checks cover clocks, gaps, jumps, frozen channels, reference frames, lags, copied channels
+    and excitation. The exit code is 1 if a finding would mislead a fit.
     """
     from residnet.core.files import require_writable_file
     from residnet.tasks.inspection import inspect_logs
@@ -351,19 +374,19 @@ def evaluate(
     output_folder: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="DIR", help="Folder of the results; RUN/external-<time> if not given."
+            "--out", metavar="DIR", help="Folder of the results; default: RUN/external-<time>."
         ),
     ] = None,
     trust: TrustOption = False,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue an interrupted evaluation in its folder.")
+        bool, typer.Option("--resume", help="Continue an interrupted evaluation.")
     ] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an earlier evaluation in its folder.")
+        bool, typer.Option("--overwrite", help="Replace an earlier evaluation in the folder.")
     ] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Evaluate the models of a finished run in free run on other logs."""
+    """Evaluate the models of a finished fit on other logs."""
     from residnet.core.files import require_free_space
     from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.registry import open_finished_task
@@ -384,31 +407,34 @@ def monitor(
     folder: RunArgument,
     log_arguments: LogArguments = None,
     log_options: LogOptions = None,
-    model: Annotated[str, typer.Option(help="Name of the model.")] = "selected",
-    window: Annotated[str, typer.Option(help="Length of the short free runs.")] = "10 s",
-    stretch: Annotated[str, typer.Option(help="Time span of the score tests.")] = "300 s",
-    false_alarm: Annotated[str, typer.Option(help="Mean time between false alarms.")] = "10 h",
+    model: Annotated[str, typer.Option(metavar="NAME", help="Name of the model.")] = "selected",
+    window: Annotated[str, typer.Option(metavar="TIME", help="Length of each free run.")] = "10 s",
+    stretch: Annotated[
+        str, typer.Option(metavar="TIME", help="Time span of the data in each score test.")
+    ] = "300 s",
+    false_alarm: Annotated[
+        str, typer.Option(metavar="TIME", help="Mean time between false alarms.")
+    ] = "10 h",
     output_folder: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder for a page and monitor.json."),
+        typer.Option("--out", metavar="DIR", help="Folder of the report and monitor.json."),
     ] = None,
     refit: Annotated[
         Path | None,
         typer.Option(
             "--refit",
             metavar="DIR",
-            help="Apply the identified changes to a copy of the model, in a new run folder.",
+            help="New run folder for a copy of the model with the identified changes.",
         ),
     ] = None,
     trust: TrustOption = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the results as JSON, for machines.")
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the results as JSON.")] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Detect changes of a vessel in new logs with a model of a finished fit.
+    """Detect changes of a vessel in new logs.
 
-    The exit code is 1 if there is an alarm. A refit does not change the run.
+    A model of a finished fit predicts the new logs; score tests on its errors name the change. The
+    exit code is 1 if there is an alarm. A refit does not change the run.
     """
     from residnet.core.files import atomic_write, require_free_space
     from residnet.core.run_loader import name_damaged_key
@@ -448,23 +474,33 @@ def monitor(
 def plan_trial(
     folder: RunArgument,
     model: Annotated[
-        str, typer.Option(help="Refitted baseline; that of the booklet or the first if not given.")
+        str,
+        typer.Option(
+            metavar="NAME", help="Refitted baseline; default: that of the booklet, else the first."
+        ),
     ] = "",
-    time: Annotated[str, typer.Option(help="Duration of each trial.")] = "120 s",
+    time: Annotated[str, typer.Option(metavar="TIME", help="Duration of each trial.")] = "120 s",
     area: Annotated[
-        str | None, typer.Option(help="Largest distance from the start, such as '200 m'.")
+        str | None,
+        typer.Option(metavar="DISTANCE", help="Largest distance from the start, such as '200 m'."),
     ] = None,
-    speed: Annotated[str | None, typer.Option(help="Largest speed, such as '3 m/s'.")] = None,
-    rudder: Annotated[float, typer.Option(help="Largest share of full steer.")] = 1.0,
-    count: Annotated[int, typer.Option(help="Number of trials to choose.")] = 3,
+    speed: Annotated[
+        str | None, typer.Option(metavar="SPEED", help="Largest speed, such as '3 m/s'.")
+    ] = None,
+    rudder: Annotated[
+        float, typer.Option(help="Largest rudder command as a share of its range.")
+    ] = 1.0,
+    count: Annotated[int, typer.Option(help="Number of trials to propose.")] = 3,
     output_folder: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder for next_trials.yaml and tracks."),
+        typer.Option(
+            "--out", metavar="DIR", help="Folder of next_trials.yaml, the tracks and a report."
+        ),
     ] = None,
     trust: TrustOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Plan the next trials, with the expected reduction of the prediction intervals."""
+    """Plan the next trials by the information they add."""
     from residnet.core.files import require_free_space
     from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.registry import open_finished_task
@@ -489,8 +525,8 @@ def export(
         typer.Option(
             "--model",
             metavar="NAME",
-            help="Name of the model; 'selected' for the single model chosen on validation data; the"
-            " model reported first if not given.",
+            help="Name of the model, or 'selected' for the single model chosen on validation data;"
+            " default: the model that the report rates.",
         ),
     ] = "predictor",
     file_format: Annotated[
@@ -501,22 +537,22 @@ def export(
         typer.Option(
             "--out",
             metavar="FILE",
-            help="File to write; RUN/exports/<model>.pt if not given, and RUN/exports/<run>.c for"
-            " C, whose symbols begin with the name of the file.",
+            help="File to write; default: RUN/exports/<model>.pt, or RUN/exports/<run>.c for C. The"
+            " symbols of a C file begin with its name.",
         ),
     ] = None,
     allows_objections: Annotated[
         bool,
         typer.Option(
             "--anyway",
-            help="Export even if the model is worse than the baseline or rated 'do not use'; its"
-            " card says so.",
+            help="Export a model that is worse than the baseline or rated 'do not use'; its card"
+            " lists the reasons.",
         ),
     ] = False,
     trust: TrustOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Export a model of a finished run for controllers, after a parity check."""
+    """Export a model for controllers, with a parity check."""
     from residnet.core.files import require_writable_file
     from residnet.core.run_loader import name_damaged_key
     from residnet.runs.task import ExportRequest
@@ -535,23 +571,29 @@ def export(
 @app.command()
 def ardupilot(
     source: Annotated[
-        str, typer.Argument(metavar="VESSEL|RUN", help="A vessel, or the folder of a finished fit.")
+        str,
+        typer.Argument(
+            metavar="VESSEL|RUN",
+            help="Vessel (`residnet list vessels`), or folder of a finished fit.",
+        ),
     ],
     model: Annotated[
-        str, typer.Option("--model", metavar="NAME", help="Name of the model of a run.")
+        str, typer.Option("--model", metavar="NAME", help="Model of the run.")
     ] = "selected",
     servo: Annotated[
         list[str] | None,
         typer.Option(
             "--servo",
             metavar="COMMAND=OUTPUT:LOW:HIGH",
-            help="Servo output of a command and its values at 1000 and 2000 us, SI.",
+            help="Servo output of a command, and the command in SI units at 1000 and 2000 us.",
         ),
     ] = None,
-    port: Annotated[int, typer.Option("--port", help="UDP port that ArduPilot sends to.")] = 9002,
+    port: Annotated[int, typer.Option("--port", help="UDP port to which ArduPilot sends.")] = 9002,
     trust: TrustOption = False,
 ) -> None:
-    """Simulate a vessel or a learned model for ArduPilot (sim_vehicle.py --model JSON)."""
+    """Simulate a vessel or a model for ArduPilot.
+
+    It implements the JSON interface of `sim_vehicle.py --model JSON`."""
     from residnet.simulators.ardupilot import ArduPilotBackend, assign_servos
     from residnet.simulators.vehicle import load_vehicle
 
@@ -570,34 +612,56 @@ def ardupilot(
 @app.command()
 def derivatives(
     folder: RunArgument,
-    length: Annotated[str, typer.Option(help="Length between perpendiculars, such as '7 m'.")],
+    length: Annotated[
+        str, typer.Option(metavar="LENGTH", help="Length between perpendiculars, such as '7 m'.")
+    ],
     speed: Annotated[
-        str, typer.Option(help="Service speed of the vessel in the logs, such as '1.2 m/s'.")
+        str,
+        typer.Option(
+            metavar="SPEED", help="Speed about which the forces are expanded, such as '1.2 m/s'."
+        ),
     ],
     model: Annotated[
-        str, typer.Option("--model", metavar="NAME", help="Model whose baseline is expanded.")
+        str,
+        typer.Option(
+            "--model", metavar="NAME", help="Model whose baseline is expanded in a Taylor series."
+        ),
     ] = "baseline",
-    draught: Annotated[str | None, typer.Option(help="Draught, such as '0.46 m'.")] = None,
-    beam: Annotated[str | None, typer.Option(help="Beam, such as '1.27 m'.")] = None,
-    mass: Annotated[str | None, typer.Option(help="Displacement, such as '3270 kg'.")] = None,
+    draught: Annotated[
+        str | None, typer.Option(metavar="DRAUGHT", help="Draught, such as '0.46 m'.")
+    ] = None,
+    beam: Annotated[
+        str | None, typer.Option(metavar="BEAM", help="Beam, such as '1.27 m'.")
+    ] = None,
+    mass: Annotated[
+        str | None, typer.Option(metavar="MASS", help="Displacement, such as '3270 kg'.")
+    ] = None,
     centre_of_gravity: Annotated[
-        str, typer.Option("--xg", help="Centre of gravity ahead of the origin.")
+        str, typer.Option("--xg", help="Distance of the centre of gravity ahead of the origin.")
     ] = "0 m",
     gyradius: Annotated[
-        float, typer.Option(help="Radius of gyration in yaw in units of the length.")
+        float, typer.Option(help="Radius of gyration in yaw divided by the length.")
     ] = 0.25,
-    density: Annotated[str, typer.Option(help="Density of the water.")] = "1000 kg/m^3",
+    density: Annotated[
+        str, typer.Option(metavar="DENSITY", help="Density of the water.")
+    ] = "1000 kg/m^3",
     scale: Annotated[
-        float, typer.Option(help="Length at full scale divided by that in the logs.")
+        float,
+        typer.Option(
+            metavar="RATIO", help="Scale ratio: length at full scale divided by length in the logs."
+        ),
     ] = 1.0,
     density_ratio: Annotated[
-        float, typer.Option(help="Density of the water at full scale divided by that in the logs.")
+        float,
+        typer.Option(help="Density of the water at full scale divided by the density in the logs."),
     ] = 1.0,
     order: Annotated[int, typer.Option(help="Highest order of the Taylor series, 1 to 3.")] = 1,
     output_file: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="FILE", help="File to write: .json, .csv, .m, .yaml (vessel) or .sdf."
+            "--out",
+            metavar="FILE",
+            help="File to write, with the extension .json, .csv, .m, .yaml (vessel) or .sdf.",
         ),
     ] = None,
     format_name: Annotated[
@@ -605,14 +669,17 @@ def derivatives(
         typer.Option(
             "--format",
             metavar="FORMAT",
-            help="Format of --out: json, csv, matlab, vessel, mss or sdf; else by its suffix.",
+            help="Format of --out: json, csv, matlab, vessel, mss or sdf; default: by extension.",
         ),
     ] = None,
     trust: TrustOption = False,
 ) -> None:
-    """Print hydrodynamic derivatives with standard errors, in SI, prime and bis systems.
+    """Print hydrodynamic derivatives with standard errors.
 
-    Masses from beam, draught and mass turn derivatives of accelerations into those of forces.
+    The units are SI, prime I, prime II and bis.
+
+    With beam, draught and mass, they are derivatives of
+    forces instead of accelerations.
     """
     from residnet.core.errors import UsageError
     from residnet.core.files import write_owned
@@ -651,52 +718,70 @@ def derivatives(
 def scale(
     folder: RunArgument,
     scale: Annotated[
-        float, typer.Option("--scale", help="Length at full scale divided by that in the logs.")
+        float,
+        typer.Option(
+            "--scale",
+            metavar="RATIO",
+            help="Scale ratio: length at full scale divided by length in the logs.",
+        ),
     ],
     output_folder: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder of the run; RUN_full_scale by default."),
+        typer.Option(
+            "--out", metavar="DIR", help="Folder of the new run; default: RUN_full_scale."
+        ),
     ] = None,
     models: Annotated[
         list[str] | None,
-        typer.Option("--model", metavar="NAME", help="Model to scale; all if not given."),
+        typer.Option("--model", metavar="NAME", help="Model to scale; default: all models."),
     ] = None,
     density_ratio: Annotated[
-        float, typer.Option(help="Density of the water at full scale divided by that in the logs.")
+        float,
+        typer.Option(help="Density of the water at full scale divided by the density in the logs."),
     ] = 1.0,
     resistance: Annotated[
         float, typer.Option(help="Resistance coefficient of the ship divided by that of the model.")
     ] = 1.0,
     form_factor: Annotated[
         float | None,
-        typer.Option(help="Form factor k, for the resistance by ITTC 1978 instead of a ratio."),
+        typer.Option(
+            metavar="K", help="Form factor k: resistance by ITTC 1978 instead of --resistance."
+        ),
     ] = None,
     total_resistance: Annotated[
-        float | None, typer.Option(help="C_TM from a towing test, with --form-factor.")
+        float | None,
+        typer.Option(
+            metavar="C_TM",
+            help="Total resistance coefficient C_TM of the towing test; needed with --form-factor.",
+        ),
     ] = None,
     length: Annotated[
-        str | None, typer.Option(help="Length of the model, with --form-factor.")
+        str | None,
+        typer.Option(metavar="LENGTH", help="Length of the model; needed with --form-factor."),
     ] = None,
     speed: Annotated[
-        str | None, typer.Option(help="Speed of the model, with --form-factor.")
+        str | None,
+        typer.Option(metavar="SPEED", help="Speed of the model; needed with --form-factor."),
     ] = None,
     propeller: Annotated[
-        float, typer.Option(help="Thrust at full scale divided by the scaled one.")
+        float, typer.Option(help="Thrust at full scale divided by the thrust by Froude's law.")
     ] = 1.0,
     rudder: Annotated[
-        float, typer.Option(help="Rudder force at full scale divided by the scaled one.")
+        float, typer.Option(help="Rudder force at full scale divided by the force by Froude's law.")
     ] = 1.0,
-    source: Annotated[str, typer.Option(help="Source of these scale effects.")] = "",
+    source: Annotated[
+        str, typer.Option(metavar="TEXT", help="Source of the factors, stored with the run.")
+    ] = "",
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier run in the folder.")
     ] = False,
     trust: TrustOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Scale the models and logs of a finished fit to full scale, by Froude's law of similarity.
+    """Scale the models and logs of a fit by Froude's law.
 
-    The new run can be evaluated, exported and simulated like any other. Froude's law ignores
-    viscosity: factors of resistance, propeller and rudder correct it where their source is known.
+    The new run can be evaluated, exported and simulated like any other run. Froude's law ignores
+    viscosity. Factors of resistance, propeller and rudder correct this; state their source.
     """
     from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.registry import open_finished_task
@@ -723,30 +808,32 @@ def scale(
 @app.command()
 def report(
     folder: RunArgument,
-    pdf: Annotated[
-        bool, typer.Option("--pdf", help="Write a client report as PDF instead of the page.")
-    ] = False,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Write a client report as PDF.")] = False,
     template: Annotated[
         str,
-        typer.Option(help="Template of the PDF: 'client', or a Typst file of your own (.typ)."),
+        typer.Option(
+            metavar="NAME|FILE",
+            help="Template of the PDF: 'client', or your own Typst file (.typ).",
+        ),
     ] = "client",
     logo: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Image in the head of the PDF.")
+        Path | None, typer.Option(metavar="FILE", help="Image in the header of the PDF.")
     ] = None,
     text: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="YAML: title, subtitle, client, author, reference, introduction, conclusions.",
+            help="YAML file with title, subtitle, client, author, reference, introduction and"
+            " conclusions.",
         ),
     ] = None,
     output_file: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="The PDF; RUN/client_report.pdf by default."),
+        typer.Option("--out", metavar="FILE", help="PDF file; default: RUN/client_report.pdf."),
     ] = None,
     quiet: QuietOption = False,
 ) -> None:
-    """Rewrite the figures and the report of a finished run, or write its client report."""
+    """Rewrite the report of a finished run, or write a PDF."""
     from residnet.tasks.registry import report_run, write_client_pdf
 
     with show_progress(quiet=quiet):
@@ -760,13 +847,14 @@ def report(
 @app.command()
 def trust(
     folder: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Folder of a run, or of a single model.")
+        Path, typer.Argument(metavar="RUN", help="Folder of a run or of a single model.")
     ],
 ) -> None:
-    """Accept the files of a run folder: list new and changed files, and write checksums.
+    """Accept new and changed files of a run folder.
 
-    Do this only if you trust the source of the folder. No code in it runs, but its numbers are
-    used as results of a run, and later commands may replace the listed files.
+    The command lists these files and writes their checksums. Use it only if you trust the source of
+    the folder: its numbers are then used as results of a run, and later commands may replace its
+    files. It executes no code of the folder.
     """
     from residnet.core.run_loader import accept_run
 
@@ -780,11 +868,13 @@ def compare(
         list[Path], typer.Argument(metavar="RUN RUN...", help="Folders of finished fits.")
     ],
     output_folder: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder of the page.")
+        Path, typer.Option("--out", metavar="DIR", help="Folder of the report.")
     ] = Path("comparison"),
     quiet: QuietOption = False,
 ) -> None:
-    """Compare finished fits: errors on common logs, paired intervals, settings."""
+    """Compare finished fits on common logs.
+
+    The report has errors, paired confidence intervals and differences of settings."""
     from residnet.core.run_loader import name_damaged_key
     from residnet.tasks.compare import compare_runs
 
@@ -799,7 +889,7 @@ def runs(
     folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Folder of runs.")] = Path("runs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
 ) -> None:
-    """List the runs below a folder with task, state, best figure and age."""
+    """List runs with task, state, best result and age."""
     from residnet.tasks.registry import format_runs, list_runs
 
     rows = list_runs(folder)
@@ -813,10 +903,13 @@ def list_names(
         Literal[
             "vessels", "heads", "manoeuvres", "readers", "tasks", "baselines", "formats", "configs"
         ],
-        typer.Argument(help="Kind of part to list."),
+        typer.Argument(
+            metavar="KIND",
+            help="Kind of part.",
+        ),
     ],
 ) -> None:
-    """List the parts that a config can use, each with a description."""
+    """List the parts that a config can use."""
     from residnet.tasks.registry import list_catalogue
 
     for name, description in list_catalogue(part_kind):

@@ -336,7 +336,7 @@ def test_the_verdict_refuses_a_single_head_that_diverges() -> None:
         (
             [horizon(30, errors(3.0, 5.0, half=None))],
             "too few windows",
-            "at least 5 of 3 logs are needed",
+            "A rating needs at least 5 free runs of 3 logs",
         ),
         # a model with a far larger error than another one of the run is not good
         (
@@ -442,12 +442,12 @@ def test_data_outside_the_training_range_and_the_doctor_are_told() -> None:
     limits = under(outside=OutsideRange(share=0.123, channels={"u": 0.1, "delta": 0.03}))
     said = write_verdict(
         evidence(
-            limits_by_protocol=limits, data_quality_text="Data doctor: nothing would mislead a fit."
+            limits_by_protocol=limits, data_quality_text="Data checks: nothing would mislead a fit."
         )
     )
     assert any(text.startswith("Of the test data, 12 % lies outside") for text in said)
     assert any("(u 10 %, delta 3.0 %)" in text for text in said)
-    assert said[1] == "Data doctor: nothing would mislead a fit."
+    assert said[1] == "Data checks: nothing would mislead a fit."
 
 
 def test_windows_unlike_those_that_calibrated_the_intervals_are_named() -> None:

@@ -596,10 +596,10 @@ def test_summarize_inspection_counts_and_ranks_findings() -> None:
         texts = [(finding.text, finding.level) for finding in entry.findings]
         assert texts == [(finding.text, finding.level) for finding in report.findings]
     clean = summarize_inspection(build_inspection(reports[:1], InspectionReport("together", ())))
-    assert clean.sentences == ["Data doctor: nothing in the log would mislead a fit."]
+    assert clean.sentences == ["Data checks: nothing in the log would mislead a fit."]
     counted = summarize_inspection(inspection)
     assert (counted.n_logs, counted.n_logs_with_problems) == (2, 1)
-    assert counted.tally.startswith("Data doctor: 1 of 2 logs has faults")
+    assert counted.tally.startswith("Data checks: 1 of 2 logs has faults")
     assert counted.first_action.startswith("First fix this: sick: ")
     assert [inspection.tally, inspection.first] == counted.sentences
 

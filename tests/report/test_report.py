@@ -101,7 +101,7 @@ def test_the_first_screen_answers_how_far_off_and_which_model(page: str) -> None
     assert verdict is not None
     assert "On test data the velocity errors of plsr" in verdict[0]
     assert "! Limited" in page
-    for absent in ("Before you use it", "Physical sanity", 'id="data-doctor"', REFITTED):
+    for absent in ("Before you use it", "Physical sanity", 'id="data-checks"', REFITTED):
         assert absent not in text
 
 
@@ -192,6 +192,55 @@ def test_five_questions_are_answered_before_the_first_section(level: str, tmp_pa
     glance = Page(f"<section>{opening[2].partition('</section>')[0]}</section>").tables[0]
     rows = " | ".join(" | ".join(line) for line in glance)
     assert five_answers(f"{opening[0]} {rows}", level)
+
+
+NEXT_STEPS = {
+    "good": "test your controller",
+    "limited": "Record more logs",
+    "do not use": "Record more logs",
+    "too few windows": "Record more test logs",
+}
+
+
+def facts_of(run: Path) -> str:
+    """The facts of the first screen as text."""
+    text = html.unescape(shown(run))
+    facts = re.search(r'<section class="facts">.*?</section>', text, re.DOTALL)
+    assert facts is not None
+    assert text.index("</section>", text.index('id="verdict"')) < facts.start()
+    assert facts.end() < text.index('id="at-a-glance"')
+    return re.sub(r"<[^>]+>", "", facts[0])
+
+
+@pytest.mark.parametrize("level", LEVEL_TEXTS)
+def test_facts_have_reference_evidence_domain_and_next_step(level: str, tmp_path: Path) -> None:
+    run = judged(tmp_path / "run", level)
+    facts = facts_of(run)
+    assert "position 0.40 m instead of 12 m; heading 0.57 deg instead of 12 deg" in facts
+    assert "free runs of 30 s on 6 test logs: turning (3) and zigzag (3)" in facts
+    assert "mean speeds 0.90 to 1.1 m/s" in facts
+    assert re.search(r"Operating domain.*u .* to .* m/s.*errors outside are unknown", facts)
+    assert "First fix this: zigzag_01: a gap" in facts
+    (run / "doctor.json").unlink()
+    facts = facts_of(run)
+    assert NEXT_STEPS[level] in facts
+    is_exported = "residnet export RUN --format c" in facts
+    assert is_exported == (level != "do not use")
+    assert ("not exported unless" in facts) == (level == "do not use")
+
+
+def test_facts_say_when_constant_velocity_is_not_beaten(tmp_path: Path) -> None:
+    run = judged(tmp_path / "run", "good")
+    content = json.loads((run / "limits.json").read_text())
+    for horizon in content["splits"]["test"]["T30"]["horizons"]:
+        horizon["models"]["constant_velocity"] |= {
+            "position": 0.3,
+            "intervals": {"position": [0.2, 0.4], "heading": [0.1, 0.3]},
+        }
+    write_json(run / "limits.json", content)
+    facts = facts_of(run)
+    assert "The model is not shown to be better than holding the initial velocities" in facts
+    assert "position 0.40 m instead of 0.30 m (not smaller)" in facts
 
 
 def test_free_runs_of_logs_that_turn_to_one_side_make_no_good_model(tmp_path: Path) -> None:
@@ -330,8 +379,8 @@ def test_what_doctor_sanity_refit_and_currents_found_is_shown(run: Path) -> None
     assert "of other logs" in text
     loud = {one.code for report in reports for one in report.findings if one.level != "note"}
     assert "gaps" in loud
-    assert '<a href="#data-doctor">Data doctor</a>' in text
-    page = part(text, "data-doctor")
+    assert '<a href="#data-checks">Data checks</a>' in text
+    page = part(text, "data-checks")
     for code in loud:
         assert f'<th class="label"><div>{code.replace("_", " ")}</div></th>' in page
     assert "split the log there (mask kind: gap)" in page

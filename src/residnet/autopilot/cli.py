@@ -19,34 +19,48 @@ def autopilot(
         list[str],
         typer.Argument(
             metavar="RUN|LOGS...|K,T",
-            help="A finished fit, logs with turns, or K in 1/s and T in s, such as 0.31,7.4.",
+            help="Folder of a finished fit; logs with turns to both sides; or K in 1/s and T in s,"
+            " such as 0.31,7.4.",
         ),
     ],
     output_file: Annotated[
-        Path, typer.Option("--out", metavar="CONFIG", help="Config to write, and the run's name.")
+        Path,
+        typer.Option(
+            "--out", metavar="CONFIG", help="Config to write; its name is the name of the run."
+        ),
     ] = Path("my_autopilot.yaml"),
     rudder: Annotated[
         str | None,
-        typer.Option(help="Largest rudder angle; that of the logs, or 20 deg, if not given."),
+        typer.Option(
+            metavar="RUDDER", help="Largest rudder angle; default: from the logs, else 20 deg."
+        ),
     ] = None,
     rate: Annotated[
-        str | None, typer.Option(help="Rate of the steering gear; from the logs if not given.")
+        str | None,
+        typer.Option(
+            metavar="RATE", help="Rate limit of the steering gear; default: from the logs."
+        ),
     ] = None,
-    speed: Annotated[str | None, typer.Option(help="Speed at which K and T hold.")] = None,
+    speed: Annotated[
+        str | None, typer.Option(metavar="SPEED", help="Speed for which K and T are valid.")
+    ] = None,
     classical: Annotated[
         bool,
         typer.Option(
-            "--classical", help="Tune a classical law and train no policy; takes a minute at most."
+            "--classical",
+            help="Tune a classical law only, without a learned policy (at most a minute).",
         ),
     ] = False,
-    draft: Annotated[bool, typer.Option("--draft", help="Write the config alone.")] = False,
+    draft: Annotated[
+        bool, typer.Option("--draft", help="Write the vessel file and the config, without a run.")
+    ] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace earlier files and an earlier run.")
+        bool, typer.Option("--overwrite", help="Replace existing files and an earlier run.")
     ] = False,
     trust: TrustOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Train a heading autopilot for your vessel under the conditions that its logs show."""
+    """Train and compare heading autopilots for your vessel."""
     from residnet.autopilot.tasks.design import draft_autopilot_config
     from residnet.tasks.registry import load_task
 

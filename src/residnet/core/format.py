@@ -117,6 +117,17 @@ def format_interval(bounds: Sequence[float] | None, factor: float = 1.0, digits:
     return f"{lower} to {upper}"
 
 
+def format_range(lower: float, upper: float, digits: int = 3) -> str:
+    """Format the limits of a range with the decimals of the limit of larger magnitude."""
+    largest = max(abs(lower), abs(upper))
+    if not math.isfinite(largest) or largest == 0.0:
+        return f"{format_number(lower, digits)} to {format_number(upper, digits)}"
+    decimals = max(digits - 1 - math.floor(math.log10(largest)), 0)
+    # the sum removes the sign of a rounded zero
+    limits = (format_fixed(round(limit, decimals) + 0.0, decimals) for limit in (lower, upper))
+    return " to ".join(limits)
+
+
 def join_list(texts: Sequence[str]) -> str:
     """Join texts as `a, b and c`."""
     return " and ".join(filter(None, (", ".join(texts[:-1]), *texts[-1:])))

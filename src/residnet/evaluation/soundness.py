@@ -347,11 +347,11 @@ def check_damping(
     typical_sizes = np.quantile(np.abs(damping_slopes), 0.9, axis=0)
     wrong_signs = [
         f"d({name}_dot)/d{name} {median_slopes[i]:+.2g} 1/s, positive at"
-        f" {(damping_slopes[:, i] > 0).mean():.0%} of it"
+        f" {100.0 * (damping_slopes[:, i] > 0).mean():.0f} %"
         for i, name in enumerate(dof.velocities)
         if median_slopes[i] > _NEGLIGIBLE_SLOPE_SHARE * typical_sizes[i]
     ]
-    fault = f"its damping has the wrong sign in most of the data ({'; '.join(wrong_signs)})"
+    fault = f"its damping has the wrong sign at most recorded states ({'; '.join(wrong_signs)})"
     medians_text = ", ".join(
         f"d({name}_dot)/d{name} {median_slopes[i]:+.3g}" for i, name in enumerate(dof.velocities)
     )
@@ -731,7 +731,7 @@ def check_boundedness(
         text = (
             f"{n_recorded} runs of {_LONG_RUN_DURATION:.0f} s or longer from recorded states, and"
             f" {len(corners)}"
-            " from rest with inputs held at their extremes, stay bounded"
+            " from zero speed with inputs at their limits, are bounded"
         )
         return _to_sanity_finding(spec, BOUNDEDNESS, True, text, "")
     if first_diverged < n_recorded:

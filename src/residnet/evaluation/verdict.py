@@ -474,8 +474,8 @@ def describe_main_horizon(evidence: VerdictEvidence, main: ProtocolHorizon) -> l
         return [
             errors_text,
             f"Too few {evidence.data_name} for a rating: {format_count(row.windows, 'free run')}"
-            f" of {format_count(row.logs, 'log')}, at least {_MIN_WINDOWS} of"
-            f" {MIN_LOGS_FOR_INTERVAL} logs are needed.",
+            f" of {format_count(row.logs, 'log')}. A rating needs at least {_MIN_WINDOWS} free runs"
+            f" of {MIN_LOGS_FOR_INTERVAL} logs.",
         ]
     shorter_text = _describe_shorter_horizons(evidence, row)
     if level == DO_NOT_USE:

@@ -125,8 +125,8 @@ class OnnxExporter(Exporter):
                     pairs = zip(batch_results, row_results, strict=True)
                     if not all(np.allclose(*pair, rtol=1e-5, atol=1e-5) for pair in pairs):
                         raise ExportError(
-                            f"{exported.label}: the ONNX file gives other answers for several rows"
-                            " at once than for each alone"
+                            f"{exported.label}: the ONNX file has other results for several rows"
+                            " than for single rows"
                         )
                     return exported.check_parity(loaded, "the ONNX file", dtype, _TOLERANCES[dtype])
                 except RoundingError as error:

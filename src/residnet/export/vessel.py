@@ -55,8 +55,8 @@ _BAD_INPUT_RULES = (
     " is true"
 )
 _WAVE_LOADS_TEXT = (
-    "none: the model has no input for wave loads and computes none; it is the mean of the logs,"
-    " whatever their waves"
+    "none: the model has no input for wave loads and computes none; it has the mean"
+    " motion of the logs, with or without waves"
 )
 _BAND_TEXT = (
     "half widths of the {:.3g} % prediction intervals of a free run for each channel, by number of"

@@ -330,7 +330,7 @@ def summarize_inspection(inspection: InspectionFile) -> InspectionSummary:
     if not findings_by_code:
         logs_text = "the log" if n_logs == 1 else f"the {n_logs} logs"
         return InspectionSummary(
-            n_logs, 0, tally=f"Data doctor: nothing in {logs_text} would mislead a fit."
+            n_logs, 0, tally=f"Data checks: nothing in {logs_text} would mislead a fit."
         )
     logs_by_code = {
         code: {name for name, _ in code_findings}
@@ -363,7 +363,7 @@ def summarize_inspection(inspection: InspectionFile) -> InspectionSummary:
     # a finding about the set of logs belongs to no single log
     subject_text = count_text if n_logs_with_problems else "the logs as a set have"
     tally = (
-        f"Data doctor: {subject_text} faults that would mislead a fit:"
+        f"Data checks: {subject_text} faults that would mislead a fit:"
         f" {', '.join(kind_texts)}{omitted_text}."
     )
     name, first_finding = max(

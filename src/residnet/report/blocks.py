@@ -376,6 +376,12 @@ class Section:
         return [block for block in self.blocks if block is not None]
 
     @property
+    def is_facts(self) -> bool:
+        """Return whether the section has a list of facts only, in the full width of the page."""
+        blocks = self.present_blocks
+        return len(blocks) == 1 and isinstance(blocks[0], Facts)
+
+    @property
     def is_side_by_side(self) -> bool:
         """Return whether the blocks are laid out in two columns."""
         tables = [block for block in self.present_blocks if isinstance(block, Table)]

@@ -10,7 +10,16 @@ from residnet.report.blocks import Section
 from residnet.report.figure import Figure
 from residnet.report.figure_files import read_figures, write_figures
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections import data, derivatives, free_runs, manoeuvres, models, runs, verdict
+from residnet.report.sections import (
+    at_a_glance,
+    data,
+    derivatives,
+    free_runs,
+    manoeuvres,
+    models,
+    runs,
+    verdict,
+)
 
 
 def _iterate_fit_sections(run: RunFiles) -> Iterator[Section | None]:
@@ -20,6 +29,7 @@ def _iterate_fit_sections(run: RunFiles) -> Iterator[Section | None]:
     not collapsed.
     """
     folder = run.path / "figures"
+    yield at_a_glance.facts_section(run)
     yield verdict.opening_section(run, read_figures(folder, "track"))
     yield verdict.cautions_section(run)
     yield _figures_section("Error against horizon", folder, "horizon")

@@ -14,7 +14,7 @@ import numpy as np
 from residnet.core.config import load_mapping
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import make_file_stem, read_table
-from residnet.core.format import DISPLAY_UNITS, DisplayUnit, display_unit
+from residnet.core.format import DISPLAY_UNITS, DisplayUnit, display_unit, format_range
 from residnet.core.frames import wrap_angle_array
 from residnet.core.layout import SIX_DOF_LAYOUT, SURGE_SWAY_YAW, DegreesOfFreedom
 from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY, PLANT
@@ -577,6 +577,23 @@ class RunFiles:
         """Return the description of a model (model.json); defaults if the file does not exist."""
         name = f"models/{model}/model.json"
         return parse_settings(self.read_json(name), ModelSettings, self.path / name)
+
+    def describe_training_ranges(self, model: str) -> list[str]:
+        """Return the training range of each velocity and input of a model with its unit.
+
+        Empty if the folder does not hold the model.
+        """
+        settings = self.model_settings(model)
+        names = [*self.dof.dynamic_states, *settings.signals.inputs, *settings.signals.exogenous]
+        texts = []
+        for name, lower, upper in zip(names, settings.low, settings.high, strict=False):
+            if name in self.dof.fixed_states:
+                continue
+            unit, factor = self.display_unit(name)
+            text = f"{name} {format_range(factor * lower, factor * upper)}"
+            # dimensionless channels have the unit "-"
+            texts.append(text if unit == "-" else f"{text} {unit}")
+        return texts
 
     def fit_notes(self, model: str) -> FitNotes | None:
         """Return the notes on the fit of a model (fit.json); None if the file does not exist."""

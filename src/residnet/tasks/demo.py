@@ -151,7 +151,7 @@ def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
     return [
         f"{len(logs)} logs of a simulated boat in wind, {seconds / 60.0:.0f} minutes, as",
         *(f"{folder}/{name}: {description}" for name, (description, _) in LAYOUTS.items()),
-        "their faults: positions 0.3 s late, a rudder that stands 2 degrees off, gaps, noise",
+        "their faults: positions 0.3 s late, a rudder offset of 2 degrees, gaps, noise",
         basin_line,
         f"next: residnet new {folder}/two_files",
     ]

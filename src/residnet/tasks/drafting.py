@@ -597,8 +597,8 @@ class _DraftLogs:
     def header_lines(self) -> list[str]:
         """Return the comment lines at the top of the config."""
         lines = [
-            "Drafted by `residnet new` from the logs alone. Lines with 'guess' say what the logs do"
-            " not tell, and why this value was taken: read them before the results are trusted."
+            "Drafted by `residnet new`. Lines with 'guess' mark values that the logs do not"
+            " determine, with the reason of each value: check them before you use the results."
         ]
         labels = label_files(self.exclusion_reasons)
         lines += [
@@ -607,15 +607,14 @@ class _DraftLogs:
         if derived_channels := next(iter(self.complete_logs.values())).meta.get("smoothed"):
             lines.append(
                 f"{', '.join(derived_channels)} are not measured at every sample: a smoother"
-                f" makes them from"
-                " position and heading. Where the antenna stands off the vessel's centre, or its"
-                " positions come late, add prepare.motion: {antenna: {x: ..., y: ...}, delay: ...}."
+                " estimates them from position and heading. If the antenna is not at the origin of"
+                " the vessel, or its positions have a delay, add"
+                " prepare.motion: {antenna: {x: ..., y: ...}, delay: ...}."
             )
         if derived_channels := next(iter(self.complete_logs.values())).meta.get("integrated"):
             lines.append(
                 f"{', '.join(derived_channels)} are not measured: they are integrated from the"
-                f" velocities, and"
-                " errors of position and heading are those of integrated velocities."
+                " velocities, and so are the errors of position and heading."
             )
         logs_text = "1 log was" if len(self.logs) == 1 else f"{len(self.logs)} logs were"
         log_message(f"{logs_text} read, {len(self.exclusion_reasons)} left out")

@@ -304,9 +304,7 @@ def sections(run: RunFiles) -> list[Section]:
         if spread_rows:
             blocks.append(Section("Spread of vessels and currents", [spread_table(spread_rows)]))
         sections_written.append(Section(f"Protocol {protocol}", blocks))
-    sections_written.append(
-        Section("What the numbers mean", [Text(_course_definitions(metrics, settings))])
-    )
+    sections_written.append(Section("Definitions", [Text(_course_definitions(metrics, settings))]))
     return [*sections_written, *figures_section(run.path / "figures")]
 
 

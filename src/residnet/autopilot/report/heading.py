@@ -749,14 +749,13 @@ def _conditions_text(evaluation: EvaluationConditions) -> list[str]:
     texts = [
         f"{evaluation.flights} changes of {axis_labels.value} of {lower:.3g} to {upper:.3g}"
         f" {axis_labels.unit},"
-        " which no tuning or training has seen, the same for all controllers. The vessel's K lies"
-        f" within {conditions.effect[0]:g} to {conditions.effect[1]:g} and its T within"
-        f" {conditions.time[0]:g} to {conditions.time[1]:g} of the nominal one; commands"
-        " arrive"
-        f" {conditions.delay[0]:g} to {conditions.delay[1]:g} s late; the"
-        f" {axis_labels.rudder} has a bias of"
-        f" up to {math.degrees(conditions.bias):.3g} deg and a slow push of"
-        f" {math.degrees(conditions.push):.3g} deg; the noise is {noise} and"
+        " which were not used for tuning or training, the same for all controllers. K is"
+        f" {conditions.effect[0]:g} to {conditions.effect[1]:g} times and T"
+        f" {conditions.time[0]:g} to {conditions.time[1]:g} times the nominal value; commands have"
+        f" a delay of {conditions.delay[0]:g} to {conditions.delay[1]:g} s; the"
+        f" {axis_labels.rudder} has a bias of up to {math.degrees(conditions.bias):.3g} deg and a"
+        f" slowly varying disturbance of {math.degrees(conditions.push):.3g} deg; the noise is"
+        f" {noise} and"
         f" {math.degrees(conditions.noise_r):.3g} deg/s on the {axis_labels.rate}.",
         f"Cost: the integral of |e| / (|e| + {band:.3g} {axis_labels.unit}) over"
         f" {conditions.duration:g} s from the change on, plus"
@@ -766,7 +765,7 @@ def _conditions_text(evaluation: EvaluationConditions) -> list[str]:
         f" of {axis_labels.rudder} travel. Swing: largest movement, peak to"
         f" peak, from {settled_time(conditions.duration):.3g} s after a change on in flights"
         " without"
-        " noise and slow push. Classical controllers are tuned by the same cost, by differential"
+        " noise and disturbance. Classical controllers are tuned by the same cost, by differential"
         " evolution.",
     ]
     if conditions.wind or conditions.current:

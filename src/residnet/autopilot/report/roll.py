@@ -226,7 +226,7 @@ def sections(run: RunFiles) -> list[Section]:
         Section("", [*previews, total_table(metrics)]),
         Section("By sea state and direction of the waves", [sea_table(metrics)]),
         Section("All controllers", [*controller_tables(metrics)], is_folded=True),
-        Section("What the numbers mean", [Text(_definitions(metrics))]),
+        Section("Definitions", [Text(_definitions(metrics))]),
         *figures_section(run.path / "figures"),
     ]
 

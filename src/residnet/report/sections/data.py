@@ -217,18 +217,9 @@ def _model_facts(run: RunFiles) -> dict[str, str]:
     model = run.model_settings(run.baseline or "baseline")
     if model.dt is None:
         return {}
-    names = [*run.dof.dynamic_states, *model.signals.inputs, *model.signals.exogenous]
-    ranges = []
-    for name, lower, upper in zip(names, model.low, model.high, strict=False):
-        if name in run.dof.fixed_states:
-            continue
-        unit, factor = run.display_unit(name)
-        range_text = f"{name} {format_number(factor * lower)} to {format_number(factor * upper)}"
-        # dimensionless channels have the unit "-"
-        ranges.append(range_text if unit == "-" else f"{range_text} {unit}")
     return {
         "model step": f"{model.dt:g} s, {model.integrator}; inputs held over a step",
-        "training range": "; ".join(ranges),
+        "training range": "; ".join(run.describe_training_ranges(run.baseline or "baseline")),
     }
 
 
@@ -375,4 +366,4 @@ def quality_section(run: RunFiles) -> Section | None:
     if notes:
         by_log = [Section(name, [Bullets(texts)]) for name, texts in notes.items()]
         blocks.append(Section("Notes, log by log", by_log, is_folded=True))
-    return Section("Data doctor", blocks)
+    return Section("Data checks", blocks)

@@ -222,12 +222,13 @@ def track_figure(run: RunFiles, windows: Sequence[StoredWindow]) -> Figure | Non
     window = ranked_windows[position]
     if position == middle:
         caption = (
-            f"Median of {len(ranked_windows)} free runs on {run.report_data_name}: {window.log}."
+            f"Free run with the median error of {len(ranked_windows)} on {run.report_data_name}:"
+            f" {window.log}."
         )
     else:
         caption = (
-            f"The unsteady run nearest to the median of {len(ranked_windows)} free runs on"
-            f" {run.report_data_name}: {window.log}, error rank {position + 1}."
+            f"Unsteady free run with the error closest to the median of {len(ranked_windows)} free"
+            f" runs on {run.report_data_name}: {window.log} (rank {position + 1})."
         )
     visible_names = {"measured", "start", run.main_model, run.baseline}
     styles = {"measured": MEASURED_STYLE, **model_styles(run), "start": START_STYLE}

@@ -69,8 +69,8 @@ _HORIZON_LEVELS = {
 }
 """Labels of the levels in the narrow table of horizons."""
 _NO_POSE_TEXT = (
-    "The logs hold no {}: judge the model by its velocities, for errors of position and heading are"
-    " those of integrated velocities."
+    "The logs have no {}: use the velocity errors, because position and heading were integrated"
+    " from the velocities."
 )
 
 
@@ -261,6 +261,10 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         ""
         if run.report_split in UNSEEN_SPLITS and not run.logs_of_fit[0]
         else "These data are not unseen: read with care.",
+        "Predictor: the model that is rated and exported by default. Selected: the best single"
+        " model."
+        if run.predictor != run.selected
+        else "",
         "constant_velocity: the initial velocities are held." if CONSTANT_VELOCITY in rows else "",
         "Noise floor: the error of the integrated measured velocities."
         if any(line.model is None for line in lines)
