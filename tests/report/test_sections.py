@@ -472,10 +472,11 @@ def test_one_seed_has_no_spread_and_the_reference_no_difference(tmp_path: Path) 
     rows = [row.model_copy(update={"seconds": 10.0}) for row in found]
     assert rows[1].nrmse_sd is None
     recipe, other = tabulate_variants(rows, "recipe").rows
-    assert [cell.text for cell in recipe.cells[:4]] == [f"{rows[0].nrmse_mean:.4f}", "–", "", ""]
+    assert [cell.text for cell in recipe.cells[:2]] == [f"{rows[0].nrmse_mean:.4f}", ""]
     assert rows[1].difference_ci95 is not None
     low, high = rows[1].difference_ci95
-    assert (other.cells[3].text, other.cells[3].mark) == (f"+{low:.4f} to +{high:.4f}", "best")
+    assert (other.cells[1].note, other.cells[1].mark) == (f"+{low:.4f} to +{high:.4f}", "best")
+    assert other.cells[1].text == f"+{rows[1].difference:.4f}"
     figure = plot_differences(rows, "recipe")
     assert figure.cases[0].curves[0]["difference"][0].tolist() == [rows[1].difference]
     run = made_run(tmp_path / "made")

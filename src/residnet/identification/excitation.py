@@ -109,7 +109,7 @@ def _assess_input(
     elif is_closed_loop and feedback is not None:
         text = (
             f"{name} was set by feedback from {feedback.source}, which explains"
-            f" {100 * feedback.share:.0f} % of what its effects do not"
+            f" {100 * feedback.share:.0f} % of its variance beyond the velocities"
         )
     elif is_collinear:
         text = (

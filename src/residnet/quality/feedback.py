@@ -304,8 +304,8 @@ def check_feedback(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
             continue
         text = (
             f"{feedback.name} follows {feedback.source}: feedback explains"
-            f" {100.0 * feedback.share:.0f} % of what its effects do not explain, so that its"
-            " effect cannot be identified from these logs"
+            f" {100.0 * feedback.share:.0f} % of the variance that the velocities do not explain,"
+            " so that its effect cannot be identified from these logs"
         )
         yield make_finding(text, {"share": feedback.share, "effects": feedback.effect_share})
 

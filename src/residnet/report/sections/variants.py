@@ -38,18 +38,22 @@ def variant_sections(files: RunFiles) -> list[Section]:
     """Return the sections of the report, and draw the figure."""
     comparison = VariantsFile.read(files.path / VARIANTS_FILE)
     rows = comparison.rows
-    figure_blocks = write_figures(
-        files.path / "figures", [plot_differences(rows, comparison.reference)]
+    figure = plot_differences(rows, comparison.reference)
+    figure_blocks = write_figures(files.path / "figures", [figure])
+    explanation = (
+        f"NRMSE of the free runs of {comparison.model} on {comparison.split} data, mean over the"
+        f" windows and {format_count(rows[0].seeds, 'seed')}; SD: standard deviation over seeds."
+        f" Difference: to {comparison.reference} over the same windows, after the mean over seeds;"
+        " negative is better, bold is significant (95 % confidence interval from blocks of"
+        " windows)."
     )
-    explanation = [
-        f"Free-run NRMSE of model {comparison.model} on {comparison.split} data, mean over the"
-        f" windows and {format_count(rows[0].seeds, 'seed')}.",
-        f"Difference: from {comparison.reference} over the same windows, seeds averaged first;"
-        " negative is better, and a bold interval excludes 0. The 95 % confidence intervals come"
-        " from blocks of windows.",
-    ]
     table = tabulate_variants(rows, comparison.reference)
-    return [Section("", [table, *figure_blocks, Text(explanation, is_secondary=True)])]
+    return [
+        # the first picture of a page needs no JavaScript
+        Section("", [figure.preview(), table, Text(explanation, is_secondary=True)]),
+        Section("Differences", figure_blocks),
+        Section("Definition of the variants", [tabulate_overrides(rows)]),
+    ]
 
 
 def plot_differences(rows: Sequence[VariantRow], reference: str) -> Figure:
@@ -85,7 +89,7 @@ def plot_differences(rows: Sequence[VariantRow], reference: str) -> Figure:
         panel_curves.append(
             {"interval": interval_lines, "difference": points, "zero": (np.zeros(1), np.zeros(1))}
         )
-        label = f"{protocol}: NRMSE minus that of {reference} [-]"
+        label = f"{protocol}: NRMSE, difference to {reference} [-]"
         panels.append(
             Panel(
                 "",
@@ -98,9 +102,9 @@ def plot_differences(rows: Sequence[VariantRow], reference: str) -> Figure:
         )
     return Figure(
         "variants",
-        "Variants of the recipe",
-        f"Free-run error of each variant minus that of {reference}, mean over windows and seeds."
-        " The bars are 95 % confidence intervals over logs.",
+        "Differences between variants",
+        f"NRMSE of each variant minus NRMSE of {reference}, mean over windows and seeds. The bars"
+        " are 95 % confidence intervals over logs.",
         {
             "zero": GlyphStyle("", "#666666", width=0.8, kind="vline", z_order=1),
             "interval": GlyphStyle("95 % confidence interval", width=1.2),
@@ -124,36 +128,47 @@ def tabulate_variants(rows: Sequence[VariantRow], reference: str) -> Table:
     protocols = list(dict.fromkeys(row.protocol for row in rows))
 
     def format_error(row: VariantRow) -> Cell:
-        n_diverged = row.diverged
-        note = f"{n_diverged} diverged" if n_diverged else ""
+        notes = [] if row.nrmse_sd is None else [f"SD {row.nrmse_sd:.4f}"]
+        notes += [f"{row.diverged} diverged"] if row.diverged else []
         protocol_rows = [other for other in rows if other.protocol == row.protocol]
         is_lowest = row.nrmse_mean == min(other.nrmse_mean for other in protocol_rows)
         return Cell(
-            f"{row.nrmse_mean:.4f}", note, "bad" if n_diverged else "best" if is_lowest else ""
+            f"{row.nrmse_mean:.4f}",
+            ", ".join(notes),
+            "bad" if row.diverged else "best" if is_lowest else "",
         )
+
+    def format_difference(row: VariantRow) -> Cell:
+        interval = format_paired_interval(row.difference_ci95, "")
+        text = format_signed(row.difference) if row.difference_ci95 else ""
+        return Cell(text, interval.text, interval.mark)
 
     protocol_columns: list[Column[VariantRow]] = [
         ("NRMSE", format_error),
-        ("sd of seeds", lambda row: row.nrmse_sd, 4),
-        (
-            "difference",
-            lambda row: format_signed(row.difference) if row.difference_ci95 else "",
-            str,
-        ),
-        ("95 % confidence interval", lambda row: format_paired_interval(row.difference_ci95, "")),
+        ("difference", format_difference),
     ]
     return build_table(
         by_variant.values(),
         [
             ("variant", lambda row: row[protocols[0]].variant),
             *(
-                (title, lambda row, name=name, of=cell_function: of(row[name]), *number_format)
+                (title, lambda row, name=name, of=cell_function: of(row[name]))
                 for name in protocols
-                for title, cell_function, *number_format in protocol_columns
+                for title, cell_function in protocol_columns
             ),
             ("run [s]", lambda row: row[protocols[0]].seconds, 0),
-            ("what changes", lambda row: ", ".join(row[protocols[0]].overrides)),
         ],
-        groups=[*((f"protocol {name}", len(protocol_columns)) for name in protocols), ("", 2)],
+        groups=[*((f"protocol {name}", len(protocol_columns)) for name in protocols), ("", 1)],
         is_selected=lambda row: row[protocols[0]].variant == reference,
+    )
+
+
+def tabulate_overrides(rows: Sequence[VariantRow]) -> Table:
+    """Return the table of the overrides of config keys that define each variant."""
+    return build_table(
+        {row.variant: row for row in rows}.values(),
+        [
+            ("variant", lambda row: row.variant),
+            ("overrides", lambda row: ", ".join(row.overrides) or "none"),
+        ],
     )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from residnet.core.errors import DataError
+from residnet.core.format import format_signed
 from residnet.core.processes import process_pool
 from residnet.core.progress import report_progress
 from residnet.core.run_records import ProvenanceFile
@@ -97,23 +98,23 @@ def _summarize_variants(rows: Sequence[VariantRow], reference: str) -> list[str]
         protocol_rows = [row for row in rows if row.protocol == protocol]
         # diverged runs have the constant-velocity error: variants without them are ranked first
         best_row = min(protocol_rows, key=lambda row: (row.diverged > 0, row.nrmse_mean))
-        qualifier = " of the steady ones" if any(row.diverged for row in protocol_rows) else ""
+        is_any_diverged = any(row.diverged for row in protocol_rows)
+        qualifier = " of the variants without divergence" if is_any_diverged else ""
         sentence = (
-            f"{protocol}: '{best_row.variant}' has the least free-run NRMSE{qualifier},"
+            f"{protocol}: '{best_row.variant}' has the smallest free-run NRMSE{qualifier},"
             f" {best_row.nrmse_mean:.4f}"
         )
         if best_row.diverged:
             sentence = (
-                f"{protocol}: EVERY VARIANT DIVERGED in some windows; of the errors, which count"
-                f" those windows as constant velocity does, that of '{best_row.variant}' is"
-                f" the least,"
+                f"{protocol}: every variant DIVERGED in some windows, which count with the error of"
+                f" constant velocity; '{best_row.variant}' has the smallest NRMSE,"
                 f" {best_row.nrmse_mean:.4f}"
             )
         interval = best_row.difference_ci95
         if best_row.variant != reference and interval is not None:
             sentence += (
-                f"; that is {best_row.difference:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]"
-                f" from '{reference}'"
+                f"; difference to '{reference}' {format_signed(best_row.difference)} (95 %"
+                f" confidence interval {format_signed(interval[0])} to {format_signed(interval[1])})"
             )
         sentences.append(f"{sentence}.")
         diverged_rows = [row for row in protocol_rows if row.diverged]
