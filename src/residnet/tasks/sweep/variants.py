@@ -112,9 +112,10 @@ def _summarize_variants(rows: Sequence[VariantRow], reference: str) -> list[str]
             )
         interval = best_row.difference_ci95
         if best_row.variant != reference and interval is not None:
+            limits = " to ".join(map(format_signed, interval))
             sentence += (
                 f"; difference to '{reference}' {format_signed(best_row.difference)} (95 %"
-                f" confidence interval {format_signed(interval[0])} to {format_signed(interval[1])})"
+                f" confidence interval {limits})"
             )
         sentences.append(f"{sentence}.")
         diverged_rows = [row for row in protocol_rows if row.diverged]
