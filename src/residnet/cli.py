@@ -254,7 +254,8 @@ def new(
     """Draft a config for `residnet run` from logs.
 
     The draft has channels, units, frames, inputs, splits, protocols and models. In a terminal, the
-    command asks what the logs do not answer; otherwise it uses a default and marks it as a guess.
+    command asks for values that the logs do not determine; otherwise it uses a default and marks it
+    as a guess.
     """
     from residnet.io.drafting.questions import READER_KEY
     from residnet.tasks.drafting import STOP, write_new_config

@@ -38,8 +38,8 @@ _MAX_KINDS = 5
 def facts_section(run: RunFiles) -> Section | None:
     """Return the facts between the verdict and the picture; None without free runs.
 
-    They answer whether the model is better than no model, what it was evaluated on, where it is
-    valid, what to do next, and which file a controller loads.
+    The facts are the comparison with constant velocity, the test data, the training data, the
+    operating domain, the next step, and the file for a controller.
     """
     main_model = run.main_model
     if run.find_row(main_model, run.report_split, run.main_protocol) is None:
@@ -57,7 +57,12 @@ def facts_section(run: RunFiles) -> Section | None:
 
 
 class _Comparison(NamedTuple):
-    """Comparison of one pose error with that of constant velocity."""
+    """Comparison of one pose error with the error of constant velocity.
+
+    Attributes:
+        text: both errors with a remark.
+        is_better: whether the error is smaller, and significantly so.
+    """
 
     text: str
     is_better: bool
@@ -85,6 +90,7 @@ def _compare_with_constant_velocity(evidence: VerdictEvidence) -> str:
 def _compare_error(
     evidence: VerdictEvidence, row: HorizonRow, error_name: str, reference_error: float
 ) -> _Comparison:
+    """Compare a pose error of the model at a horizon with the error of constant velocity."""
     model_errors = row.models[evidence.selected]
     error = model_errors.by_name[error_name]
     is_better = is_better_than_constant_velocity(evidence, row, error_name)

@@ -343,7 +343,7 @@ def _build_horizon_table(run: RunFiles) -> Table | None:
 
 
 def cautions_section(run: RunFiles) -> Section | None:
-    """Return the objections to using the main model; None if there are none."""
+    """Return the objections to the use of the main model; None without objections."""
     sentences = []
     main_model = run.predictor
     for protocol in run.protocols:
