@@ -49,7 +49,7 @@ def facts_section(run: RunFiles) -> Section | None:
         ("Constant velocity", _compare_with_constant_velocity(evidence)),
         ("Evaluated on", _describe_evaluation_data(run)),
         ("Fitted to", _describe_training_data(run)),
-        ("Operating domain", _describe_operating_domain(run)),
+        ("Operating domain", _describe_operating_domain(run, evidence)),
         ("Next step", _recommend_next_step(run, evidence)),
         ("For a controller", _describe_export(run, evidence)),
     ]
@@ -153,10 +153,16 @@ def _describe_training_data(run: RunFiles) -> str:
     return f"{format_count(len(logs), 'training log')}, {duration}{selection}."
 
 
-def _describe_operating_domain(run: RunFiles) -> str:
-    """Return the training range of each velocity and input; empty if it is unknown."""
+def _describe_operating_domain(run: RunFiles, evidence: VerdictEvidence) -> str:
+    """Return the training range of each velocity and input, and relations of the inputs.
+
+    Empty if the ranges are unknown.
+    """
     ranges = run.describe_training_ranges(run.main_model)
-    return f"{', '.join(ranges)}; errors outside are unknown." if ranges else ""
+    relations = () if evidence.excitation is None else evidence.excitation.domain
+    # the report has the complete sentences among the reasons
+    facts = [", ".join(ranges), *(sentence.partition(":")[0] for sentence in relations)]
+    return f"{'; '.join(facts)}; errors outside are unknown." if ranges else ""
 
 
 def _recommend_next_step(run: RunFiles, evidence: VerdictEvidence) -> str:
