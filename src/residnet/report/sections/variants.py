@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from residnet.core.format import format_count, format_signed
 from residnet.report.blocks import (
     Cell,
-    Column,
     Section,
     Table,
     Text,
@@ -143,7 +142,7 @@ def tabulate_variants(rows: Sequence[VariantRow], reference: str) -> Table:
         text = format_signed(row.difference) if row.difference_ci95 else ""
         return Cell(text, interval.text, interval.mark)
 
-    protocol_columns: list[Column[VariantRow]] = [
+    protocol_columns: list[tuple[str, Callable[[VariantRow], Cell]]] = [
         ("NRMSE", format_error),
         ("difference", format_difference),
     ]
