@@ -489,9 +489,9 @@ def plan_trial(
         str | None, typer.Option(metavar="SPEED", help="Largest speed, such as '3 m/s'.")
     ] = None,
     rudder: Annotated[
-        float, typer.Option(help="Largest rudder command as a share of its range.")
+        float, typer.Option(metavar="RATIO", help="Largest rudder command as a share of its range.")
     ] = 1.0,
-    count: Annotated[int, typer.Option(help="Number of trials to propose.")] = 3,
+    count: Annotated[int, typer.Option(metavar="N", help="Number of trials to propose.")] = 3,
     output_folder: Annotated[
         Path | None,
         typer.Option(
@@ -589,7 +589,9 @@ def ardupilot(
             help="Servo output of a command, and the command in SI units at 1000 and 2000 us.",
         ),
     ] = None,
-    port: Annotated[int, typer.Option("--port", help="UDP port to which ArduPilot sends.")] = 9002,
+    port: Annotated[
+        int, typer.Option("--port", metavar="N", help="UDP port to which ArduPilot sends.")
+    ] = 9002,
     trust: TrustOption = False,
 ) -> None:
     """Simulate a vessel or a model for ArduPilot.
@@ -638,10 +640,16 @@ def derivatives(
         str | None, typer.Option(metavar="MASS", help="Displacement, such as '3270 kg'.")
     ] = None,
     centre_of_gravity: Annotated[
-        str, typer.Option("--xg", help="Distance of the centre of gravity ahead of the origin.")
+        str,
+        typer.Option(
+            "--xg",
+            metavar="DISTANCE",
+            help="Distance of the centre of gravity ahead of the origin.",
+        ),
     ] = "0 m",
     gyradius: Annotated[
-        float, typer.Option(help="Radius of gyration in yaw divided by the length.")
+        float,
+        typer.Option(metavar="RATIO", help="Radius of gyration in yaw divided by the length."),
     ] = 0.25,
     density: Annotated[
         str, typer.Option(metavar="DENSITY", help="Density of the water.")
@@ -654,9 +662,14 @@ def derivatives(
     ] = 1.0,
     density_ratio: Annotated[
         float,
-        typer.Option(help="Density of the water at full scale divided by the density in the logs."),
+        typer.Option(
+            metavar="RATIO",
+            help="Density of the water at full scale divided by the density in the logs.",
+        ),
     ] = 1.0,
-    order: Annotated[int, typer.Option(help="Highest order of the Taylor series, 1 to 3.")] = 1,
+    order: Annotated[
+        int, typer.Option(metavar="N", help="Highest order of the Taylor series, 1 to 3.")
+    ] = 1,
     output_file: Annotated[
         Path | None,
         typer.Option(
@@ -738,10 +751,16 @@ def scale(
     ] = None,
     density_ratio: Annotated[
         float,
-        typer.Option(help="Density of the water at full scale divided by the density in the logs."),
+        typer.Option(
+            metavar="RATIO",
+            help="Density of the water at full scale divided by the density in the logs.",
+        ),
     ] = 1.0,
     resistance: Annotated[
-        float, typer.Option(help="Resistance coefficient of the ship divided by that of the model.")
+        float,
+        typer.Option(
+            metavar="RATIO", help="Resistance coefficient of the ship divided by that of the model."
+        ),
     ] = 1.0,
     form_factor: Annotated[
         float | None,
@@ -765,10 +784,16 @@ def scale(
         typer.Option(metavar="SPEED", help="Speed of the model; needed with --form-factor."),
     ] = None,
     propeller: Annotated[
-        float, typer.Option(help="Thrust at full scale divided by the thrust by Froude's law.")
+        float,
+        typer.Option(
+            metavar="RATIO", help="Thrust at full scale divided by the thrust by Froude's law."
+        ),
     ] = 1.0,
     rudder: Annotated[
-        float, typer.Option(help="Rudder force at full scale divided by the force by Froude's law.")
+        float,
+        typer.Option(
+            metavar="RATIO", help="Rudder force at full scale divided by the force by Froude's law."
+        ),
     ] = 1.0,
     source: Annotated[
         str, typer.Option(metavar="TEXT", help="Source of the factors, stored with the run.")
