@@ -507,3 +507,10 @@ def test_numbers_have_three_digits(value: float | None, text: str) -> None:
 )
 def test_units_of_coefficients(axis: str, term: str, unit: str) -> None:
     assert term_unit(axis, term) == unit
+
+
+def test_facts_name_the_exported_file(tmp_path: Path) -> None:
+    run = judged(tmp_path / "run", "good")
+    export = {"model": "selected", "file": "exports/plsr.pt", "fault": None}
+    write_json(run / "exports.json", {"schema": "residnet.exports/1", "exports": [export]})
+    assert "exports/plsr.pt; as C source: residnet export RUN --format c." in facts_of(run)

@@ -353,6 +353,7 @@ class Task(Config):
                     files, export_errors = _write_exports(folder, outcome.exports)
                     verdict += [f"Not exported: {export_error}." for export_error in export_errors]
                     write_summary(verdict, is_finished=False)
+                    sections = self.add_exports_to_sections(folder, sections)
                     self._write_page(folder, sections, interactive_figures)
         write_summary(verdict, is_finished=True)
         write_checksums(folder.path)
@@ -362,6 +363,17 @@ class Task(Config):
             if not isinstance(export_error, WithheldError):
                 raise ExportError(f"{export_error}; the run itself is complete: {folder.report}")
         return FinishedRun(folder, outcome, files)
+
+    @classmethod
+    def add_exports_to_sections(
+        cls, run: RunFolder, sections: Sequence[Section]
+    ) -> Sequence[Section]:
+        """Return the sections of `report_sections` after the exports of a run were written.
+
+        The default returns them unchanged. A task overrides it where a section names exported
+        files, because figures are not drawn again after an export.
+        """
+        return sections
 
     @classmethod
     def write_report(cls, run: RunFolder) -> Path:

@@ -216,12 +216,15 @@ def _describe_export(run: RunFiles, evidence: VerdictEvidence) -> str:
         else ""
     )
     exports = ExportsFile.read_optional(run.path, "exports.json")
+    # an export may name the model by its role
+    names = {run.main_model, "predictor"} | (
+        {"selected"} if run.selected == run.main_model else set()
+    )
     files = [
-        row.file
+        f"`exports/{PurePosixPath(row.file).name}`"
         for row in (() if exports is None else exports.exports)
-        if row.file and row.model == run.main_model
+        if row.file and row.model in names
     ]
     if files:
-        names = join_list([f"exports/{PurePosixPath(file).name}" for file in files])
-        return f"`{names}`; in C: `residnet export RUN --format c`{single}."
+        return f"{join_list(files)}; as C source: `residnet export RUN --format c`{single}."
     return f"`residnet export RUN --format c` writes {run.main_model} as C source{single}."

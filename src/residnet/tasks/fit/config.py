@@ -146,6 +146,18 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
             sections += find_fit_study(study).sections(files)
         return sections
 
+    @classmethod
+    def add_exports_to_sections(
+        cls, run: RunFolder, sections: Sequence[Section]
+    ) -> Sequence[Section]:
+        from residnet.report.run_reader import RunFiles
+        from residnet.report.sections.at_a_glance import facts_section
+
+        facts = facts_section(RunFiles(run.path))
+        return [
+            facts if facts is not None and section.is_facts else section for section in sections
+        ]
+
     def evaluate_on_logs(
         self,
         run: RunFolder,
