@@ -265,7 +265,7 @@ def require_releasable(
     if objections and not allows_objections:
         raise WithheldError(
             f"{exported.label} is withheld: {'; '.join(objections)}; `residnet export --anyway`"
-            " writes it all the same, and its card says so"
+            " exports it, and its card lists the objections"
         )
     return exported
 

@@ -665,12 +665,12 @@ def cost_sentences(rows: Sequence[HeadingRow], vessel_text: str = "") -> list[st
         cost = row.mean_cost
         best_cost = best_row.mean_cost
         network_text = (
-            "; it has no law inside"
+            "; it contains no law"
             if switched_off is None
-            else f"; with its network switched off it costs {switched_off.mean_cost:.3f} s"
+            else f"; {switched_off.mean_cost:.3f} s with its network switched off"
         )
         sentences.append(
-            f"{conditions_text} '{name}' costs {cost:.3f} s a change,"
+            f"{conditions_text} '{name}' has a mean cost of {cost:.3f} s,"
             f" {100 * abs(cost / best_cost - 1):.1f} % {'below' if cost < best_cost else 'above'}"
             f" '{best_row.model}', the best classical law, with {best_cost:.3f} s{network_text}."
         )

@@ -468,11 +468,9 @@ def _summarize(
         summary_metrics[f"{name}_settling_nominal"] = SummaryMetric(nominal, "s")
         summary_metrics[f"{name}_settling_worst"] = SummaryMetric(slowest, "s")
         sentences.append(
-            f"'{name}' settles on a new {axis_labels.value}"
-            f" {axis_labels.scale * reference_change:.3g} {axis_labels.unit} away"
-            f" in {nominal:.2f} s on the nominal vessel, and in {slowest:.2f} s on the slowest"
-            " vessel"
-            " at the corners of the spread."
+            f"Settling time of '{name}' after a step of"
+            f" {axis_labels.scale * reference_change:.3g} {axis_labels.unit}: {nominal:.2f} s on the"
+            f" nominal vessel, {slowest:.2f} s on the slowest vessel at the corners of the spread."
         )
     if (scope := _describe_linear_scope(config)) and config.policies:
         sentences.append(scope)
