@@ -123,7 +123,7 @@ _LEARNED_KINDS = ("policy", "network")
 """Kinds of controllers with a trained network."""
 _KIND_LABELS = {
     "policy": "learned",
-    "network": "learned, no law inside",
+    "network": "learned, without a law",
     "constants": "law, constants trained",
     "law": "classical law, exported",
     "untrained": "policy before training",

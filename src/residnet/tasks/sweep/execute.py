@@ -354,8 +354,8 @@ def _write_results(config: SweepConfig, study: optuna.Study, folder: RunFolder) 
         f"Trial {best_row.number} of {len(rows)} is the best:"
         f" {config.objective.description.removesuffix(' [-]')} {best_value:.5g}, with"
         f" {', '.join(f'{key} = {format_value(value)}' for key, value in key_values)}.",
-        f"Its run folder is {_trial_folder_path(Path(), best_row.number)}; {BEST_CONFIG_FILE} is its"
-        " config.",
+        f"Its run folder is {_trial_folder_path(Path(), best_row.number)}; {BEST_CONFIG_FILE} is"
+        " its config.",
     ]
     if by_state["ended early"]:
         verdict.append(f"Ended early: {format_count(len(by_state['ended early']), 'trial')}.")
