@@ -470,7 +470,8 @@ def _summarize(
         sentences.append(
             f"Settling time of '{name}' after a step of"
             f" {axis_labels.scale * reference_change:.3g} {axis_labels.unit}: {nominal:.2f} s on"
-            f" the nominal vessel, {slowest:.2f} s on the slowest vessel at the corners of the spread."
+            f" the nominal vessel, {slowest:.2f} s on the slowest vessel at the corners of the"
+            " spread."
         )
     if (scope := _describe_linear_scope(config)) and config.policies:
         sentences.append(scope)
