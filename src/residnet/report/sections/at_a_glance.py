@@ -13,16 +13,13 @@ from residnet.evaluation.records import HorizonRow
 from residnet.evaluation.verdict import (
     DO_NOT_USE,
     GOOD_LEVEL,
-    LIMITED_LEVEL,
     TOO_FEW_WINDOWS,
     VerdictEvidence,
     contradicts_positions,
     format_pose_error,
     is_better_than_constant_velocity,
-    known_horizons,
     list_unidentifiable_inputs,
     main_horizon,
-    rate_horizon,
     rate_model,
 )
 from residnet.quality import summarize_inspection
@@ -190,18 +187,15 @@ def _recommend_next_step(run: RunFiles, evidence: VerdictEvidence) -> str:
         )
     if level == GOOD_LEVEL:
         return "Export the model, and test your controller with it in simulation."
-    shorter_horizons = [
-        f"{horizon.row.seconds:.4g} s ({horizon_level})"
-        for horizon in known_horizons(evidence)
-        if main is not None
-        and horizon.row.seconds < main.row.seconds
-        and (horizon_level := rate_horizon(evidence, horizon.row)) in (GOOD_LEVEL, LIMITED_LEVEL)
-        and (horizon_level == GOOD_LEVEL or level == DO_NOT_USE)
-    ]
-    more_logs = "Record more logs of such manoeuvres and run the fit again"
-    if shorter_horizons:
-        return f"Use predictions of at most {shorter_horizons[-1]} only. {more_logs}."
-    return f"{more_logs}; a training set of other manoeuvres may also help."
+    if level == DO_NOT_USE:
+        return (
+            "Record more logs of such manoeuvres and run the fit again; a training set of other"
+            " manoeuvres may also help."
+        )
+    return (
+        "Record more logs of such manoeuvres and run the fit again: the upper limits decrease with"
+        " the number of test logs."
+    )
 
 
 def _describe_export(run: RunFiles, evidence: VerdictEvidence) -> str:
