@@ -104,7 +104,7 @@ def sections(files: RunFiles) -> list[Section]:
             ),
             ("diverged", lambda row: Cell(row["of"])),
         ],
-        caption="Root mean square errors in free runs over whole records, with 95 % intervals by"
+        caption="Root mean square errors in free runs over complete records, with 95 % intervals by"
         " moving blocks of the squared errors. Published figures are those of the document's own"
         " ship and records.",
     )
@@ -218,7 +218,7 @@ def _record_figure(records: Sequence[StoredWindow]) -> Figure:
     """Return measured and predicted velocities of the longest test record (Figure 8)."""
     record = max(records, key=lambda window: len(window.t))
     title = "Figure 8 of Moreno-Salinas et al. 2019: test record in free run"
-    caption = "One free run over the whole record, without the wind as an input."
+    caption = "One free run over the complete record, without the wind as an input."
     return plot_time_series(
         "8",
         (title, caption),

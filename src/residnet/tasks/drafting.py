@@ -742,7 +742,7 @@ def _move_short_logs_to_training(
                 split_entries[name].remove(split_entry)
                 split_entries["train"].append(split_entry)
                 draft_notes.add_note(
-                    ("data", "split"), f"{split_entry[1].name} is too short to be judged on"
+                    ("data", "split"), f"{split_entry[1].name} is too short for an evaluation"
                 )
 
 

@@ -688,7 +688,7 @@ def cost_table(rows: Sequence[HeadingRow], axis_labels: AxisWords) -> Table:
         sorted(rows_by_model.values(), key=lambda row: row["conditions"].mean_cost),
         [
             ("controller", "conditions.model"),
-            ("what it is", lambda row: _KIND_LABELS[row["conditions"].kind]),
+            ("kind", lambda row: _KIND_LABELS[row["conditions"].kind]),
             ("mean [s]", "conditions.cost.mean", 3),
             (
                 f"over {best_row.model} [%]",

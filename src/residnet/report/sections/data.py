@@ -231,7 +231,7 @@ def _protocol_text(protocol: ProtocolSettings) -> str:
         )
     if protocol.kind == "manoeuvre" and protocol.initial is not None:
         return (
-            "whole manoeuvres; they start from the mean velocities of the first"
+            "complete manoeuvres; they start from the mean velocities of the first"
             f" {protocol.initial:g} s and are scored after them"
         )
     return protocol.kind

@@ -411,7 +411,7 @@ def run_refit(monitor: FittedModelMonitor, output_folder: Path) -> RefitResult:
     original_model = monitor.fitted_model
     if len(monitor.logs) < 2:
         raise DataError(
-            "a refit needs at least two new logs, the last of which are held out to judge it; give"
+            "a refit needs at least two new logs, because the last ones are held out to evaluate it; give"
             " more --logs, or cut the log into several"
         )
     for log in monitor.logs:

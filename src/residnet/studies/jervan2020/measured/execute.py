@@ -557,7 +557,7 @@ def _data_section(config: ForceResidualConfig, results: StudyResults) -> Section
     validation = config.validation
     blocks = results["intervals"]
     fold_text = (
-        "each consists of whole logs"
+        "each consists of complete logs"
         if folds["of"] == "logs"
         else "each is a stretch of time of every log"
     )
