@@ -126,7 +126,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("search.model=rigde", "no model is named 'rigde'"),
         ("'search.seeds=[1, 1]'", "each only once"),
         ("'search.variants.short=[heads.ridge.degre=1]'", "degre"),
-        ("'space.seed={choices: [1, 2]}'", "leave space and pruning out"),
+        ("'space.seed={choices: [1, 2]}'", "remove space and pruning"),
     ],
     "actuators": [
         ("~throttle", "no test is named"),

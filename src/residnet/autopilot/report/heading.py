@@ -433,8 +433,9 @@ def _learning_figure(notes_by_policy: Mapping[str, JsonObject], name: str) -> Fi
     return Figure(
         "learning",
         f"Training of {name}",
-        "Mean cost over the flights that epochs are chosen on; epoch 0 is the start, the law as"
-        " tuned, and the dotted line goes on from it. The epoch of least cost is kept.",
+        "Mean cost over the simulations by which the epoch is selected. Epoch 0 is the tuned law"
+        " from which the training starts, shown as a dotted line. The epoch with the smallest cost"
+        " is selected.",
         styles | start_styles,
         [Panel("mean cost [s]", "epoch", height=290)],
         [Case("", [panel])],

@@ -464,10 +464,10 @@ def evolution_figures(run: RunFiles) -> Iterator[Figure]:
             yield Figure(
                 f"breeding_{model}",
                 f"Search of {model}, generation by generation",
-                "Mean square error of the best individual over the target's mean square, on the"
-                " samples that breed and on those that validate. A ring marks the generation whose"
-                " equation was kept, the least validation error. A curve that still falls at its"
-                " end asks for more generations.",
+                "Mean square error of the best individual over the target's mean square, on"
+                " training and validation samples. A ring marks the selected generation, with the"
+                " smallest validation error. If a curve still decreases at its end, more"
+                " generations can reduce the error.",
                 style_family(_SPLITS) | {"kept": replace(_RING_STYLE, label="selected")},
                 panels,
                 [Case("", panel_curves)],

@@ -411,8 +411,8 @@ def run_refit(monitor: FittedModelMonitor, output_folder: Path) -> RefitResult:
     original_model = monitor.fitted_model
     if len(monitor.logs) < 2:
         raise DataError(
-            "a refit needs at least two new logs, because the last ones are held out to evaluate it; give"
-            " more --logs, or cut the log into several"
+            "a refit needs at least two new logs, because the last ones are held out to evaluate"
+            " it; give more --logs, or cut the log into several"
         )
     for log in monitor.logs:
         check_window_fits(log, config)

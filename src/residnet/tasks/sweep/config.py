@@ -472,7 +472,8 @@ class SweepConfig(PackageTask):
         if isinstance(self.search, VariantSearch):
             if self.space or self.pruning is not None:
                 raise ValueError(
-                    "search.kind: variants have no search space and no pruning; remove space and pruning"
+                    "search.kind: variants have no search space and no pruning; remove space and"
+                    " pruning"
                 )
             if not isinstance(self.runner, ProcessesConfig):
                 raise ValueError("runner: variants are fitted in processes of this machine")
