@@ -17,7 +17,8 @@ from typer.main import get_command
 from residnet.cli import app
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "command_line.md"
-START, END = "<!-- commands -->", "<!-- end of commands -->"
+START = "<!-- commands -->"
+END = "<!-- end of commands -->"
 COMMON = ("help", "quiet", "trust")
 """Parameters of nearly all commands, which the page describes once."""
 
