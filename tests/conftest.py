@@ -23,25 +23,49 @@ DEAR = (
     "runs/test_untrusted_folders.py",
     "corpus/test_corpus.py",
     "io/test_consensus.py",
-    "io/test_basin_workbooks.py",
     "export/test_formats.py",
-    "io/test_doctor_faults.py",
-    "export/test_c_names.py",
-    "test_layers.py",
     "test_api.py",
-    "io/test_drafting.py",
+    "export/test_c_names.py",
+    "golden/test_golden.py",
     "identification/monitoring/test_monitor.py",
-    "training/test_current.py",
-    "identification/test_some_velocities.py",
-    "contracts/test_beyond_the_plane.py",
-    "autopilot/test_courses.py",
+    "tasks/test_new.py",
+    "tasks/test_data_loss.py",
     "physics/test_every_vessel.py",
-    "tasks/test_sklearn_run.py",
     "heads/test_symbolic.py",
+    "test_layers.py",
+    "report/test_figures.py",
+    "io/test_doctor_faults.py",
+    "export/test_policies.py",
+    "studies/test_jervan2020.py",
+    "identification/test_some_velocities.py",
+    "identification/test_fit.py",
+    "io/test_motion.py",
+    "autopilot/test_courses.py",
+    "io/test_relations.py",
+    "tasks/test_refusals.py",
+    "autopilot/test_steering_identified.py",
+    "io/test_doctor.py",
+    "contracts/test_beyond_the_plane.py",
+    "tasks/test_sklearn_run.py",
     "autopilot/test_heading.py",
     "tasks/test_simulate.py",
+    "report/test_sections.py",
     "tasks/test_scale.py",
+    "autopilot/test_design.py",
+    "quality/test_compatibility_table.py",
+    "autopilot/test_roll_task.py",
+    "tasks/test_drafted_currents.py",
+    "export/test_domain.py",
+    "io/test_drafting.py",
+    "io/test_basin_workbooks.py",
+    "autopilot/test_depth.py",
+    "studies/test_force_residual.py",
+    "quality/test_lack_of_fit.py",
+    "io/test_drafting_habits.py",
+    "autopilot/test_guidance.py",
+    "preprocessing/test_compatibility.py",
 )
+"""Files of four seconds or more, the longest first, so that the last ones are short."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -64,6 +88,15 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
         return Said(call(monkeypatch, *words), *capsys.readouterr())
 
     return carried_out
+
+
+@pytest.fixture
+def omit_currents(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draft without a test for currents, which takes a third of the time of a draft.
+
+    `tests/tasks/test_drafted_currents.py` and the long tests of the corpus draft with it.
+    """
+    monkeypatch.setattr("residnet.tasks.drafting._has_current", lambda *_: False)
 
 
 @pytest.fixture(scope="module")

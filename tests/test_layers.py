@@ -168,11 +168,12 @@ def test_every_entry_point_of_a_wing_leads_to_its_own_package() -> None:
 
 def test_core_commands_load_no_wing(tmp_path: Path) -> None:
     """Lists, a fit with an export, and another export import no module of a wing."""
-    config = {**TINY, "heads": {"ridge": TINY["heads"]["ridge"]}, "export": {"models": ["ridge"]}}
+    # few short trials; no bands and no selection of the penalty, whose free runs take most time
+    ridge = {"kind": "ridge", "degree": 1, "choose": "one_step"}
+    config = {**TINY, "heads": {"ridge": ridge}, "export": {"models": ["ridge"]}}
     del config["training"], config["ensembles"]
-    # short trials, and no bands, whose free runs take most of the time
-    data = {"duration": 15, "trials": [{"kind": "zigzag", "count": 5, "heading": ["20 deg"]}]}
-    data |= {"identification": {"zigzag": 4}, "validation": {"zigzag": 1}}
+    data = {"duration": 12, "trials": [{"kind": "zigzag", "count": 4, "heading": ["20 deg"]}]}
+    data |= {"identification": {"zigzag": 3}, "validation": {"zigzag": 1}}
     terms = ["u", "v", "r", "tau_x", "tau_n"]
     config |= {"data": {**TINY["data"], **data}, "bands": None}
     config["baseline"] = {"kind": "regressors", "terms": terms}

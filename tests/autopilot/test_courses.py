@@ -113,7 +113,10 @@ def test_a_turn_that_follows_a_turn_begins_with_its_yaw(vessel: SteeredPlant) ->
 
 @pytest.mark.parametrize(
     ("name", "turning"),
-    [("nomoto_oceanos", TURNING), ("patrol_p06_linear", NomotoModel(0.3829, 5.154, 7.71))],
+    [
+        ("nomoto_oceanos", TURNING),
+        pytest.param("patrol_p06_linear", NomotoModel(0.3829, 5.154, 7.71), marks=pytest.mark.long),
+    ],
 )
 def test_a_turn_with_the_step_chosen_ends_where_one_with_a_thirtieth_does(
     name: str, turning: NomotoModel

@@ -72,6 +72,7 @@ def answers_of(case: dict[str, Any]) -> dict[Key, str]:
     return {(*READER_KEY, *key.split(".")): text for key, text in case.get("answers", {}).items()}
 
 
+@pytest.mark.usefixtures("omit_currents")
 @pytest.mark.parametrize("name", FOLDERS)
 def test_a_layout_is_read_and_told_for_what_it_is(name: str, tmp_path: Path) -> None:
     case, folder = case_in(name, tmp_path)

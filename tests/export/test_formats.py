@@ -257,7 +257,7 @@ def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:
         assert float(printed[1]) == pytest.approx(float(after[0, 3]), rel=1e-6)
 
 
-@pytest.mark.parametrize("left", [0, 5])
+@pytest.mark.parametrize("left", [0, pytest.param(5, marks=pytest.mark.long)])
 def test_coefficients_of_zero_are_left_out(left: int, tmp_path: Path) -> None:
     """A closed-form fit may find that most terms are nothing, or all of them."""
     spec, model = built("plsr")
@@ -431,7 +431,7 @@ DEEP = {"w": (0.1, 0.2, 0.3), "q": (0.01, 0.02, 0.03), "z": (0.1, 0.3, 0.9), "th
     [
         (TABLE, EXAMPLE_SIGNALS),
         pytest.param(ROLLS.model_copy(update=DEEP), SUBMERGED_SIGNALS, marks=pytest.mark.long),
-        (None, ROLLING_SIGNALS),
+        pytest.param(None, ROLLING_SIGNALS, marks=pytest.mark.long),
     ],
 )
 def test_half_widths_are_those_of_the_table_in_torchscript_and_in_c(

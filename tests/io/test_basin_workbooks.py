@@ -19,6 +19,8 @@ from residnet.core.log import Log
 from residnet.io.readers.excel_tables import read_excel_sheet
 from residnet.physics.actuators.steering_gear import simulate_gear
 
+pytestmark = pytest.mark.usefixtures("omit_currents")
+
 DEGREES = 180.0 / np.pi
 LENGTH = 3.2186
 

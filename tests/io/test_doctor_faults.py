@@ -32,7 +32,10 @@ def told(logs: list[Log], alone: int) -> list[Finding]:
     return [*found, *inspect_log_set(logs).findings]
 
 
-@pytest.mark.parametrize("name", HOSTS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.long] if name != "boat" else []) for name in HOSTS],
+)
 def test_inspect_log_of_clean_simulations_gives_notes_only(name: str) -> None:
     logs = list(host(name)[1])
     said = told(logs, len(logs))

@@ -42,6 +42,8 @@ GERMAN = Style(
     dates="%d.%m.%Y %H:%M:%S,%f",
     encoding="cp1252",
 )
+
+pytestmark = pytest.mark.usefixtures("omit_currents")
 STYLES = {
     "SI without units": Style(told=False),
     "degrees without units": Style(

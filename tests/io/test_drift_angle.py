@@ -18,6 +18,8 @@ from residnet.io.readers.tables import CsvConfig
 from residnet.tasks.drafting import write_new_config
 from residnet.tasks.registry import load_task
 
+pytestmark = pytest.mark.usefixtures("omit_currents")
+
 CORPUS = Path(__file__).parents[1] / "corpus"
 TRUTH = [pd.read_csv(CORPUS / f"truth_{trip}.csv") for trip in (1, 2)]
 SPEED_NAMES = ("V", "U", "Vs", "Speed", "Ship speed", "V_model", "Geschwindigkeit")

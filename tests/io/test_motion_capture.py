@@ -17,6 +17,8 @@ from residnet.io.readers.motion_capture import detect_motive_axes
 from residnet.io.readers.tables import CsvConfig
 from residnet.tasks.drafting import write_new_config
 
+pytestmark = pytest.mark.usefixtures("omit_currents")
+
 TRUTH = pd.read_csv(Path(__file__).parents[1] / "corpus" / "truth_1.csv")
 UNITS = {"Meters": 1.0, "Millimeters": 1000.0}
 BOWS = {("y", "x"): 0.0, ("y", "z"): 90.0, ("y", "-z"): -90.0, ("z", "x"): 0.0, ("z", "y"): -90.0}

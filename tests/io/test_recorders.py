@@ -21,6 +21,8 @@ from residnet.core.log import Log
 from residnet.io.readers import ReaderConfig
 from residnet.io.readers.detect import detect_recording_format
 
+pytestmark = pytest.mark.usefixtures("omit_currents")
+
 
 def read(path: Path, **config: Any) -> Log:
     return validate_config(config, ReaderConfig, "test").build().read(path)

@@ -37,6 +37,7 @@ from residnet.report.run_reader import RunFiles
 from residnet.runs import folder as run_folder
 from residnet.runs.folder import RunFolder
 from residnet.tasks import registry
+from residnet.tasks.fit import outcome
 
 SECONDS = 5.0
 """Time after which a folder counts as one that hangs a command."""
@@ -78,6 +79,7 @@ def finished(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
         config = write_yaml(place / "config.yaml", CONFIGS[request.param](place))
         with pytest.MonkeyPatch.context() as patch:
             omit_drawings(patch)
+            patch.setattr(outcome, "_MAX_ANALYSED_LOGS", 1)
             assert call(patch, "run", config, "--out", folder, "--quiet") == 0
 
     return made_once(tmp_path_factory, f"untrusted_{request.param}", make)
@@ -347,6 +349,7 @@ def no_execution(monkeypatch: pytest.MonkeyPatch) -> None:
     # the revision of residnet's source is asked of git, whatever the run folder holds
     monkeypatch.setattr(run_folder, "read_git_revision", lambda: None)
     monkeypatch.setattr(vessel, "PARITY_STEPS", 20)
+    monkeypatch.setattr(outcome, "_MAX_ANALYSED_LOGS", 0)
     omit_drawings(monkeypatch)
     # the drawings of the first screen read values of the run folder
     monkeypatch.setattr(page, "draw_svg", still.draw_svg)

@@ -28,6 +28,8 @@ from residnet.tasks.drafting import write_new_config
 from residnet.tasks.fit.config import FitConfig
 from residnet.tasks.registry import load_task
 
+pytestmark = pytest.mark.usefixtures("omit_currents")
+
 
 @pytest.fixture(scope="module")
 def logs() -> list[Log]:
