@@ -295,7 +295,13 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> No
 
 def test_currents_are_estimated_as_by_the_key_of_a_config() -> None:
     config = copy.deepcopy(TINY)
-    config["data"]["disturbance"] = {"current_each": [0.2, 0.4]}
+    # zigzags and steps alone, which excite most
+    config["data"] |= {
+        "disturbance": {"current_each": [0.2, 0.4]},
+        "trials": [config["data"]["trials"][k] for k in (1, 3)],
+        "identification": {"zigzag": 4, "three_two_one_one": 2},
+        "validation": {"zigzag": 1},
+    }
     config |= {"heads": {}, "ensembles": {}, "training": {}, "current": {}, "bands": None}
     config["baseline"] = {"kind": "regressors", "sets": ["linear"]}
     simulated = validate_config(config["data"], SimulatedTrials, "data")

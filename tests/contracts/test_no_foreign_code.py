@@ -23,7 +23,7 @@ FORBIDDEN_METHODS = {
 }  # fmt: skip
 
 EXCEPTIONS = {
-    ("engine/free_runs.py", "import pickle"): "writes a structure to hash it; nothing is read",
+    ("engine/structure.py", "import pickle"): "writes a structure to hash it; nothing is read",
     ("core/processes.py", "from joblib"): "`cpu_count` alone, which counts cores",
     ("tasks/sweep/config.py", "from joblib"): "`cpu_count` alone, which counts cores",
     ("export/torchscript.py", "torch.jit.load"): "the file that the same call has just written",

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import copy
-import hashlib
-import io
-import pickle
 from functools import cache
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
@@ -21,26 +18,11 @@ from residnet.engine.rollout import (
     has_untraceable_part,
     trace_rollout,
 )
+from residnet.engine.structure import hash_structure
 from residnet.heads.recurrent import GRUEnsembleHead
 
 if TYPE_CHECKING:
     from residnet.engine.compiled import CompiledRollout
-
-
-class _StructurePickler(pickle.Pickler):
-    """Pickles a rollout without the values of its parameters and buffers."""
-
-    def __init__(self, file: io.BytesIO, rollout: Rollout) -> None:
-        super().__init__(file)
-        self.tensor_ids = {id(tensor) for tensor in (*rollout.parameters(), *rollout.buffers())}
-
-    def persistent_id(self, obj: Any) -> Any:
-        """Return the identity of a tensor: type and shape, or type and values of a constant."""
-        if not isinstance(obj, Tensor):
-            return None
-        if obj.is_floating_point() and id(obj) in self.tensor_ids:
-            return str(obj.dtype), tuple(obj.shape), obj.requires_grad and torch.is_grad_enabled()
-        return str(obj.dtype), obj.tolist()
 
 
 # compiled rollouts by structure; False where compilation failed
@@ -145,13 +127,11 @@ def _is_compilable(rollout: Rollout, steps: int, x0: Tensor, w: Tensor) -> bool:
 
 def _compile(rollout: Rollout, x0: Tensor, w: Tensor, s: Tensor) -> CompiledRollout | None:
     """Return the compiled rollout of this structure; None if it cannot be compiled."""
-    file = io.BytesIO()
-    try:
-        _StructurePickler(file, rollout).dump((rollout, x0.dtype, torch.is_grad_enabled()))
-    except Exception:
-        # parts of other packages that cannot be pickled
+    key = hash_structure(
+        (rollout, x0.dtype, torch.is_grad_enabled()), (*rollout.parameters(), *rollout.buffers())
+    )
+    if key is None:
         return None
-    key = hashlib.sha256(file.getvalue()).digest()
     if key not in _COMPILED:
         from residnet.engine.c_code import CompilerError
         from residnet.engine.compiled import CompiledRollout

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from typing import Any, final
 
 import torch
@@ -10,7 +11,13 @@ from torch import Tensor
 from residnet.core.errors import ExportError
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.simulated import PlantDynamics
+from residnet.engine.structure import hash_structure
 from residnet.physics.plant import Plant
+
+_MAX_CACHED_STEPS = 64
+"""Largest number of traced steps in the cache."""
+# traced steps by plant and time step: tracing takes as long as the simulation of many seconds
+_cached_steps: OrderedDict[bytes, Any] = OrderedDict()
 
 
 @final
@@ -30,6 +37,20 @@ class RecordedPlantDynamics(Dynamics):
         # CasADi buffers and evaluators by number of rows
         self._evaluators: dict[int, tuple[Any, Any]] = {}
 
+    def _find_row_function(self) -> Any:
+        """Return the traced step of one row, from the cache if an equal plant was traced."""
+        key = hash_structure((self.plant, self.dt, self.substeps))
+        if key is None:
+            return self._trace_row()
+        if key not in _cached_steps:
+            _cached_steps[key] = self._trace_row()
+            if len(_cached_steps) > _MAX_CACHED_STEPS:
+                _cached_steps.popitem(last=False)
+        _cached_steps.move_to_end(key)
+        return _cached_steps[key]
+
+    # a free run without gradients is in inference mode, whose operations are others
+    @torch.inference_mode(False)
     def _trace_row(self) -> Any:
         """Return the step of one row as a CasADi function, which calls one traced sub-step."""
         import casadi as ca
@@ -51,7 +72,7 @@ class RecordedPlantDynamics(Dynamics):
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         if self._row_function is None and self._torch_plant is None:
             try:
-                self._row_function = self._trace_row()
+                self._row_function = self._find_row_function()
             except ExportError:
                 self._torch_plant = PlantDynamics(self.plant, self.dt, self.substeps)
         if self._torch_plant is not None:
