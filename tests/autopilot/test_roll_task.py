@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from pictures import omit_drawings
 from read_page import Page, plain
 from tiny import Command, call, write_yaml
 from tiny_tasks import roll
@@ -26,6 +27,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = write_yaml(folder / "roll.yaml", roll(folder))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        omit_drawings(patch)
         assert call(patch, "run", file, "--out", folder / "run") == 0
     return folder / "run"
 

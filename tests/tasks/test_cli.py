@@ -14,6 +14,7 @@ import pytest
 import torch
 import written_logs
 import yaml
+from pictures import omit_drawings
 from tiny import Command, read_json, write_yaml
 from tiny_tasks import measured
 
@@ -30,6 +31,11 @@ from residnet.tasks.simulate.config import SimulateConfig
 CONSTANT = {"kind": "constant", "name": "turn", "drive": 0.5, "steer": 0.3}
 PROGRAMME = {"vessel": "wam_v_cal", "duration": "5 s", "manoeuvres": [CONSTANT]}
 FLY = {"task": "simulate", "name": "fly", "programme": PROGRAMME}
+
+
+@pytest.fixture(autouse=True)
+def _no_drawings(monkeypatch: pytest.MonkeyPatch) -> None:
+    omit_drawings(monkeypatch)
 
 
 @pytest.fixture
