@@ -73,8 +73,6 @@ _MAX_GROWTH = 3.0
 """Largest growth of the standard error of an error that the sensors determine."""
 _MAX_NODES = 20_000
 """Largest number of nodes."""
-_MAX_PRODUCTS = 2_000_000
-"""Largest number of products of derivatives that are computed at once, 16 MB."""
 _CACHE_BYTES = 50_000_000
 """Largest total size of the stored results of `reconstruct`."""
 _MIN_SAMPLES = 20
@@ -715,31 +713,25 @@ class _Problem:
             weighted = weights * group.values
             # a dynamic equation belongs to each node but the last; a node may have several samples
             n_targets = n_nodes if group.sensor is not None else n_nodes - 1
-            keys = np.array(sorted(group.by_state), dtype=int)
+            keys = np.array(sorted(group.by_state))
             derivatives = np.array([group.by_state[key] for key in keys.tolist()])
-            # all states of a node at once: a loop over the states takes twice the time
-            for side in np.unique(keys // N_STATES).tolist():
+            for position, first in enumerate(keys.tolist()):
+                side, state = divmod(first, N_STATES)
                 target = slice(side, n_targets + side)
-                positions = np.flatnonzero(keys // N_STATES == side)
-                states = keys[positions] % N_STATES
-                by_states = derivatives[positions]
-                gradient[target, states] += _sum_by_node(group, by_states * weighted, n_nodes).T
-                weighted_derivatives = by_states * weights
-                for index, derivative in group.by_error.items():
-                    products = _sum_by_node(group, weighted_derivatives * derivative, n_nodes)
-                    border[index][target, states] += products.T
+                first_derivative = derivatives[position]
+                gradient[target, state] += _sum_by_node(group, first_derivative * weighted, n_nodes)
+                weighted_derivative = first_derivative * weights
+                products = _sum_by_node(
+                    group, weighted_derivative * derivatives[position:], n_nodes
+                )
                 # a product of two states of the next node belongs to that node
                 n_products = min(n_targets, n_nodes - side)
-                first, second = np.nonzero(positions[:, None] <= np.arange(keys.size))
-                for pairs in _split_pairs(first.size, weighted.size):
-                    products = _sum_by_node(
-                        group,
-                        weighted_derivatives[first[pairs]] * derivatives[second[pairs]],
-                        n_nodes,
+                offsets = keys[position:] - first
+                band[offsets, side : side + n_products, state] += products[:, :n_products]
+                for index, derivative in group.by_error.items():
+                    border[index, target, state] += _sum_by_node(
+                        group, weighted_derivative * derivative, n_nodes
                     )
-                    offsets = keys[second[pairs]] - keys[positions[first[pairs]]]
-                    rows = slice(side, side + n_products)
-                    band[offsets, rows, states[first[pairs]]] += products[:, :n_products]
             for index, derivative in group.by_error.items():
                 error_gradient[index] += float((derivative * weighted).sum())
                 for other_index, other_derivative in group.by_error.items():
@@ -977,24 +969,15 @@ class _Problem:
 
 
 def _sum_by_node(group: _Residuals, values: np.ndarray, n_nodes: int) -> np.ndarray:
-    """Sum values of the residuals [M, N] by node [M, K].
+    """Sum values of the residuals [..., N] by node [..., K].
 
     A dynamic equation has one value per node but the last.
     """
     if group.sensor is None:
         return values
-    if (np.diff(group.nodes) > 0).all():
-        # one sample of a node at most
-        sums = np.zeros((len(values), n_nodes))
-        sums[:, group.nodes] = values
-        return sums
+    if values.ndim == 1:
+        return np.bincount(group.nodes, values, n_nodes)
     return np.array([np.bincount(group.nodes, row, n_nodes) for row in values])
-
-
-def _split_pairs(n_pairs: int, n_residuals: int) -> list[slice]:
-    """Return slices of pairs of states whose products of all residuals need little memory."""
-    size = max(1, _MAX_PRODUCTS // max(n_residuals, 1))
-    return [slice(start, start + size) for start in range(0, n_pairs, size)]
 
 
 def _linearize_score(group: _Residuals) -> _Residuals:
