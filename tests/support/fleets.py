@@ -8,13 +8,22 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from planted import KINDS as MANOEUVRES
 from planted import SHIPS, clean, driving
-from random_vessels import KINDS, draw, fly, log_of
+from random_vessels import (
+    KINDS,
+    FlightDraws,
+    draw,
+    draw_flight,
+    log_of,
+    simulate_flights,
+    skip_log,
+)
 
 from residnet.core.log import Log
 
@@ -51,13 +60,24 @@ def drawn(kind: str, seed: int, count: int, fewest: int = 8, most: int = 20) -> 
     step = step[np.argmin(np.abs(step[:, None] - unit / 15.0), axis=0)]
     sizes = random.integers(fewest, most + 1, count)
     both: list[list[list[Log]]] = [[[] for _ in range(count)] for _ in range(2)]
+    # all random numbers are drawn first, so that all flights are simulated together
+    flights: list[tuple[int, FlightDraws]] = []
+    logs: list[tuple[int, int, int, Mapping[str, Any]]] = []
     for k in range(int(sizes.max())):
-        for of, members in zip((vessels, other), both, strict=True):
-            flight = fly(of, kind, int(random.integers(4)), step, random, 900)
-            for i in np.flatnonzero(sizes > k):
+        for which in range(2):
+            draws = draw_flight(count, int(random.integers(4)), random, 900)
+            for i in np.flatnonzero(sizes > k).tolist():
                 rows = int(random.integers(350, 900))
-                part = {name: values[:rows] for name, values in flight.items()}
-                members[i].append(log_of(of, kind, part, step, int(i), k, random))
+                logs.append((len(flights), i, rows, random.bit_generator.state))
+                skip_log(rows, random)
+            flights.append((which, draws))
+    vessels_of_flights = [(vessels, other)[which] for which, _ in flights]
+    motions = simulate_flights(vessels_of_flights, kind, step, [draws for _, draws in flights])
+    for number, i, rows, state in logs:
+        random.bit_generator.state = state
+        part = {name: values[:rows] for name, values in motions[number].items()}
+        log = log_of(vessels_of_flights[number], kind, part, step, i, number // 2, random)
+        both[flights[number][0]][i].append(log)
     inputs = ("n_port", "n_stbd") if kind == "twin" else ("n", "delta")
     return [
         Fleet(f"{kind} {i}", logs, sisters, inputs, inputs[1])

@@ -7,7 +7,8 @@ the parameters of a shipped vessel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from planted import Ship
@@ -122,6 +123,130 @@ def ship_of(kind: str, log: Log) -> Ship:
     return Ship(kind, kind, "0 s", "0 s", {}, lag, arm, bias, (names[0],), names[1], names[2])
 
 
+@dataclass(frozen=True)
+class FlightDraws:
+    """Random numbers of a flight of B vessels over K samples, [K, B] each.
+
+    Attributes:
+        what: 0 for a zigzag, 1 for steps of the steering, 2 for steps of both, 3 for courses that a
+            controller holds.
+        heading: initial headings [B] in rad.
+        angle: angles of the steering [B] in rad.
+        limit: heading changes [B] in rad at which a zigzag reverses.
+        side: first side of a zigzag [B].
+        turn: changes of the course, or angles of the steering, in rad.
+        turn_time: times until the next turn.
+        power: settings of the propulsion.
+        power_time: times until the next setting.
+        gust: standard normal numbers [K, substeps, 3, B].
+    """
+
+    what: int
+    heading: np.ndarray
+    angle: np.ndarray
+    limit: np.ndarray
+    side: np.ndarray
+    turn: np.ndarray
+    turn_time: np.ndarray
+    power: np.ndarray
+    power_time: np.ndarray
+    gust: np.ndarray
+
+
+def draw_flight(
+    count: int, what: int, random: np.random.Generator, samples: int = _SAMPLES
+) -> FlightDraws:
+    """Draw the random numbers of a flight of `count` vessels; see `FlightDraws`."""
+    heading = random.uniform(-3.0, 3.0, count)
+    angle = random.uniform(0.17, 0.52, count)
+    limit = random.uniform(0.17, 0.4, count)
+    side = random.choice([-1.0, 1.0], count)
+    turn, turn_time, power, power_time = np.zeros((4, samples, count))
+    gust = np.zeros((samples, _SUBSTEPS, 3, count))
+    for k in range(samples):
+        if what == 3:
+            turn[k] = random.uniform(-1.6, 1.6, count)
+            turn_time[k] = random.uniform(6.0, 18.0, count)
+        elif what != 0:
+            turn[k] = random.uniform(-0.55, 0.55, count)
+            turn_time[k] = random.uniform(2.0, 8.0, count)
+        if what in (2, 3):
+            power[k] = random.uniform(0.4, 1.1, count)
+            power_time[k] = random.uniform(8.0, 20.0, count)
+        gust[k] = random.standard_normal((_SUBSTEPS, 3, count))
+    return FlightDraws(what, heading, angle, limit, side, turn, turn_time, power, power_time, gust)
+
+
+def simulate_flights(
+    vessels: Sequence[Vessels], kind: str, step: np.ndarray, draws: Sequence[FlightDraws]
+) -> list[dict[str, np.ndarray]]:
+    """Simulate flights together, which takes little longer than one of them.
+
+    Args:
+        vessels: B vessels of each flight.
+        kind: one of `KINDS`.
+        step: time steps of these vessels [B] in s.
+        draws: random numbers of each flight, all of the same number of samples.
+
+    Returns:
+        State and actuators [K, B] in units of length and speed, for each flight.
+    """
+    joined = Vessels(
+        **{
+            part.name: np.concatenate([getattr(one, part.name) for one in vessels])
+            for part in fields(Vessels)
+        }
+    )
+
+    def join(name: str) -> np.ndarray:
+        return np.concatenate([getattr(one, name) for one in draws], axis=-1)
+
+    n_flights = len(draws)
+    unit = joined.length / joined.speed
+    steps = np.tile(step, n_flights)
+    dt = steps / unit / _SUBSTEPS
+    what = np.repeat([one.what for one in draws], len(step))
+    is_zigzag = what == 0
+    is_course = what == 3
+    has_power_steps = what >= 2
+    psi, angle, limit, sign = map(join, ("heading", "angle", "limit", "side"))
+    turns, turn_times, powers, power_times, gust = map(
+        join, ("turn", "turn_time", "power", "power_time", "gust")
+    )
+    x, y, v, r, side, turn, until, powered = np.zeros((8, psi.size))
+    u = np.full(psi.size, 0.7)
+    drive = np.full(psi.size, 0.8)
+    power = np.full(psi.size, 0.8)
+    course = psi.copy()
+    gusts = np.zeros((3, psi.size))
+    names = ("x", "y", "psi", "u", "v", "r", "side", "drive")
+    out = np.zeros((len(names), len(turns), psi.size))
+    for k in range(len(turns)):
+        out[:, k] = (x, y, psi, u, v, r, side, drive)
+        now = k * steps / unit
+        sign = np.where(is_zigzag & (sign * (psi - course) > limit), -sign, sign)
+        is_turning = now >= until
+        course = np.where(is_course & is_turning, course + turns[k], course)
+        turn = np.where(is_turning, turns[k], turn)
+        until = np.where(is_turning, now + turn_times[k], until)
+        held_course = np.clip(1.2 * (course - psi) - 0.6 * r, -angle, angle)
+        wanted = np.where(is_course, held_course, turn)
+        wanted = np.where(is_zigzag, np.where(now > 3.0, sign * angle, 0.0), wanted)
+        is_new_power = has_power_steps & (now >= powered)
+        power = np.where(is_new_power, powers[k], power)
+        powered = np.where(is_new_power, now + power_times[k], powered)
+        for substep in range(_SUBSTEPS):
+            gusts += dt * (-gusts / 3.0) + np.sqrt(dt) * gust[k, substep] * (joined.gust * 0.8)
+            side = side + np.clip(wanted - side, -0.5 * dt, 0.5 * dt)
+            drive = drive + dt / 0.3 * (power - drive)
+            du, dv, dr = accelerations(joined, kind, (u, v, r), (side, drive), gusts)
+            u, v, r = u + dt * du, v + dt * dv, r + dt * dr
+            x = x + dt * (u * np.cos(psi) - v * np.sin(psi))
+            y = y + dt * (u * np.sin(psi) + v * np.cos(psi))
+            psi = psi + dt * r
+    return [dict(zip(names, flight, strict=True)) for flight in np.split(out, n_flights, axis=-1)]
+
+
 def fly(
     vessels: Vessels,
     kind: str,
@@ -130,64 +255,9 @@ def fly(
     random: np.random.Generator,
     samples: int = _SAMPLES,
 ) -> dict[str, np.ndarray]:
-    """Return state and actuators [samples, B] in units of length and speed.
-
-    `what` is 0 for a zigzag, 1 for steps of the steering, 2 for steps of both, 3 for courses that
-    a controller holds.
-    """
-    count = vessels.length.size
-    unit = vessels.length / vessels.speed
-    dt = step / unit / _SUBSTEPS
-    x, y, psi, u, v, r = (np.zeros(count) for _ in range(6))
-    psi = random.uniform(-3.0, 3.0, count)
-    u = np.full(count, 0.7)
-    side = np.zeros(count)
-    drive = np.full(count, 0.8)
-    turn = np.zeros(count)
-    power = np.full(count, 0.8)
-    course = psi.copy()
-    until = np.zeros(count)
-    powered = np.zeros(count)
-    angle = random.uniform(0.17, 0.52, count)
-    limit = random.uniform(0.17, 0.4, count)
-    sign = random.choice([-1.0, 1.0], count)
-    gusts = np.zeros((3, count))
-    out = {
-        name: np.zeros((samples, count))
-        for name in ["x", "y", "psi", "u", "v", "r", "side", "drive"]
-    }
-    for k in range(samples):
-        for name, values in zip(out, (x, y, psi, u, v, r, side, drive), strict=True):
-            out[name][k] = values
-        now = k * step / unit
-        if what == 0:
-            sign = np.where(sign * (psi - course) > limit, -sign, sign)
-            turn = np.where(now > 3.0, sign * angle, 0.0)
-        elif what == 3:
-            fresh = now >= until
-            course = np.where(fresh, course + random.uniform(-1.6, 1.6, count), course)
-            until = np.where(fresh, now + random.uniform(6.0, 18.0, count), until)
-            turn = np.clip(1.2 * (course - psi) - 0.6 * r, -angle, angle)
-        else:
-            fresh = now >= until
-            turn = np.where(fresh, random.uniform(-0.55, 0.55, count), turn)
-            until = np.where(fresh, now + random.uniform(2.0, 8.0, count), until)
-        if what in (2, 3):
-            fresh = now >= powered
-            power = np.where(fresh, random.uniform(0.4, 1.1, count), power)
-            powered = np.where(fresh, now + random.uniform(8.0, 20.0, count), powered)
-        for _ in range(_SUBSTEPS):
-            gusts += dt * (-gusts / 3.0) + np.sqrt(dt) * random.standard_normal((3, count)) * (
-                vessels.gust * 0.8
-            )
-            side = side + np.clip(turn - side, -0.5 * dt, 0.5 * dt)
-            drive = drive + dt / 0.3 * (power - drive)
-            du, dv, dr = accelerations(vessels, kind, (u, v, r), (side, drive), gusts)
-            u, v, r = u + dt * du, v + dt * dv, r + dt * dr
-            x = x + dt * (u * np.cos(psi) - v * np.sin(psi))
-            y = y + dt * (u * np.sin(psi) + v * np.cos(psi))
-            psi = psi + dt * r
-    return out
+    """Return state and actuators [samples, B] of one flight; see `FlightDraws.what`."""
+    draws = draw_flight(vessels.length.size, what, random, samples)
+    return simulate_flights([vessels], kind, step, [draws])[0]
 
 
 def accelerations(
@@ -221,6 +291,12 @@ def accelerations(
     dr = -vessels.yaw * np.abs(u) * r - vessels.yaw_square * r * np.abs(r)
     dr = dr - vessels.munk * u * v + vessels.rudder_yaw * steer + gusts[2]
     return du, dv, dr
+
+
+def skip_log(rows: int, random: np.random.Generator) -> None:
+    """Draw as many random numbers as `log_of` does for a log of some rows."""
+    random.uniform()
+    random.standard_normal((6, rows))
 
 
 def log_of(
