@@ -78,7 +78,8 @@ def random_logs(kind: str, seed: int, count: int) -> list[list[Log]]:
     unit = vessels.length / vessels.speed
     step = np.array([0.05, 0.1, 0.2, 0.5, 1.0])
     step = step[np.argmin(np.abs(step[:, None] - unit / 15.0), axis=0)]
-    flights = [fly(vessels, kind, what, step, random) for what in range(3)]
+    draws = [draw_flight(count, what, random) for what in range(3)]
+    flights = simulate_flights([vessels] * 3, kind, step, draws)
     return [
         [log_of(vessels, kind, flight, step, i, k, random) for k, flight in enumerate(flights)]
         for i in range(count)
