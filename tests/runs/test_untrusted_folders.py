@@ -178,7 +178,7 @@ class Hang(BaseException):
     """The alarm of a command that takes too long."""
 
 
-def measure_slowness(seconds: float = 0.02) -> float:
+def measure_slowness(seconds: float = 0.005) -> float:
     """Measure how many seconds pass for each second of the processor, at least 1.
 
     Other processes of the machine make it larger than 1.
