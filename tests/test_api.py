@@ -73,7 +73,8 @@ def data(logs: list[residnet.Log]) -> residnet.Dataset:
 
 @pytest.fixture(scope="module")
 def models(data: residnet.Dataset) -> residnet.Models:
-    return residnet.fit(data, heads={"ridge": "ridge", "net": {"kind": "mlp", "hidden": (8,)}})
+    heads = {"ridge": "ridge", "net": {"kind": "mlp", "hidden": (8,)}}
+    return residnet.fit(data, heads=heads, effort=0.2)
 
 
 def test_the_face_loads_nothing_and_every_name_is_there_and_documented() -> None:
