@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import random
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pictures import omit_drawings
 from tiny import Command, call, write_yaml
 
+from residnet.core.log import Log
 from residnet.export import vessel
+from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.runs import folder as folders
 from residnet.runs.folder import RunFolder
 from residnet.tasks import demo
@@ -226,6 +230,17 @@ def test_demo_is_replaced_only_if_it_is_unchanged(
     monkeypatch.setitem(demo.DEMO_TRIALS, "duration", "35 s")
     workbooks = dict([next(iter(demo._BASIN_MANOEUVRES.items()))])
     monkeypatch.setattr(demo, "_BASIN_MANOEUVRES", workbooks)
+    # each command writes logs of the same simulations
+    trials: list[Log] = []
+    simulate_trial_logs = demo.simulate_trial_logs
+
+    def simulate_once(manoeuvres: Any, config: SimulatedTrials) -> list[Log]:
+        if not trials:
+            trials.extend(simulate_trial_logs(manoeuvres, config))
+        return trials
+
+    monkeypatch.setattr(demo, "simulate_trial_logs", simulate_once)
+    monkeypatch.setattr(demo, "simulate_basin_tests", functools.cache(demo.simulate_basin_tests))
     folder = tmp_path / "demo"
     assert command("demo", folder, "--quiet").code == 0
     said = command("demo", folder, "--quiet")
