@@ -13,10 +13,13 @@ from made_once import made_once
 from sample_package import TASKS, install
 from tiny import TINY, Command, Said, call, write_yaml
 
+from residnet.core.processes import retain_freed_memory
 from residnet.core.registry import clear_caches
 
 # the interval between searches for reference cycles that the command line uses
 gc.set_threshold(100_000)
+# as every run does
+retain_freed_memory()
 
 DEAR = (
     "contracts/test_every_part.py",
