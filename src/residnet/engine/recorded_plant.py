@@ -37,6 +37,15 @@ class RecordedPlantDynamics(Dynamics):
         # CasADi buffers and evaluators by number of rows
         self._evaluators: dict[int, tuple[Any, Any]] = {}
 
+    # a free run without gradients is in inference mode, whose operations and tensors are others
+    @torch.inference_mode(False)
+    def _prepare(self) -> None:
+        """Trace the step, or build the plant in torch if that is impossible."""
+        try:
+            self._row_function = self._find_row_function()
+        except ExportError:
+            self._torch_plant = PlantDynamics(self.plant, self.dt, self.substeps)
+
     def _find_row_function(self) -> Any:
         """Return the traced step of one row, from the cache if an equal plant was traced."""
         key = hash_structure((self.plant, self.dt, self.substeps))
@@ -49,8 +58,6 @@ class RecordedPlantDynamics(Dynamics):
         _cached_steps.move_to_end(key)
         return _cached_steps[key]
 
-    # a free run without gradients is in inference mode, whose operations are others
-    @torch.inference_mode(False)
     def _trace_row(self) -> Any:
         """Return the step of one row as a CasADi function, which calls one traced sub-step."""
         import casadi as ca
@@ -71,10 +78,7 @@ class RecordedPlantDynamics(Dynamics):
     @torch.no_grad()
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         if self._row_function is None and self._torch_plant is None:
-            try:
-                self._row_function = self._find_row_function()
-            except ExportError:
-                self._torch_plant = PlantDynamics(self.plant, self.dt, self.substeps)
+            self._prepare()
         if self._torch_plant is not None:
             return self._torch_plant.step(x, w, s)
         if len(x) not in self._evaluators:
