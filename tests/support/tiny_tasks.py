@@ -25,7 +25,7 @@ CHANNELS = {
 WINDOWS = {"T5": {"kind": "windows", "length": 5, "first": 1, "history": 1}}
 
 
-def boat(seed: int, seconds: float = 15.0, step: float = 0.1) -> pd.DataFrame:
+def boat(seed: int, seconds: float = 20.0, step: float = 0.1) -> pd.DataFrame:
     """A small boat in the plane under random revolutions and rudder angles, with some noise."""
     rng = np.random.default_rng(seed)
     count = round(seconds / step)
