@@ -58,8 +58,8 @@ def _select_run(rollout: Rollout, steps: int, x0: Tensor, w: Tensor, s: Tensor) 
     if head is None:
         compiled = _compile(rollout, x0, w, s)
         return trace_rollout(rollout, steps) if compiled is None else compiled.with_rollout(rollout)
-    # one compiled program runs the rows of each member with the parameters of this member. The
-    # traced step of all members took five times as long in a training
+    # one compiled program runs the rows of each member with the parameters of this member. With the
+    # traced step of all members, a training took three times as long (71 instead of 24 s)
     n_members = head.batch_ensemble_size
     n_rows = len(x0) // n_members
     member_rollout = copy.deepcopy(rollout)
