@@ -8,19 +8,24 @@ page is not current.
 from __future__ import annotations
 
 import json
+import pydoc
 import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from pydantic import BaseModel, RootModel
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core import core_schema
 
 from residnet.autopilot.records import (
     AutopilotMetricsFile,
     ControllersFile,
     CourseMetricsFile,
+    PolicyNotes,
     RollMetricsFile,
 )
+from residnet.core.config import Config
 from residnet.core.records import StoredFile
 from residnet.core.run_records import ExportsFile, ProvenanceFile, SummaryFile
 from residnet.evaluation.derivatives import DerivativesFile
@@ -77,6 +82,7 @@ RECORDS: dict[str, type[StoredFile]] = {
     "monitor.json": MonitorFile,
     "metrics.json of the task `autopilot`": AutopilotMetricsFile,
     "controllers.json": ControllersFile,
+    "fit.json of a policy": PolicyNotes,
     "metrics.json of the task `course`": CourseMetricsFile,
     "metrics.json of the task `roll`": RollMetricsFile,
 }
@@ -92,7 +98,12 @@ A file with an unknown key, or with a value of another type, is refused in one l
 
 
 def iterate_records(annotation: object) -> Iterator[type[BaseModel]]:
-    """Yield the records in an annotation and in their fields, each before those inside of it."""
+    """Yield the records in an annotation and in their fields, each before those inside of it.
+
+    The classes of configs are part of another reference, and are not yielded.
+    """
+    if is_config(annotation) and issubclass(annotation, Config):
+        return
     if is_config(annotation):
         yield annotation
         for field in annotation.model_fields.values():
@@ -102,9 +113,24 @@ def iterate_records(annotation: object) -> Iterator[type[BaseModel]]:
             yield from iterate_records(part)
 
 
+class RecordSchema(GenerateJsonSchema):
+    """Generator of the schema of a record, in which a config is any object.
+
+    Readers of configs check them, so that two schemas of one config cannot differ.
+    """
+
+    def model_schema(self, schema: core_schema.ModelSchema) -> JsonSchemaValue:
+        """Return the schema of a record or a config."""
+        if issubclass(schema["cls"], Config):
+            return {"type": "object", "title": schema["cls"].__name__}
+        return super().model_schema(schema)
+
+
 def schema_stem(name: str) -> str:
     """Return the file name of a schema without its suffix, such as `metrics_course`."""
-    return re.sub(r"\W+", "_", name.replace(".json", "").replace("of the task ", "")).strip("_")
+    return re.sub(
+        r"\W+", "_", name.replace(".json", "").replace("of the task ", "").replace("of a ", "")
+    ).strip("_")
 
 
 def write_schema(name: str, kind: type[StoredFile]) -> str:
@@ -114,7 +140,9 @@ def write_schema(name: str, kind: type[StoredFile]) -> str:
         "title": name,
         **{
             key: value
-            for key, value in kind.model_json_schema(by_alias=True).items()
+            for key, value in kind.model_json_schema(
+                by_alias=True, schema_generator=RecordSchema
+            ).items()
             if key != "title"
         },
     }
@@ -157,10 +185,15 @@ def _capitalize(text: str) -> str:
 
 
 def _link(text: str) -> str:
-    """Return a type with a link for each record that it names."""
-    return re.sub(
-        r"\{residnet[\w.]*\.(\w+)\}", lambda match: f"[{match[1]}](#{match[1].lower()})", text
-    )
+    """Return a type with a link for each record that it names, and the names of config classes."""
+
+    def link(match: re.Match[str]) -> str:
+        kind = pydoc.locate(match[1])
+        assert isinstance(kind, type)
+        name = kind.__name__
+        return f"`{name}`" if issubclass(kind, Config) else f"[{name}](#{name.lower()})"
+
+    return re.sub(r"\{(residnet[\w.]*)\}", link, text)
 
 
 def list_undocumented() -> list[str]:

@@ -30,6 +30,7 @@ from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import Rollout
 from residnet.evaluation.band import read_bands
 from residnet.evaluation.derivatives import (
+    CovarianceNotes,
     DerivativesFile,
     compute_derivatives,
     read_covariance,
@@ -138,7 +139,9 @@ class Model:
             raise UsageError(
                 f"model {self.name}: an ensemble has no derivatives; take one of its members"
             )
-        covariance, has_correlations = read_covariance(self.notes, self.module.baseline)
+        covariance, has_correlations = read_covariance(
+            CovarianceNotes.model_validate(self.notes), self.module.baseline
+        )
         return compute_derivatives(
             self.spec,
             self.module,

@@ -11,7 +11,7 @@ import math
 import time
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, final
+from typing import Any, Generic, Literal, TypedDict, TypeVar, final
 
 import numpy as np
 import torch
@@ -408,7 +408,20 @@ def guard_policy(
     return GuardedPolicy(policy, limits, fallback, dtype).eval()
 
 
-class ExportedController(Exportable):
+GuardedT = TypeVar("GuardedT", GuardedPolicy, GuardedCoursePolicy)
+
+
+class CardParts(TypedDict, total=False):
+    """Entries of a model card that depend on the type of policy, see `ControllerCard`."""
+
+    reference: tuple[ReferenceQuantity, ...]
+    start: CourseStart
+    length: float
+    lookahead: float
+    memory: tuple[str, ...]
+
+
+class ExportedController(Exportable, Generic[GuardedT]):
     """Common parts of the export of steering policies and course policies.
 
     Args:
@@ -456,15 +469,15 @@ class ExportedController(Exportable):
         return self.policy.measured
 
     @abstractmethod
-    def build_controller(self, dtype: torch.dtype) -> GuardedPolicy | GuardedCoursePolicy:
+    def build_controller(self, dtype: torch.dtype) -> GuardedT:
         """Build the policy with input checks in a precision."""
 
     @abstractmethod
-    def parity_arguments(self, module: Any) -> Sequence[Tensor]:
+    def parity_arguments(self, module: GuardedT) -> Sequence[Tensor]:
         """Return the arguments [PARITY_STEPS, n] of the parity check, without the memory."""
 
     @abstractmethod
-    def describe_for_card(self, module: Any) -> dict[str, Any]:
+    def describe_for_card(self, module: GuardedT) -> CardParts:
         """Return the fields of the model card that depend on the type of policy."""
 
     def build_module(self, dtype: torch.dtype) -> nn.Module:
@@ -565,7 +578,7 @@ class ExportedController(Exportable):
 
 
 @final
-class ExportedHeading(ExportedController):
+class ExportedHeading(ExportedController[GuardedPolicy]):
     """Export of a heading or depth policy; some laws with a rudder rate need double precision."""
 
     schema: CardSchema = "residnet.policy_card/1"
@@ -579,7 +592,7 @@ class ExportedHeading(ExportedController):
     def build_controller(self, dtype: torch.dtype) -> GuardedPolicy:
         return guard_policy(self.policy, self.fallback, dtype)
 
-    def parity_arguments(self, module: Any) -> Sequence[Tensor]:
+    def parity_arguments(self, module: GuardedPolicy) -> Sequence[Tensor]:
         """Return sinusoidal measurements, and references that change in steps.
 
         Depths in m have the same values as headings in rad.
@@ -594,7 +607,7 @@ class ExportedHeading(ExportedController):
         y = torch.stack(measurements, dim=-1)
         return y, 0.5 * torch.sign(torch.sin(0.004 * step_index)).unsqueeze(-1)
 
-    def describe_for_card(self, module: Any) -> dict[str, Any]:
+    def describe_for_card(self, module: GuardedPolicy) -> CardParts:
         return {
             "reference": (
                 ReferenceQuantity(
@@ -602,12 +615,12 @@ class ExportedHeading(ExportedController):
                     unit=self.measured_units[self.steering_axis.value],
                 ),
             ),
-            "memory": [*module.policy.memory_ranges(1.0, 1.0), "last_command"],
+            "memory": (*module.policy.memory_ranges(1.0, 1.0), "last_command"),
         }
 
 
 @final
-class ExportedCoursePolicy(ExportedController):
+class ExportedCoursePolicy(ExportedController[GuardedCoursePolicy]):
     """Export of a heading policy with the guidance of a planned course."""
 
     schema: CardSchema = "residnet.course_card/1"
@@ -638,7 +651,7 @@ class ExportedCoursePolicy(ExportedController):
     def build_controller(self, dtype: torch.dtype) -> GuardedCoursePolicy:
         return GuardedCoursePolicy(self.policy, self.guidance, self.fallback).eval()
 
-    def parity_arguments(self, module: Any) -> Sequence[Tensor]:
+    def parity_arguments(self, module: GuardedCoursePolicy) -> Sequence[Tensor]:
         """Return measurements with cross-track errors, heading errors and a varying speed."""
         step_index = torch.arange(PARITY_STEPS, dtype=torch.float64)
         course = self.course
@@ -657,7 +670,7 @@ class ExportedCoursePolicy(ExportedController):
         )
         return (torch.stack(y, dim=-1),)
 
-    def describe_for_card(self, module: Any) -> dict[str, Any]:
+    def describe_for_card(self, module: GuardedCoursePolicy) -> CardParts:
         course = self.course
         n_guidance = module.guidance.n_state
         guidance_names = ("place", "drift_north", "drift_east")[:n_guidance]
@@ -667,10 +680,10 @@ class ExportedCoursePolicy(ExportedController):
             "start": CourseStart(north=north, east=east, heading=heading),
             "length": course.length,
             "lookahead": module.guidance.lookahead,
-            "memory": [
+            "memory": (
                 *guidance_names,
                 "rudder",
                 *(f"policy_{i}" for i in range(self.policy.n_state)),
                 "last_command",
-            ],
+            ),
         }

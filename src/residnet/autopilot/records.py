@@ -5,11 +5,14 @@ The keys are a contract with other programs; values are in SI units and rad.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
+from residnet.autopilot.heading.evaluation_config import EvaluationConditions, StepTestConfig
+from residnet.autopilot.heading.predictive import AnyController, PredictiveConfig
 from residnet.core.records import FileRecord, Record
+from residnet.identification.records import EpochRow
 
 ControllerKind = Literal[
     "policy",
@@ -118,6 +121,18 @@ class HeadingRow(Record):
         return self.settling.max
 
 
+class SimulatedSettings(Record):
+    """Settings of an autopilot run as simulated, with all times scaled by `pace`.
+
+    Attributes:
+        test: step test of all controllers.
+        conditions: operating conditions of tuning, training and evaluation; None for none.
+    """
+
+    test: StepTestConfig
+    conditions: EvaluationConditions | None = None
+
+
 class AutopilotMetricsFile(FileRecord):
     """metrics.json of the task `autopilot`: metrics of all controllers in all tests.
 
@@ -125,8 +140,7 @@ class AutopilotMetricsFile(FileRecord):
         run: name of the run.
         channels: metric -> its unit.
         floor: name of the controller that knows the vessel exactly; None without one.
-        flown: settings `test` and `conditions` of the config as simulated, with all times scaled by
-            `pace`.
+        flown: settings as simulated.
         rows: metrics of one controller in one test each.
     """
 
@@ -134,7 +148,7 @@ class AutopilotMetricsFile(FileRecord):
     run: str
     channels: dict[str, str]
     floor: str | None
-    flown: dict[str, Any]
+    flown: SimulatedSettings
     rows: tuple[HeadingRow, ...] = Field(min_length=1)
 
 
@@ -161,7 +175,7 @@ class ControllerNotes(Record):
     """Notes on the tuning or training of a controller; trained ones have further keys.
 
     Attributes:
-        config: config of a classical law with its tuned constants.
+        config: settings of a classical law with its tuned constants, or of a predictive autopilot.
         cost: mean cost of the tuned law in s.
         tried: number of sets of constants that the tuning simulated.
         seconds: duration of the tuning or training in s.
@@ -169,10 +183,24 @@ class ControllerNotes(Record):
 
     model_config = ConfigDict(extra="allow")
 
-    config: dict[str, Any] | None = None
+    config: AnyController | PredictiveConfig | None = None
     cost: float | None = None
     tried: int | None = None
     seconds: float | None = None
+
+
+class PolicyNotes(FileRecord):
+    """fit.json of a policy: notes on its training; there are further keys.
+
+    Attributes:
+        start_validation: mean cost in s over the validation simulations before the training.
+        training_history: mean cost by epoch.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    start_validation: float
+    training_history: tuple[EpochRow, ...] = Field(alias="curve")
 
 
 class ControllersFile(FileRecord):

@@ -12,6 +12,12 @@ from residnet.core.errors import UsageError
 from residnet.core.run_loader import read_json_value, require_listed
 
 RowT = TypeVar("RowT", bound="Record")
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+def with_explicit_defaults(settings: ModelT) -> ModelT:
+    """Return settings in which each default counts as set, so that a record writes it."""
+    return type(settings).model_validate(settings.model_dump(mode="json"))
 
 
 class Record(BaseModel):
@@ -24,6 +30,12 @@ class Record(BaseModel):
     model_config = ConfigDict(
         extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False
     )
+
+
+class OpenRecord(Record):
+    """A JSON object with some known keys; heads, baselines and other parts may add keys."""
+
+    model_config = ConfigDict(extra="allow")
 
 
 class StoredFile(BaseModel):

@@ -18,7 +18,7 @@ import io
 import itertools
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -32,7 +32,7 @@ from residnet.baselines.mmg import MMGBaseline
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import UsageError
 from residnet.core.names import FORCE_CHANNELS
-from residnet.core.records import FileRecord, Record
+from residnet.core.records import FileRecord, OpenRecord, Record, StoredFile
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.evaluation.records import Interval
@@ -768,28 +768,55 @@ def _describe_errors(has_errors: bool, has_correlations: bool) -> list[str]:
     return []
 
 
+class StandardErrorRow(OpenRecord):
+    """The standard error of a parameter in fit.json.
+
+    Attributes:
+        axis: name of the acceleration.
+        term: the regressor.
+        standard_error: standard error of the parameter.
+    """
+
+    axis: str
+    term: str
+    standard_error: float | None
+
+
+class CovarianceNotes(OpenRecord, StoredFile):
+    """The uncertainty of the parameters of a baseline in fit.json.
+
+    Attributes:
+        covariance: covariance [P][P] of the free parameters; None if it was not estimated.
+        coefficients: standard errors of the parameters.
+    """
+
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    coefficients: tuple[StandardErrorRow, ...] = ()
+
+
 def read_covariance(
-    notes: Mapping[str, Any], baseline: Baseline
-) -> tuple[list[list[float]] | None, bool]:
+    notes: CovarianceNotes, baseline: Baseline
+) -> tuple[Sequence[Sequence[float]] | None, bool]:
     """Return the covariance of the baseline's free parameters from the notes of a fit.
 
     Args:
-        notes: contents of fit.json.
+        notes: notes on the fit of the baseline.
         baseline: the fitted baseline.
 
     Returns:
         The covariance [P][P], None if unknown; and whether correlations are known. Baselines whose
         parameters are ratios of coefficients store standard errors only.
     """
-    if isinstance(covariance := notes.get("covariance"), list):
-        return covariance, True
+    if notes.covariance is not None:
+        return notes.covariance, True
     if not isinstance(baseline, ParametricBaseline):
         return None, False
     errors = {
-        (entry["axis"], entry["term"]): entry["standard_error"]
-        for entry in notes.get("coefficients", [])
+        (row.axis, row.term): row.standard_error
+        for row in notes.coefficients
+        if row.standard_error is not None
     }
     names = baseline.free_parameter_names()
-    if not names or any(errors.get(name) is None for name in names):
+    if not names or not errors.keys() >= {*names}:
         return None, False
     return np.diag([errors[name] ** 2 for name in names]).tolist(), False

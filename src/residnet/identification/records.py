@@ -12,16 +12,10 @@ from typing import Literal
 from pydantic import ConfigDict, Field
 
 from residnet.core.format import channel_title
-from residnet.core.records import FileRecord, Record
+from residnet.core.records import FileRecord, OpenRecord, Record
 
 Hyperparameter = float | str | tuple[float | str, ...]
 """A selected setting; several values where it differs between the axes."""
-
-
-class OpenRecord(Record):
-    """A JSON object with some known keys; a head or a baseline may add keys of its own."""
-
-    model_config = ConfigDict(extra="allow")
 
 
 class CoefficientRow(OpenRecord):

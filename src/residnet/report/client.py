@@ -11,7 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
@@ -26,6 +26,9 @@ from residnet.report.figure import Figure
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections import manoeuvres, runs
 from residnet.report.still import RC_PARAMS, render_matplotlib
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
 
 CLIENT_TEMPLATE = "client"
 """Name of the template that comes with residnet."""
@@ -168,7 +171,7 @@ def _compile(source: Path, template_file: Path) -> bytes:
     return bytes(pdf)
 
 
-def _draw_figures(run: RunFiles) -> Iterator[tuple[str, str, Any]]:
+def _draw_figures(run: RunFiles) -> Iterator[tuple[str, str, Canvas]]:
     """Yield name, caption and matplotlib figure of the figures of the report."""
     windows = run.read_split_windows(run.report_split)
     figures: list[Figure | None] = [
@@ -192,17 +195,17 @@ def _draw_figures(run: RunFiles) -> Iterator[tuple[str, str, Any]]:
             yield "derivatives", caption, _draw_derivatives(rows, derivatives.published or {})
     booklet = run.read_record(BookletFile, "booklet.json")
     if booklet is not None and any(page.split for page in booklet.pages):
-        canvas = _draw_repeated_indices(booklet)
-        if canvas is not None:
+        indices_canvas = _draw_repeated_indices(booklet)
+        if indices_canvas is not None:
             yield (
                 "repeated_indices",
                 "Predicted over measured indices of the repeated manoeuvres, with intervals;"
                 " filled symbols are held-out records.",
-                canvas,
+                indices_canvas,
             )
 
 
-def _draw_derivatives(rows: Sequence[DerivativeRow], published: Mapping[str, float]) -> Any:
+def _draw_derivatives(rows: Sequence[DerivativeRow], published: Mapping[str, float]) -> Canvas:
     """Return a chart of derivatives with error bars, one panel for each equation."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -239,7 +242,7 @@ def _draw_derivatives(rows: Sequence[DerivativeRow], published: Mapping[str, flo
     return canvas
 
 
-def _draw_repeated_indices(booklet: BookletFile) -> Any | None:
+def _draw_repeated_indices(booklet: BookletFile) -> Canvas | None:
     """Return a chart of predicted over measured indices, relative to the measured value."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG

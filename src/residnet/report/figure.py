@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import ClassVar, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -86,19 +86,17 @@ START_STYLE = GlyphStyle("start", kind="points", size=6, is_hollow=True, z_order
 ZERO_LINE_STYLE = GlyphStyle("", "#666666", width=0.8, kind="hline", z_order=1)
 
 
-def style_family(names: Iterable[str], **attributes: Any) -> dict[str, GlyphStyle]:
+def style_family(names: Iterable[str], width: float = 1.4) -> dict[str, GlyphStyle]:
     """Return a style for each name, distinguished by colour and line style.
 
     Args:
         names: names of the curves, which are also their labels.
-        attributes: further attributes of all styles.
+        width: width of all curves.
     """
     n_colors = len(COLORS)
     return {
         name: GlyphStyle(
-            name,
-            **{"color": COLORS[i % n_colors], "dash": DASHES[(i + i // n_colors) % n_colors]}
-            | attributes,
+            name, COLORS[i % n_colors], DASHES[(i + i // n_colors) % n_colors], width=width
         )
         for i, name in enumerate(names)
     }

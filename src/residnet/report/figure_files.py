@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,9 +30,27 @@ from residnet.report.figure import (
 from residnet.report.still import render_matplotlib, save_png
 
 
-def pack_columns(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Encode columns as 16-bit numbers with offset and step; equal columns are stored once."""
-    packed_columns: dict[str, Any] = {}
+class PackedColumn(NamedTuple):
+    """Numbers as 16-bit levels.
+
+    Attributes:
+        minimum: value of level 0.
+        step: difference between two levels.
+        levels: levels [T] as unsigned little-endian integers in base 64; 65,535 marks a gap.
+    """
+
+    minimum: float
+    step: float
+    levels: str
+
+
+PackedColumns = dict[str, PackedColumn | str]
+"""Columns by name; a column that is equal to an earlier one is the name of that one."""
+
+
+def pack_columns(columns: Mapping[str, np.ndarray]) -> PackedColumns:
+    """Encode columns as 16-bit numbers; equal columns are stored once."""
+    packed_columns: PackedColumns = {}
     stored: dict[bytes, str] = {}
     for name, values in columns.items():
         first_name = stored.setdefault(values.tobytes(), name)
@@ -50,16 +68,23 @@ def pack_columns(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
         step = span / 65_000 if span > 0 else 1.0
         levels = np.full(len(values), 65_535, dtype="<u2")
         levels[finite] = np.round((finite_values - minimum) / step)
-        packed_columns[name] = [minimum, step, base64.b64encode(levels.tobytes()).decode("ascii")]
+        text = base64.b64encode(levels.tobytes()).decode("ascii")
+        packed_columns[name] = PackedColumn(minimum, step, text)
     return packed_columns
 
 
-def unpack_column(columns: Mapping[str, Any], name: str) -> np.ndarray:
-    """Decode one of the columns of `pack_columns`, as numbers [T]."""
+def unpack_column(columns: Mapping[str, PackedColumn | str], name: str) -> np.ndarray:
+    """Decode one of the columns of `pack_columns`, as numbers [T].
+
+    Raises:
+        ValueError: if an equal column is itself the name of another one.
+    """
     packed_column = columns[name]
-    minimum, step, text = (
-        columns[packed_column] if isinstance(packed_column, str) else packed_column
-    )
+    if isinstance(packed_column, str):
+        packed_column = columns[packed_column]
+    if isinstance(packed_column, str):
+        raise ValueError(f"column {name} has no numbers")
+    minimum, step, text = packed_column
     levels = np.frombuffer(base64.b64decode(text), dtype="<u2")
     values: np.ndarray = np.where(levels == 65_535, np.nan, minimum + step * levels)
     return values
@@ -99,7 +124,7 @@ _FORMER_KINDS = {"across": "hline", "upright": "vline", "strip": "vspan"}
 """Kind of a curve by its name in files of earlier versions."""
 
 
-def _pack_curves(panel_curves: Mapping[str, Curve]) -> dict[str, Any]:
+def _pack_curves(panel_curves: Mapping[str, Curve]) -> PackedColumns:
     """Encode the curves of a panel, subsampled to the resolution of a screen."""
     columns: dict[str, np.ndarray] = {}
     for name, (x, y) in panel_curves.items():

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -54,8 +54,6 @@ from residnet.report.run_settings import (
 if TYPE_CHECKING:
     import pandas as pd
 
-JsonObject = Mapping[str, Any]
-"""A JSON object."""
 RecordT = TypeVar("RecordT", bound=StoredFile)
 _LOG_SET_NAME = "together"
 """Name in doctor.json of the findings on the set of all logs, instead of one log."""
@@ -157,18 +155,6 @@ class RunFiles:
         if not path.is_dir():
             raise UsageError(f"{path}: no such folder; give the folder of a run")
         self.path = path
-
-    def read_json(self, name: str) -> Any:
-        """Return the content of a JSON file of the folder; an empty object if it does not exist.
-
-        Raises:
-            UsageError: if the file cannot be read.
-        """
-        path = self.path / name
-        if not os.path.lexists(path):
-            return {}
-        require_listed(self.path, name)
-        return read_json_value(path, self.path)
 
     def read_parquet(self, name: str) -> pd.DataFrame | None:
         """Return a Parquet file of the folder as a data frame; None if it does not exist."""
@@ -284,7 +270,7 @@ class RunFiles:
         return metrics
 
     @cached_property
-    def resolved_config(self) -> JsonObject:
+    def resolved_config(self) -> Mapping[str, object]:
         """The configuration of the run with all its keys."""
         path = self.path / "resolved.yaml"
         return load_mapping(path) if path.is_file() else {}
@@ -576,7 +562,11 @@ class RunFiles:
     def model_settings(self, model: str) -> ModelSettings:
         """Return the description of a model (model.json); defaults if the file does not exist."""
         name = f"models/{model}/model.json"
-        return parse_settings(self.read_json(name), ModelSettings, self.path / name)
+        path = self.path / name
+        if not os.path.lexists(path):
+            return ModelSettings()
+        require_listed(self.path, name)
+        return parse_settings(read_json_value(path, self.path), ModelSettings, path)
 
     def describe_training_ranges(self, model: str) -> list[str]:
         """Return the training range of each velocity and input of a model with its unit.

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -36,6 +36,11 @@ _MAX_LABELLED_RATIO = 30.0
 """Ratio of the limits of a logarithmic axis up to which ticks between powers of ten have labels:
 more would overlap in a panel of two centimetres.
 """
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+
 _DASHES: dict[str, Any] = {
     "solid": "-",
     "dashed": "--",
@@ -79,7 +84,7 @@ def render_matplotlib(
     map_height: float = 0.0,
     *,
     is_rasterized: bool = True,
-) -> Any:
+) -> Canvas:
     """Return a matplotlib figure of a case: maps in one row, other panels below.
 
     Args:
@@ -117,11 +122,11 @@ def render_matplotlib(
         grid = canvas.add_gridspec(
             len(map_lines) + n_lines, n_map_columns * columns, height_ratios=[*map_lines, *heights]
         )
-        handles: dict[str, Any] = {}
+        handles: dict[str, Artist] = {}
         for position, number in enumerate(maps):
             cell = grid[0, columns * position : columns * (position + 1)]
             _draw_panel(canvas.add_subplot(cell), figure, case, number, handles)
-        shared: dict[str, Any] = {}
+        shared: dict[str, Axes] = {}
         for position, number in enumerate(other_panels):
             line, column = divmod(position, columns)
             cell = grid[
@@ -150,7 +155,7 @@ def render_matplotlib(
     return canvas
 
 
-def _wrap_axis_labels(canvas: Any) -> bool:
+def _wrap_axis_labels(canvas: Canvas) -> bool:
     """Break labels of axes that are longer than the space of their panel; return if any is.
 
     Only a drawn label has a length. The label of a horizontal axis may be wider than the axis,
@@ -161,6 +166,7 @@ def _wrap_axis_labels(canvas: Any) -> bool:
         x_extent = axes.xaxis.label.get_window_extent()
         y_extent = axes.yaxis.label.get_window_extent()
         grid_spec = axes.get_subplotspec()
+        assert grid_spec is not None
         column_width = canvas.bbox.width / grid_spec.get_gridspec().ncols
         center = (x_extent.x0 + x_extent.x1) / 2
         half_space = min(
@@ -181,7 +187,7 @@ def _wrap_axis_labels(canvas: Any) -> bool:
     return is_wrapped
 
 
-def draw_on_axes(figure: Figure, axes: Sequence[Any], panel_numbers: Sequence[int]) -> None:
+def draw_on_axes(figure: Figure, axes: Sequence[Axes], panel_numbers: Sequence[int]) -> None:
     """Draw panels of the first case on axes of the caller, in the style of the caller.
 
     Curves have labels, so that `legend()` of the axes lists them.
@@ -192,14 +198,14 @@ def draw_on_axes(figure: Figure, axes: Sequence[Any], panel_numbers: Sequence[in
         panel_numbers: numbers of the panels.
     """
     for panel_axes, number in zip(axes, panel_numbers, strict=True):
-        handles: dict[str, Any] = {}
+        handles: dict[str, Artist] = {}
         _draw_panel(panel_axes, figure, figure.cases[0], number, handles)
         for label, handle in handles.items():
             handle.set_label(label)
 
 
 def _draw_panel(
-    axes: Any, figure: Figure, case: Case, number: int, handles: dict[str, Any]
+    axes: Axes, figure: Figure, case: Case, number: int, handles: dict[str, Artist]
 ) -> None:
     """Draw one panel of a case.
 
@@ -210,6 +216,8 @@ def _draw_panel(
         number: index of the panel.
         handles: receives the legend handle of each label.
     """
+    from matplotlib.ticker import MaxNLocator
+
     panel = figure.panels[number]
     for name in figure.curve_names(number):
         style = figure.styles[name]
@@ -227,7 +235,9 @@ def _draw_panel(
     _format_axis(axes, "x", panel.x_log, panel.x_limits, panel.x_names)
     _format_axis(axes, "y", panel.y_log, panel.y_limits, panel.y_names)
     if not panel.x_names and not panel.x_log and figure.has_integer_axis(number):
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        locator = axes.xaxis.get_major_locator()
+        if isinstance(locator, MaxNLocator):
+            locator.set_params(integer=True)
     for panel_number, x_position, y_position, text in case.texts:
         if panel_number == number:
             # a text without a height is placed at the top of the panel
@@ -245,7 +255,7 @@ def _draw_panel(
 
 
 def _format_axis(
-    axes: Any,
+    axes: Axes,
     direction: Literal["x", "y"],
     is_logarithmic: bool,
     limits: Sequence[float],
@@ -280,10 +290,10 @@ def _format_axis(
         getattr(axes, f"set_{direction}lim")(*limits)
 
 
-def _draw_curve(axes: Any, style: GlyphStyle, x: np.ndarray, y: np.ndarray) -> Any:
+def _draw_curve(axes: Axes, style: GlyphStyle, x: np.ndarray, y: np.ndarray) -> Artist | None:
     """Draw one named curve and return its legend handle."""
     color = "black" if style.color == TEXT_COLOR else style.color
-    line = {"color": color, "alpha": style.alpha, "zorder": style.z_order}
+    line: dict[str, Any] = {"color": color, "alpha": style.alpha, "zorder": style.z_order}
     stroke = {**line, "linestyle": _DASHES[style.dash], "linewidth": style.width}
     if style.kind == "points":
         face_color = (
@@ -298,7 +308,7 @@ def _draw_curve(axes: Any, style: GlyphStyle, x: np.ndarray, y: np.ndarray) -> A
         )[0]
     if style.kind == "line":
         return axes.plot(x, y, **stroke)[0]
-    artist = None
+    artist: Artist | None = None
     if style.kind == "fill":
         for curve_part in split_at_gaps(x, y):
             artist = axes.fill(*curve_part, **line, linewidth=0)[0]
@@ -317,7 +327,7 @@ def _draw_curve(axes: Any, style: GlyphStyle, x: np.ndarray, y: np.ndarray) -> A
     return artist
 
 
-def _legend_above(canvas: Any, handles: dict[str, Any], width: float) -> int:
+def _legend_above(canvas: Canvas, handles: Mapping[str, Artist], width: float) -> int:
     """Place a legend above the panels, with the largest number of columns that fit.
 
     A legend that would be a long column has a smaller font. Returns the number of lines.
@@ -390,15 +400,17 @@ def draw_svg(figure: Figure) -> str:
     )
 
 
-def save_png(canvas: Any, path: Path, title: str, caption: str) -> None:
+def save_png(canvas: Canvas, path: Path, title: str, caption: str) -> None:
     """Write a PNG with title and caption as text metadata.
 
     A palette of 128 colours needs a third of the bytes. It is chosen by coverage of the colour
     space: a palette chosen by frequency would change the colours of thin lines.
     """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
+    assert isinstance(canvas.canvas, FigureCanvasAgg)
     picture = (
         Image.fromarray(np.asarray(canvas.canvas.buffer_rgba()))
         .convert("RGB")

@@ -12,9 +12,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from pydantic import ConfigDict, Field
 
 from residnet.core.errors import UsageError
 from residnet.core.format import DEGREES_PER_RADIAN, format_fixed
+from residnet.core.records import FileRecord, OpenRecord
 from residnet.evaluation.goodness import block_bootstrap_interval
 from residnet.report.blocks import Block, Cell, Column, Section, Text, build_table
 from residnet.report.figure import (
@@ -121,7 +123,7 @@ def sections(files: RunFiles) -> list[Section]:
     folder = files.path / "figures" / "moreno2019"
     figures = [
         _record_figure(records["test"]),
-        *grid_figures(files.read_json("models/rbf_joint/fit.json")),
+        *grid_figures(files.read_record(GridNotes, "models/rbf_joint/fit.json") or GridNotes()),
     ]
     blocks: list[Block] = [
         errors,
@@ -239,20 +241,53 @@ GridErrors = dict[tuple[float, float], float]
 """An error for each pair of penalty and width."""
 
 
-def grid_errors(notes: Mapping[str, Any]) -> tuple[GridErrors, GridErrors]:
+class GridPoint(OpenRecord):
+    """A choice of penalty and width by free runs over the validation logs.
+
+    Attributes:
+        penalty: penalty of each output.
+        sigma: width of the kernel of each output.
+        diverged: number of diverged validation windows.
+        validation_error: mean free-run error; None if it is not finite.
+    """
+
+    penalty: tuple[float, ...] | None = None
+    sigma: tuple[float, ...] | None = None
+    diverged: int = 0
+    validation_error: float | None = Field(default=None, alias="validation")
+
+
+class GridNotes(FileRecord):
+    """fit.json of a kernel ridge regression, whose penalty and width free runs have selected.
+
+    Attributes:
+        grid: the grid points.
+        cross_validated_error: mean square one-step error [widths][penalties][outputs].
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    grid: tuple[GridPoint, ...] = Field(default=(), alias="free_run_choice")
+    cross_validated_error: tuple[tuple[tuple[float, ...], ...], ...] = ()
+
+
+def grid_errors(notes: GridNotes) -> tuple[GridErrors, GridErrors]:
     """Return the validation and the one-step error by penalty and width of the radial kernel.
 
     Only grid points with equal values for all outputs are used. One-step errors are
     cross-validated and relative to the smallest one of each axis.
     """
     validation_errors: GridErrors = {}
-    for entry in notes.get("free_run_choice") or []:
-        values = [set(entry.get(key) or []) for key in ("penalty", "sigma")]
-        if all(len(value) == 1 for value in values) and not entry["diverged"]:
-            validation_errors[values[0].pop(), values[1].pop()] = float(entry["validation"])
+    for point in notes.grid:
+        penalties_of_point = {*(point.penalty or ())}
+        widths_of_point = {*(point.sigma or ())}
+        is_common = len(penalties_of_point) == len(widths_of_point) == 1
+        if is_common and not point.diverged and point.validation_error is not None:
+            grid_point = (penalties_of_point.pop(), widths_of_point.pop())
+            validation_errors[grid_point] = point.validation_error
     if not validation_errors:
         return {}, {}
-    errors = np.asarray(notes["cross_validated_error"])
+    errors = np.asarray(notes.cross_validated_error)
     # [widths, penalties, outputs]; outputs in different units are only comparable as ratios
     relative = (errors / errors.min(axis=(0, 1))).mean(axis=-1)
     penalties, widths = (
@@ -268,7 +303,7 @@ def grid_errors(notes: Mapping[str, Any]) -> tuple[GridErrors, GridErrors]:
     }
 
 
-def grid_figures(notes: Mapping[str, Any]) -> list[Figure]:
+def grid_figures(notes: GridNotes) -> list[Figure]:
     """Return Figures 5 and 6, the errors over penalty and width; empty if the notes lack them."""
     error_grids = grid_errors(notes)
     if not error_grids[0]:

@@ -10,7 +10,12 @@ from residnet.core.errors import UsageError
 from residnet.core.run_loader import name_damaged_key
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import load_model, resolve_model_name
-from residnet.evaluation.derivatives import DerivativesFile, compute_derivatives, read_covariance
+from residnet.evaluation.derivatives import (
+    CovarianceNotes,
+    DerivativesFile,
+    compute_derivatives,
+    read_covariance,
+)
 from residnet.physics.similarity import Particulars
 from residnet.runs.folder import RunFolder
 
@@ -48,7 +53,8 @@ def derive_run(
             raise UsageError(
                 f"model {name}: an ensemble has no derivatives; choose one of its members (--model)"
             )
-        covariance, has_correlations = read_covariance(run.read_fit_notes(name), module.baseline)
+        notes = CovarianceNotes.read_optional(run.path, f"models/{name}/fit.json")
+        covariance, has_correlations = read_covariance(notes or CovarianceNotes(), module.baseline)
     return compute_derivatives(
         spec,
         module,

@@ -16,7 +16,11 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.autopilot.base import Policy
-from residnet.autopilot.heading.controllers import ControllerConfig, ControlTask
+from residnet.autopilot.heading.controllers import (
+    ClassicalController,
+    ControllerConfig,
+    ControlTask,
+)
 from residnet.autopilot.heading.vessels import SteeredVessel
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
@@ -276,6 +280,10 @@ class DocumentConfig(_PredictiveLawConfig, ControllerConfig):
 
     def build(self, task: ControlTask) -> Policy:
         return self.build_law(self.build_exact_predictor(task), task)
+
+
+AnyController = Annotated[ClassicalController | DocumentConfig, Field(discriminator="kind")]
+"""Settings of a controller that is not trained: a classical law or the predictive one."""
 
 
 class PredictorSpec(Stored):

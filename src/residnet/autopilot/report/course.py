@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -124,7 +123,7 @@ def _iterate_course_figures(
         yield _spread_figure(spread_runs)
 
 
-def _run_styles(runs: Any, column: str) -> dict[str, GlyphStyle]:
+def _run_styles(runs: pd.DataFrame, column: str) -> dict[str, GlyphStyle]:
     """Return the style of the curves of each controller and guidance."""
     controllers = runs[column].drop_duplicates().tolist()
     model_pairs = runs[[column, "guidance"]].drop_duplicates()
@@ -218,7 +217,7 @@ def _protocol_case(
     return Case(protocol, panels, PROTOCOL_RULES[protocol], texts=side_labels)
 
 
-def _spread_figure(spread_runs: Any) -> Figure:
+def _spread_figure(spread_runs: pd.DataFrame) -> Figure:
     """Draw the course times of the random vessels relative to the reference course."""
     styles = _run_styles(spread_runs, "model")
     cases = []
@@ -226,7 +225,7 @@ def _spread_figure(spread_runs: Any) -> Figure:
         panel: dict[str, Curve] = {}
         medians = []
         runs_by_label = {
-            f"{m}{_GUIDANCE_SUFFIXES[g]}": is_selected
+            f"{m}{_GUIDANCE_SUFFIXES[str(g)]}": is_selected
             for (m, g), is_selected in runs.groupby(["model", "guidance"])
         }
         for line_index, name in enumerate(styles):

@@ -14,8 +14,13 @@ from pydantic import Field
 
 from residnet.autopilot.evaluation import describe_limit_cycles, list_unsuitable_conditions
 from residnet.autopilot.heading.conditions import ConditionsConfig, settled_time
-from residnet.autopilot.records import AutopilotMetricsFile, ControllersFile, HeadingRow
-from residnet.autopilot.tasks.autopilot.config import EvaluationConditions, StepTestConfig
+from residnet.autopilot.heading.evaluation_config import EvaluationConditions, StepTestConfig
+from residnet.autopilot.records import (
+    AutopilotMetricsFile,
+    ControllersFile,
+    HeadingRow,
+    PolicyNotes,
+)
 from residnet.core.format import DEGREES_PER_RADIAN, format_signed
 from residnet.report.blocks import (
     Block,
@@ -43,8 +48,8 @@ from residnet.report.figure import (
     style_family,
 )
 from residnet.report.figure_files import figures_section, read_figures, write_figures
-from residnet.report.run_reader import JsonObject, RunFiles
-from residnet.report.run_settings import ShownSettings, parse_settings
+from residnet.report.run_reader import RunFiles
+from residnet.report.run_settings import ShownSettings, read_settings
 
 RESPONSES_FILE = "flights.parquet"
 """File of the responses at the corners of the parameter ranges."""
@@ -110,8 +115,10 @@ RowsByProtocol = Mapping[str, HeadingRow]
 
 def _read_simulated_settings(run: RunFiles, metrics: AutopilotMetricsFile) -> AutopilotSettings:
     """Return the settings with all times scaled by the pace, as simulated."""
-    content = {**run.resolved_config, **metrics.flown}
-    return parse_settings(content, AutopilotSettings, run.path / "resolved.yaml")
+    settings = read_settings(run.path, AutopilotSettings)
+    return settings.model_copy(
+        update={"test": metrics.flown.test, "conditions": metrics.flown.conditions}
+    )
 
 
 def axis_words(test: StepTestConfig | ConditionsConfig) -> AxisWords:
@@ -157,14 +164,14 @@ def _iterate_autopilot_figures(
     conditioned = run.read_parquet(CONDITIONS_FILE)
     if conditioned is not None:
         yield _cost_figure(conditioned, conditioned_kinds, run.title, axis_labels)
-    fit_notes = {
-        name: run.read_json(f"models/{name}/fit.json")
+    training_notes = {
+        name: run.read_required_record(PolicyNotes, f"models/{name}/fit.json")
         for name, policy in settings.policies.items()
         # a tuned law has no training
         if policy.training is not None
     }
-    if fit_notes:
-        yield _learning_figure(fit_notes, run.title)
+    if training_notes:
+        yield _learning_figure(training_notes, run.title)
 
 
 def _controller_styles(kinds: Mapping[str, str]) -> dict[str, GlyphStyle]:
@@ -416,15 +423,17 @@ def _cost_figure(
     )
 
 
-def _learning_figure(notes_by_policy: Mapping[str, JsonObject], name: str) -> Figure:
+def _learning_figure(notes_by_policy: Mapping[str, PolicyNotes], name: str) -> Figure:
     """Draw the cost over the validation simulations, from the start of the training on."""
     panel: dict[str, Curve] = {}
-    for policy, fit in notes_by_policy.items():
-        curve = [point for point in fit["curve"] if "validation" in point]
-        epochs = np.array([0.0, *(point["epoch"] + 1.0 for point in curve)])
-        start_cost = fit["start_validation"]
-        panel[policy] = (epochs, np.array([start_cost, *(point["validation"] for point in curve)]))
-        panel[f"{policy}, start"] = (epochs[:1], np.array([start_cost]))
+    for policy, notes in notes_by_policy.items():
+        costs = {0.0: notes.start_validation} | {
+            row.epoch + 1.0: row.validation_error
+            for row in notes.training_history
+            if row.validation_error is not None
+        }
+        panel[policy] = (np.array([*costs]), np.array([*costs.values()]))
+        panel[f"{policy}, start"] = (np.zeros(1), np.array([notes.start_validation]))
     styles = _controller_styles(dict.fromkeys(notes_by_policy, "policy"))
     start_styles = {
         f"{policy}, start": replace(ZERO_LINE_STYLE, label="start", dash="dotted")

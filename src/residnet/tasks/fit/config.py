@@ -142,7 +142,7 @@ class FitConfig(FitSettings, PackageTask, ComputingTask):
         write_fit_figures(files)
         sections = fit_sections(files)
         study = files.resolved_config.get("study")
-        if study is not None and "test" in files.splits:
+        if isinstance(study, str) and "test" in files.splits:
             sections += find_fit_study(study).sections(files)
         return sections
 

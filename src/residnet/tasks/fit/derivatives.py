@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from residnet.core.errors import UsageError
 from residnet.core.progress import log_message
-from residnet.evaluation.derivatives import compute_derivatives, read_covariance
+from residnet.evaluation.derivatives import CovarianceNotes, compute_derivatives, read_covariance
 from residnet.identification.fitter import FittedModel
 from residnet.physics.similarity import DerivativesConfig
 from residnet.runs.folder import RunFolder
@@ -23,7 +23,7 @@ def write_derivatives(
     for path, (scale, density_ratio) in scales.items():
         try:
             covariance, has_correlations = read_covariance(
-                fitted_model.notes, fitted_model.model.baseline
+                CovarianceNotes.model_validate(fitted_model.notes), fitted_model.model.baseline
             )
             table = compute_derivatives(
                 fitted_model.spec,

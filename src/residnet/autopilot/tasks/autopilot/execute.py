@@ -56,6 +56,7 @@ from residnet.autopilot.records import (
     ControllerNotes,
     ControllersFile,
     HeadingRow,
+    SimulatedSettings,
     TurningParameters,
 )
 from residnet.autopilot.report.heading import (
@@ -71,6 +72,7 @@ from residnet.autopilot.report.heading import (
 from residnet.autopilot.training.fit import train_policy
 from residnet.autopilot.training.predictor import train_or_resume_controller
 from residnet.core.progress import begin_stage, log_message, report_progress
+from residnet.core.records import with_explicit_defaults
 from residnet.dynamics.store import rebuild_module
 from residnet.engine.compiled import CompiledRollout
 from residnet.evaluation.metrics import SCHEMA
@@ -81,11 +83,9 @@ from residnet.runs.model_store import RunModelStore
 from residnet.runs.task import ExportRequest, SummaryMetric, TaskOutcome
 
 if TYPE_CHECKING:
-    from residnet.autopilot.tasks.autopilot.config import (
-        AnyController,
-        AutopilotConfig,
-        EvaluationConditions,
-    )
+    from residnet.autopilot.heading.evaluation_config import EvaluationConditions
+    from residnet.autopilot.heading.predictive import AnyController
+    from residnet.autopilot.tasks.autopilot.config import AutopilotConfig
 
 Controllers = dict[str, tuple[ControllerKind, Policy]]
 """Role (policy, classical, floor and others) and controller by name."""
@@ -157,7 +157,10 @@ def execute(config: AutopilotConfig, folder: RunFolder) -> TaskOutcome:
             run=config.name,
             channels=channels,
             floor=config.floor,
-            flown=config.model_dump(mode="json", include={"test", "conditions"}),
+            flown=SimulatedSettings(
+                test=with_explicit_defaults(config.test),
+                conditions=config.conditions and with_explicit_defaults(config.conditions),
+            ),
             rows=tuple(rows),
         ),
     )
@@ -183,7 +186,7 @@ def _tune_peer(
     """Tune the missing constants of a classical law; return it and notes."""
     evaluation_conditions = config.conditions
     if not isinstance(peer, TunableConfig) or None not in peer.parameter_values().values():
-        return peer, ControllerNotes(config=peer.model_dump(mode="json"))
+        return peer, ControllerNotes(config=with_explicit_defaults(peer))
     assert evaluation_conditions is not None
     start_time = time.time()
     begin_stage(f"tuning {name}")
@@ -201,7 +204,7 @@ def _tune_peer(
     log_message(f"  tuned {name}: {constants}, cost {tuning.cost:.3f} s")
     tuned_peer = peer.with_parameters(tuning.parameters)
     return tuned_peer, ControllerNotes(
-        config=tuned_peer.model_dump(mode="json"),
+        config=with_explicit_defaults(tuned_peer),
         cost=tuning.cost,
         tried=tuning.n_candidates,
         seconds=round(time.time() - start_time, 1),

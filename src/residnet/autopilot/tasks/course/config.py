@@ -13,8 +13,9 @@ from pydantic import Field, model_validator
 from residnet.autopilot.courses.config import BuoyCourseConfig, plan_course, smallest_turn
 from residnet.autopilot.courses.course_check import PassingRule
 from residnet.autopilot.guidance import AnyLineOfSight
+from residnet.autopilot.heading.predictive import AnyController
 from residnet.autopilot.heading.steering_variation import Vessels
-from residnet.autopilot.tasks.autopilot.config import AnyController, AutopilotConfig
+from residnet.autopilot.tasks.autopilot.config import AutopilotConfig
 from residnet.core.config import (
     Config,
     ExistingPath,

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pandas as pd
 import torch
-from pydantic import TypeAdapter
 from torch import Tensor
 
 from residnet.autopilot.base import ClosedLoop, Policy, Reference
@@ -32,7 +31,7 @@ from residnet.autopilot.guidance import (
     WaypointGuidance,
     WheelOver,
 )
-from residnet.autopilot.heading.controllers import ControlTask
+from residnet.autopilot.heading.controllers import ControllerConfig, ControlTask
 from residnet.autopilot.heading.policies import SteeringPolicy
 from residnet.autopilot.heading.steering_variation import NOMINAL, Vessels
 from residnet.autopilot.heading.turning import NomotoModel
@@ -46,7 +45,7 @@ from residnet.autopilot.records import (
     SmallestTurn,
 )
 from residnet.autopilot.report.course import COURSES_FILE, SPREAD_FILE, TRACKS_FILE, tables_text
-from residnet.autopilot.tasks.autopilot.config import AnyController, AutopilotConfig
+from residnet.autopilot.tasks.autopilot.config import AutopilotConfig
 from residnet.autopilot.tasks.autopilot.execute import load_trained_policy
 from residnet.autopilot.training.predictor import load_predictive_controller
 from residnet.core.errors import ExportError
@@ -139,7 +138,6 @@ def execute(config: CourseTaskConfig, folder: RunFolder) -> TaskOutcome:
 def _load_controllers(config: CourseTaskConfig, autopilot_run: AutopilotRun) -> dict[str, Policy]:
     """Return the trained policy, the peers of the autopilot run and other controllers by name."""
     trained_policy = load_policy(autopilot_run, config.policy)
-    controller_adapter: TypeAdapter[AnyController] = TypeAdapter(AnyController)
     policies: dict[str, Policy] = {}
     for name in config.peers:
         if name in autopilot_run.autopilot.predictive:
@@ -151,9 +149,9 @@ def _load_controllers(config: CourseTaskConfig, autopilot_run: AutopilotRun) -> 
             )
         else:
             # the constants as the autopilot run tuned them
-            policies[name] = controller_adapter.validate_python(
-                autopilot_run.peer_notes[name].config
-            ).build(autopilot_run.steering)
+            tuned_law = autopilot_run.peer_notes[name].config
+            assert isinstance(tuned_law, ControllerConfig)
+            policies[name] = tuned_law.build(autopilot_run.steering)
     policies |= {
         name: policy.build(autopilot_run.steering) for name, policy in config.others.items()
     }
