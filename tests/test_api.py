@@ -18,7 +18,7 @@ from tiny import TINY
 import residnet
 from residnet.core.config import validate_config
 from residnet.core.errors import ResidnetError, UsageError
-from residnet.evaluation.metrics import build_metrics_table
+from residnet.evaluation.metrics_file import build_metrics_table
 from residnet.evaluation.protocol import EvaluationConfig
 from residnet.evaluation.records import MetricsFile
 from residnet.export import vessel

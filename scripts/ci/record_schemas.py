@@ -28,15 +28,13 @@ from residnet.autopilot.records import (
 from residnet.core.config import Config
 from residnet.core.records import StoredFile
 from residnet.core.run_records import ExportsFile, ProvenanceFile, SummaryFile
+from residnet.evaluation.booklet_records import BookletFile, IndicesFile
+from residnet.evaluation.data_records import DataQualityFile, ExcitationFile
 from residnet.evaluation.derivatives import DerivativesFile
+from residnet.evaluation.limits_records import LimitsFile
 from residnet.evaluation.records import (
     BandsFile,
-    BookletFile,
-    DataQualityFile,
-    ExcitationFile,
     GoodnessFile,
-    IndicesFile,
-    LimitsFile,
     MetricsFile,
     SanityFile,
     SelectionFile,

@@ -14,21 +14,20 @@ from residnet.baselines.given_config import ZeroBaselineConfig
 from residnet.core.layout import DegreesOfFreedom
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.evaluation.freerun import Candidate, FreeRun, FreeRunErrors, Prediction
-from residnet.evaluation.metrics import (
-    ProtocolEvaluation,
+from residnet.evaluation.intervals import (
     WindowErrors,
     bootstrap_intervals,
     bootstrap_tail_probability,
-    build_metrics_file,
-    build_metrics_table,
     estimate_spread_between_logs,
-    find_row,
     make_resampling_blocks,
     paired_difference,
     prediction_intervals,
 )
+from residnet.evaluation.limits_records import OutsideRange
+from residnet.evaluation.metrics import ProtocolEvaluation
+from residnet.evaluation.metrics_file import build_metrics_file, build_metrics_table, find_row
 from residnet.evaluation.protocol import Window, WindowProtocol
-from residnet.evaluation.records import BlockCount, ModelKind, OutsideRange, PairedDifference
+from residnet.evaluation.records import BlockCount, ModelKind, PairedDifference
 from residnet.evaluation.selection import block_error_shares, make_selection_blocks
 from residnet.heads.base import ZeroHead
 from residnet.physics.signals_config import SignalsConfig

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from residnet.core.errors import ResidnetError
-from residnet.evaluation.metrics import build_metrics_file
+from residnet.evaluation.metrics_file import build_metrics_file
 from residnet.evaluation.records import MetricsFile, MetricsRow
 
 

@@ -7,17 +7,19 @@ from typing import Any
 
 import pytest
 
-from residnet.evaluation.records import (
-    BlockCount,
-    ExcitationFile,
+from residnet.evaluation.data_records import ExcitationFile
+from residnet.evaluation.limits_records import (
     HorizonRow,
     KinematicErrors,
-    MetricsRow,
-    ModelKind,
     OutsideRange,
-    PairedDifference,
     PoseErrors,
     ProtocolLimits,
+)
+from residnet.evaluation.records import (
+    BlockCount,
+    MetricsRow,
+    ModelKind,
+    PairedDifference,
     SelectionFile,
     SelectionRow,
 )

@@ -24,7 +24,7 @@ from residnet.autopilot.report import course, roll
 from residnet.autopilot.report import heading as autopilot
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.evaluation.metrics import bootstrap_intervals, make_resampling_blocks
+from residnet.evaluation.intervals import bootstrap_intervals, make_resampling_blocks
 from residnet.report.blocks import Section
 from residnet.report.fit import fit_sections
 from residnet.report.page import write_page

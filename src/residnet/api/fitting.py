@@ -29,9 +29,11 @@ from residnet.core.names import suggest_name
 from residnet.core.processes import worker_limit
 from residnet.core.progress import ProgressCallback
 from residnet.core.trust import trusting
-from residnet.evaluation.metrics import build_metrics_table, iterate_rollout_columns, mark_selected
+from residnet.evaluation.data_records import ExcitationFile
+from residnet.evaluation.metrics_file import build_metrics_table, mark_selected
 from residnet.evaluation.protocol import WindowProtocol
-from residnet.evaluation.records import ExcitationFile, MetricsRow
+from residnet.evaluation.records import MetricsRow
+from residnet.evaluation.rollout_tables import iterate_rollout_columns
 from residnet.evaluation.selection import Selection
 from residnet.evaluation.verdict import VerdictEvidence, order_protocols, write_verdict
 from residnet.heads import HeadConfig

@@ -32,7 +32,7 @@ from residnet.core.run_loader import SIZE_LIMITS
 from residnet.core.run_records import SummaryFile
 from residnet.core.trust import trusting
 from residnet.evaluation.booklet import build_index_rows
-from residnet.evaluation.metrics import build_metrics_table
+from residnet.evaluation.metrics_file import build_metrics_table
 from residnet.heads import HeadConfig
 from residnet.heads.config import FeatureConfig
 from residnet.manoeuvres import ManoeuvreConfig

@@ -15,7 +15,7 @@ from residnet.core.config import Config, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
-from residnet.evaluation.records import (
+from residnet.evaluation.booklet_records import (
     BookletFile,
     BookletIndex,
     BookletRow,
@@ -108,7 +108,7 @@ class BookletPage:
         name: name of the page.
         manoeuvre: the simulated manoeuvre.
         runs: simulation with the estimated parameters, then with drawn ones.
-        indices: indices of each run; empty for a failed or diverged run.
+        indices: indices of each run that are numbers; empty for a failed or diverged run.
         limits: limits of IMO for the ship.
         measured_log: measured log that was repeated; None for a standard manoeuvre.
         split: split of that log.
@@ -118,11 +118,16 @@ class BookletPage:
     name: str
     manoeuvre: Manoeuvre
     runs: Sequence[ManoeuvreRun]
-    indices: Sequence[Mapping[str, Any]]
+    indices: Sequence[Mapping[str, float]]
     limits: Mapping[str, float]
     measured_log: Log | None
     split: str
-    measured_indices: Mapping[str, Any]
+    measured_indices: Mapping[str, float]
+
+
+def select_scalar_indices(indices: Mapping[str, float | Sequence[float]]) -> dict[str, float]:
+    """Return the indices that are numbers; those of a spiral are lists."""
+    return {name: value for name, value in indices.items() if isinstance(value, int | float)}
 
 
 def build_booklet(
@@ -266,11 +271,7 @@ def _page_row(
         scale: ratio of the lengths of the ship and the vessel.
         level: nominal coverage of the intervals.
     """
-    names = [
-        name
-        for name, value in page.indices[0].items()
-        if name in INDEX_UNITS and not isinstance(value, list)
-    ]
+    names = [name for name in page.indices[0] if name in INDEX_UNITS]
     indices = {
         name: _index_summary(
             page, name, [by_name[name] for by_name in other_errors if name in by_name], length,
@@ -299,7 +300,7 @@ def _index_summary(
     level: float,
 ) -> BookletIndex:
     """Return one index with its interval over draws and, where they are known, its references."""
-    value = float(page.indices[0][name])
+    value = page.indices[0][name]
     draws = _index_draws(page, name)
     predictions = add_model_error(draws, errors)
     froude_factor = scale ** _FROUDE_EXPONENTS[INDEX_UNITS[name]]
@@ -316,8 +317,8 @@ def _index_summary(
         summary["lengths"] = value / length
     if name in page.measured_indices:
         summary |= {
-            "measured": float(page.measured_indices[name]),
-            "difference": value - float(page.measured_indices[name]),
+            "measured": page.measured_indices[name],
+            "difference": value - page.measured_indices[name],
         }
     if name in page.limits:
         limit = page.limits[name]

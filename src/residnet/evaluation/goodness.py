@@ -13,7 +13,8 @@ import scipy
 from residnet.core.frames import wrap_angle_array
 from residnet.core.layout import HEADING, POSE, POSITION
 from residnet.core.names import ACCELERATION_NAMES
-from residnet.evaluation.metrics import CONFIDENCE_LEVEL, bootstrap_tail_probability
+from residnet.evaluation.intervals import CONFIDENCE_LEVEL, bootstrap_tail_probability
+from residnet.evaluation.limits_records import Repeatability, RepeatDifferences, RepeatTolerance
 from residnet.evaluation.protocol import ProtocolConfig, Window
 from residnet.evaluation.records import (
     GoodnessFile,
@@ -21,9 +22,6 @@ from residnet.evaluation.records import (
     Interval,
     MaeDifference,
     ModelKind,
-    Repeatability,
-    RepeatDifferences,
-    RepeatTolerance,
 )
 from residnet.preprocessing.prepare import PreparedLog
 

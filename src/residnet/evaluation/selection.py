@@ -17,7 +17,7 @@ import numpy as np
 from residnet.core.format import format_number
 from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.evaluation.freerun import FreeRun, FreeRunErrors
-from residnet.evaluation.metrics import MIN_LOGS_AS_BLOCKS, TARGET_BLOCKS
+from residnet.evaluation.intervals import MIN_LOGS_AS_BLOCKS, TARGET_BLOCKS
 from residnet.evaluation.records import BlockCount, SelectionFile, SelectionRow
 from residnet.preprocessing.prepare import PreparedLog
 

@@ -16,15 +16,9 @@ from residnet.core.format import (
 )
 from residnet.core.model_names import CONSTANT_VELOCITY, PLANT
 from residnet.core.names import POSE_ERROR_UNITS
-from residnet.evaluation.records import (
-    ExcitationFile,
-    HorizonRow,
-    MetricsRow,
-    PairedDifference,
-    PoseErrors,
-    ProtocolLimits,
-    SelectionFile,
-)
+from residnet.evaluation.data_records import ExcitationFile
+from residnet.evaluation.limits_records import HorizonRow, PoseErrors, ProtocolLimits
+from residnet.evaluation.records import MetricsRow, PairedDifference, SelectionFile
 
 UNSEEN_SPLITS = ("test", "external")
 """Splits that are not used in a fit."""

@@ -21,7 +21,7 @@ from residnet.dynamics.domain_config import (
     OperatingDomain,
     describe_domain,
 )
-from residnet.evaluation.records import DirectionRow, ExcitationFile, InputExcitationRow
+from residnet.evaluation.data_records import DirectionRow, ExcitationFile, InputExcitationRow
 from residnet.identification.domain import MAX_VARIANCE_INFLATION, detect_feedback_of_logs
 from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.prepare import PreparedLog

@@ -21,9 +21,11 @@ from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.evaluation.band import BandsByModel
 from residnet.evaluation.freerun import Candidate, FreeRun, run_free_runs
 from residnet.evaluation.goodness import OneStepResiduals, build_goodness_table
-from residnet.evaluation.metrics import ProtocolEvaluation, build_metrics_table
+from residnet.evaluation.limits_records import ProtocolLimits
+from residnet.evaluation.metrics import ProtocolEvaluation
+from residnet.evaluation.metrics_file import build_metrics_table
 from residnet.evaluation.protocol import EvaluationConfig
-from residnet.evaluation.records import GoodnessRow, MetricsRow, ProtocolLimits, SanityRow
+from residnet.evaluation.records import GoodnessRow, MetricsRow, SanityRow
 from residnet.evaluation.selection import (
     Selection,
     SelectionCandidate,
@@ -69,7 +71,7 @@ class SplitEvaluation:
 
     @property
     def metrics_table(self) -> pd.DataFrame:
-        """The rows as a table, see `residnet.evaluation.metrics.build_metrics_table`."""
+        """The rows as a table, see `residnet.evaluation.metrics_file.build_metrics_table`."""
         return build_metrics_table(self.rows)
 
 

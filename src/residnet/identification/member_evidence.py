@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 import scipy
 
-from residnet.evaluation.metrics import MIN_LOGS_AS_BLOCKS
+from residnet.evaluation.intervals import MIN_LOGS_AS_BLOCKS
 from residnet.evaluation.protocol import Window
 
 SIGNIFICANCE_LEVEL = 0.05

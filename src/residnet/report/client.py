@@ -18,8 +18,8 @@ from pydantic import Field
 from residnet.core.config import Config, load_mapping, validate_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import write_owned
+from residnet.evaluation.booklet_records import BookletFile
 from residnet.evaluation.derivatives import DerivativeRow, DerivativesFile
-from residnet.evaluation.records import BookletFile
 from residnet.io.readers.base import optional_import
 from residnet.report.client_content import build_sections
 from residnet.report.figure import Figure

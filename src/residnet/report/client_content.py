@@ -16,8 +16,9 @@ from pydantic import JsonValue
 from residnet.core.format import DASH, display_unit, format_interval, format_number
 from residnet.core.run_records import SummaryFile
 from residnet.core.version import __version__
+from residnet.evaluation.booklet_records import BookletFile, BookletIndex, BookletRow
 from residnet.evaluation.derivatives import DerivativeRow, DerivativesFile
-from residnet.evaluation.records import BookletFile, BookletIndex, BookletRow, MetricsRow
+from residnet.evaluation.records import MetricsRow
 from residnet.physics.similarity import is_rudder
 from residnet.report.run_reader import RunFiles
 from residnet.report.run_settings import ModelSettings

@@ -24,21 +24,18 @@ from residnet.core.run_loader import read_json_value, require_listed
 from residnet.core.run_records import ProvenanceFile, SummaryFile
 from residnet.core.units import canonical_unit
 from residnet.evaluation.assessment import Assessment, CardFinding, name_splits
-from residnet.evaluation.metrics import INPUT_PREFIX, state_column_names
+from residnet.evaluation.data_records import DataQualityFile, LogQuality
+from residnet.evaluation.limits_records import HorizonRow, LimitsFile, ProtocolLimits
 from residnet.evaluation.records import (
     BandRow,
     BandsFile,
-    DataQualityFile,
-    HorizonRow,
-    LimitsFile,
-    LogQuality,
     MetricsFile,
     MetricsRow,
-    ProtocolLimits,
     SanityFile,
     SanityRow,
     SelectionFile,
 )
+from residnet.evaluation.rollout_tables import INPUT_PREFIX, state_column_names
 from residnet.evaluation.verdict import find_main_horizon, order_protocols
 from residnet.identification.records import FitNotes
 from residnet.quality.records import InspectionFile

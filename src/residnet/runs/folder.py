@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from residnet.core.records import StoredFile
-    from residnet.evaluation.records import ExcitationFile, MetricsFile
+    from residnet.evaluation.data_records import ExcitationFile
+    from residnet.evaluation.records import MetricsFile
 
 
 SUMMARY_SCHEMA: Final = "residnet.summary/1"
@@ -289,7 +290,7 @@ class RunFolder:
 
     def read_excitation(self) -> ExcitationFile | None:
         """Return the contents of excitation.json; None for runs of earlier versions."""
-        from residnet.evaluation.records import ExcitationFile
+        from residnet.evaluation.data_records import ExcitationFile
 
         return ExcitationFile.read_optional(self.path, self.excitation.name)
 

@@ -13,7 +13,7 @@ import pandas as pd
 from residnet.core.errors import UsageError
 from residnet.core.format import format_number, format_signed
 from residnet.core.ownership import record_folder
-from residnet.evaluation.metrics import make_resampling_blocks, paired_difference
+from residnet.evaluation.intervals import make_resampling_blocks, paired_difference
 from residnet.evaluation.records import PairedDifference
 from residnet.report.blocks import Cell, Section, Table, build_table, format_paired_interval
 from residnet.report.figure import MAX_PREVIEW_HEIGHT, Case, Figure, Panel, style_family

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 from residnet.core.format import DASH, DEGREES_PER_RADIAN, format_minus_signs, format_number
-from residnet.evaluation.records import LogQuality
+from residnet.evaluation.data_records import LogQuality
 from residnet.quality.records import (
     COMPATIBILITY_FILE,
     CompatibilityFile,

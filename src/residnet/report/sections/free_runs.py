@@ -18,12 +18,8 @@ from residnet.core.format import (
     join_list,
 )
 from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY
-from residnet.evaluation.records import (
-    MetricsRow,
-    PairedDifference,
-    ProtocolLimits,
-    Repeatability,
-)
+from residnet.evaluation.limits_records import ProtocolLimits, Repeatability
+from residnet.evaluation.records import MetricsRow, PairedDifference
 from residnet.evaluation.verdict import describe_divergence, format_pose_error
 from residnet.report.blocks import (
     Block,

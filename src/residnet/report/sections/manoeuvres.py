@@ -25,7 +25,7 @@ from residnet.core.format import (
     format_number,
 )
 from residnet.core.log import Log
-from residnet.evaluation.records import (
+from residnet.evaluation.booklet_records import (
     BookletFile,
     BookletIndex,
     BookletRow,

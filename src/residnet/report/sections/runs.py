@@ -15,7 +15,7 @@ from residnet.core.layout import DegreesOfFreedom
 from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY, PLANT
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.stretches import find_runs
-from residnet.evaluation.metrics import state_column_names
+from residnet.evaluation.rollout_tables import state_column_names
 from residnet.report.figure import (
     COLORS,
     DASHED_STYLE,

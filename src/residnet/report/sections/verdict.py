@@ -15,13 +15,8 @@ from residnet.core.format import (
     format_percent_change,
 )
 from residnet.core.model_names import CONSTANT_VELOCITY
-from residnet.evaluation.records import (
-    SANITY_CHECKS,
-    ExcitationFile,
-    Interval,
-    MetricsRow,
-    SanityRow,
-)
+from residnet.evaluation.data_records import ExcitationFile
+from residnet.evaluation.records import SANITY_CHECKS, Interval, MetricsRow, SanityRow
 from residnet.evaluation.verdict import (
     DO_NOT_USE,
     GOOD_LEVEL,

@@ -18,7 +18,7 @@ from residnet.autopilot.actuator_lag import fit_lag, simulate_lagged_force
 from residnet.core.config import Config, ConfigPath, Seconds
 from residnet.core.errors import ConfigError, DataError, FitError
 from residnet.core.layout import ACCELERATIONS, PLANAR_LAYOUT, POSE, VELOCITIES
-from residnet.evaluation.metrics import (
+from residnet.evaluation.intervals import (
     ResamplingBlocks,
     bootstrap_intervals,
     make_resampling_blocks,

@@ -16,7 +16,12 @@ from residnet.core.layout import ROLL_LAYOUT
 from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES, suggest_name
 from residnet.dynamics.ensemble import SampledDynamics
-from residnet.evaluation.booklet import BookletConfig, BookletPage, build_booklet
+from residnet.evaluation.booklet import (
+    BookletConfig,
+    BookletPage,
+    build_booklet,
+    select_scalar_indices,
+)
 from residnet.identification.fitter import FitStore, FittedModel, Fitter
 from residnet.identification.prepared import PreparedSplits
 from residnet.identification.settings import FitSettings
@@ -430,12 +435,15 @@ def _make_page(
             " cover them"
         )
     indices = [
-        manoeuvre.compute_indices(flight.true_log, None) if is_valid_flight(flight, limit) else {}
+        select_scalar_indices(manoeuvre.compute_indices(flight.true_log, None))
+        if is_valid_flight(flight, limit)
+        else {}
         for flight in flights
     ]
     speed = indices[0].get("approach_speed", 0.0) * config.scale**0.5
     criteria = manoeuvre.imo_limits(craft.helm, config.length * config.scale, speed)
-    measured_indices = (
-        {} if log is None else manoeuvre.compute_indices(log.replace(t=log.t - log.t[0]), None)
-    )
+    measured_indices = {}
+    if log is not None:
+        shifted_log = log.replace(t=log.t - log.t[0])
+        measured_indices = select_scalar_indices(manoeuvre.compute_indices(shifted_log, None))
     return BookletPage(name, manoeuvre, flights, indices, criteria, log, split, measured_indices)

@@ -14,9 +14,12 @@ from residnet.core.log import Log, make_remark
 from residnet.core.names import CHANNEL_UNITS, POSE_ERROR_UNITS, si_unit
 from residnet.core.progress import begin_stage, log_message
 from residnet.dynamics.store import ModelSpec
+from residnet.evaluation.data_records import DataQualityFile, LogQuality
 from residnet.evaluation.goodness import assess_repeatability
-from residnet.evaluation.metrics import LIMITS_SCHEMA, build_metrics_file, write_rollouts
-from residnet.evaluation.records import DataQualityFile, LimitsFile, LogQuality
+from residnet.evaluation.limits_records import LimitsFile
+from residnet.evaluation.metrics import LIMITS_SCHEMA
+from residnet.evaluation.metrics_file import build_metrics_file
+from residnet.evaluation.rollout_tables import write_rollouts
 from residnet.identification.identified import SplitEvaluation
 from residnet.identification.prepared import compute_velocity_limits
 from residnet.io.drafting.log_files import find_log_files

@@ -22,8 +22,8 @@ from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.names import suggest_name
 from residnet.core.ownership import record_folder
 from residnet.core.progress import log_message
-from residnet.evaluation.metrics import find_row
-from residnet.evaluation.records import ExcitationFile
+from residnet.evaluation.data_records import ExcitationFile
+from residnet.evaluation.metrics_file import find_row
 from residnet.identification.identified import evaluate_splits, make_candidates
 from residnet.identification.monitoring import (
     ChangeDetector,

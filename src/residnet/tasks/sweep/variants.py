@@ -16,7 +16,7 @@ from residnet.core.format import format_signed
 from residnet.core.processes import process_pool
 from residnet.core.progress import report_progress
 from residnet.core.run_records import ProvenanceFile
-from residnet.evaluation.metrics import bootstrap_intervals, make_resampling_blocks
+from residnet.evaluation.intervals import bootstrap_intervals, make_resampling_blocks
 from residnet.report.records import VariantRow, VariantsFile
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.variants import VARIANTS_FILE, tabulate_variants

@@ -75,7 +75,7 @@ from residnet.core.progress import begin_stage, log_message, report_progress
 from residnet.core.records import with_explicit_defaults
 from residnet.dynamics.store import rebuild_module
 from residnet.engine.compiled import CompiledRollout
-from residnet.evaluation.metrics import SCHEMA
+from residnet.evaluation.metrics_file import SCHEMA
 from residnet.physics.nomoto_config import NomotoVesselConfig
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder

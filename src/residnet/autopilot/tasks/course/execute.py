@@ -52,7 +52,7 @@ from residnet.core.errors import ExportError
 from residnet.core.progress import log_message
 from residnet.dynamics.simulated import InAmbientCurrent
 from residnet.engine.rollout import Rollout
-from residnet.evaluation.metrics import SCHEMA
+from residnet.evaluation.metrics_file import SCHEMA
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ExportRequest, SummaryMetric, TaskOutcome
 

@@ -33,7 +33,7 @@ from residnet.autopilot.roll_config import (
 from residnet.autopilot.training.roll import train_roll_policy, tune_roll_law
 from residnet.core.progress import begin_stage, log_message
 from residnet.dynamics.store import Stored, rebuild_module
-from residnet.evaluation.metrics import SCHEMA
+from residnet.evaluation.metrics_file import SCHEMA
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import RunModelStore

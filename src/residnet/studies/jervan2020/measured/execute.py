@@ -25,7 +25,7 @@ from residnet.core.format import (
 )
 from residnet.core.layout import HEADING
 from residnet.core.stretches import find_runs
-from residnet.evaluation.metrics import bootstrap_intervals
+from residnet.evaluation.intervals import bootstrap_intervals
 from residnet.physics.force_model import ForceModel
 from residnet.report.blocks import Bullets, Cell, Section, Table, Text, build_table
 from residnet.report.figure import (
