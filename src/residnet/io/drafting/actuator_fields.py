@@ -135,8 +135,8 @@ def _rank_publishers(
 ) -> Callable[[tuple[str, str]], float]:
     """Return the sort key of commands of one rudder by several topics: the followed one first.
 
-    The vessel follows the command that explains most of the changes of its yaw rate over a second,
-    beyond what the yaw rate itself explains.
+    The vessel follows the command whose regression explains most of the changes of its yaw rate
+    over a second; the yaw rate itself is another regressor.
 
     Args:
         channel: channel of the rudder.

@@ -118,7 +118,7 @@ class ChannelMapper:
         self._choose_wind_reference()
         entries = {name: self._make_entry(name) for name in self._names}
         for force, velocity in (("tau_y", "v"), ("tau_n", "r")):
-            # forces have the axes of the velocities beside them
+            # forces have the same axes as the velocities of the file
             is_reversed = entries.get(velocity, {}).get("sign") == -1
             if is_reversed and force in entries and "sign" not in entries[force]:
                 entries[force]["sign"] = -1
@@ -628,8 +628,8 @@ class ChannelMapper:
     def _fit_vertical_motion(self, name: str) -> ScaleFit | None:
         """Regress the heave velocity, roll rate or pitch rate on a column.
 
-        The velocities along the axes of a vessel follow from those of its position by R^T, and its
-        angular velocity from the derivatives of its angles (Fossen 2021, equations 2.31 and 2.41).
+        The body velocities are R^T times the derivative of the position, and the angular velocity
+        follows from the derivatives of the Euler angles (Fossen 2021, equations 2.31 and 2.41).
 
         Args:
             name: `w`, `p` or `q`.

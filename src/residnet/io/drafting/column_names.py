@@ -242,7 +242,7 @@ def _match_name(column: str, parsed: ParsedName) -> str | None:
 
 
 def _find_other_unit(column: str, channel: str) -> str | None:
-    """Return the unit in the name of a column if its dimension is not that of the channel."""
+    """Return the unit in the name of a column if the channel has another dimension."""
     expected_unit = get_si_unit(channel)
     return find_mismatched_unit(column, expected_unit) if expected_unit else None
 

@@ -55,8 +55,8 @@ def derive_drift_velocities(
         candidate_frames: possible frames, see `ChannelMapper`.
 
     Returns:
-        Channel -> column with `u` and `v`, tables with these columns, and the drift angle; None if
-        there is none, or it is not used.
+        Channel -> column with `u` and `v`, tables with these columns, and the drift angle; None
+        without a drift angle, or if it is not used.
     """
     if not names.keys() >= {*SPEED_CHANNELS}:
         return dict(names), list(logs), None
@@ -190,7 +190,7 @@ def _find_drift_direction(
 def restore_drift_angle(
     entries: dict[str, dict[str, Any]], drift: DriftAngle | None, draft_notes: DraftNotes
 ) -> dict[str, dict[str, Any]]:
-    """Replace the entries of derived velocities by those of speed and drift angle.
+    """Replace the entries of derived velocities by entries of speed and drift angle.
 
     Args:
         entries: channel -> entry, with u and v of the drift angle unless these were left out.

@@ -30,7 +30,7 @@ _MIN_WRENCH_PARTS = 2
 def find_wrench_columns(columns: Sequence[str]) -> dict[str, str]:
     """Return column -> channel of the forces and the moment on a vessel, such as `force.x`.
 
-    Columns of one stem are a wrench; those of thrusters, rudders and wind are no total forces.
+    Columns of one stem are a wrench. Forces of thrusters, rudders and wind are no total forces.
     """
     groups: dict[str, dict[str, str]] = {}
     for column in columns:

@@ -43,8 +43,8 @@ def find_quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
 
     Returns:
         For each quaternion: channel (qx, qy, qz, qw) -> column. A quaternion with numbered parts
-        occurs twice, with the scalar part first and last. Without complete ones, those of planar
-        motion with the parts qz and qw.
+        occurs twice, with the scalar part first and last. Without complete ones, quaternions of
+        planar motion with the parts qz and qw.
     """
     parts_by_stem: dict[str, dict[str, str]] = {}
     for column in columns:
@@ -68,9 +68,10 @@ def find_quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
 
 
 def find_depth_channels(columns: Sequence[str], known_channels: Collection[str]) -> dict[str, str]:
-    """Return the channels w, q, z, theta -> columns if the table is that of an underwater vessel.
+    """Return the channels w, q, z, theta -> columns of the table of an underwater vessel.
 
-    Such a table has depth, pitch and roll, or motion in the vertical plane only.
+    Such a table has depth, pitch and roll, or motion in the vertical plane only; for other tables
+    the result is empty.
 
     Args:
         columns: names of the columns.

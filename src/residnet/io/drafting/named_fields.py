@@ -112,7 +112,7 @@ def _choose_named_fields(
         needs_pose: whether several series may be combined.
 
     Returns:
-        Name -> topic and field, and the topic whose clock is used; empty if there are none.
+        Name -> topic and field, and the topic whose clock is used; empty without such series.
 
     Raises:
         DataError: if several series have the same columns.
@@ -163,7 +163,7 @@ def _convert_entries(
     """Convert the channel map of a table to the settings of a reader of recordings.
 
     Args:
-        entries: channel -> entry; those of the pose are removed.
+        entries: channel -> entry; entries of the pose are removed.
         sources: column -> topic and field.
         base_topic: topic whose clock is used.
     """
@@ -211,8 +211,8 @@ def _convert_entries(
 def _find_named_topics(recording: Recording) -> dict[str, tuple[str, str]]:
     """Return the fields of the series without message type: name -> topic and field.
 
-    A field that several series have, such as `data`, is named with its topic. Empty if position
-    and heading are not among the names, or if the position is in several series.
+    The name of a field that several series have, such as `data`, contains its topic. The result is
+    empty if position or heading are missing, or if the position is in several series.
     """
     series_by_topic = {
         topic: series
@@ -262,7 +262,7 @@ def _name_vector_parts(fields: Iterable[str]) -> dict[str, str]:
     """Name the columns of matrices of positions, velocities and forces by their axes.
 
     Args:
-        fields: fields; those of a matrix end in `.0`, `.1`, ... or `[0]`, `[1]`, ...
+        fields: fields; columns of a matrix end in `.0`, `.1`, ... or `[0]`, `[1]`, ...
 
     Returns:
         Name -> field, in the order of the fields.

@@ -126,7 +126,7 @@ def group_problems(messages: Mapping[Path, str], *, has_full_paths: bool = True)
 
 
 def describe_other_files_with_problem(file_names: Sequence[str]) -> str:
-    """Return a remark on further files with the same problem; empty if there are none."""
+    """Return a remark on further files with the same problem; empty without such files."""
     if not file_names:
         return ""
     names = truncate(", ".join(file_names), _MAX_FILE_NAMES)

@@ -154,7 +154,7 @@ class DraftNotes:
         )
 
     def rename_keys(self, parent: Key, names: Mapping[str, str]) -> None:
-        """Rename the children of a key in guesses and notes, and drop those of other children.
+        """Rename the children of a key in guesses and notes, and drop entries of other children.
 
         Args:
             parent: key of a mapping.

@@ -74,7 +74,7 @@ class TableClock:
     Attributes:
         settings: `time` of the reader.
         seconds: times of the first rows [T] in s.
-        guess: reason for a guess; empty if there is none.
+        guess: reason for a guess; empty if the clock is certain.
         columns: names of the columns of time and date.
     """
 
@@ -89,7 +89,7 @@ class MissingClockError(DataError):
 
 
 def make_step_clock(preview: TablePreview, step: str) -> TableClock:
-    """Return the clock of a table whose rows are a constant time apart.
+    """Return the clock of a table with a constant time step.
 
     Args:
         preview: first rows of the table.

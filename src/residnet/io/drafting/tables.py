@@ -286,7 +286,7 @@ def _suggest_table_fix(
 def draft_manoeuvre_setting(files: Sequence[Path], draft_notes: DraftNotes) -> dict[str, str]:
     """Return the setting `manoeuvre: folder` for files in folders by manoeuvre, else no setting.
 
-    Folders of one file each are trips, unless their names are those of manoeuvres.
+    Folders of one file each are trips, unless their names are names of manoeuvres.
     """
     folders = {path.resolve().parent for path in files}
     has_manoeuvre_names = any(match_manoeuvre_name(folder.name) for folder in folders)

@@ -74,8 +74,8 @@ class DriftAngleChoice(NamedTuple):
         sign: 1 if the drift angle is positive with the flow from port, -1 otherwise.
         is_speed: whether the other column is the speed; otherwise it is the surge velocity.
         unexplained_share: unexplained share of u and v from both columns.
-        other_share: that of the best interpretation with the other meaning of the column; infinite
-            if there is none.
+        other_share: unexplained share of the best interpretation with the other meaning of the
+            column; infinite without another meaning.
     """
 
     unit: str

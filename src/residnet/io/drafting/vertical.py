@@ -55,10 +55,10 @@ def refuse_vertical_y(
     tables: Sequence[Mapping[str, np.ndarray]],
     names: Mapping[str, str],
 ) -> None:
-    """Refuse tracks whose y axis points up, as those of motion-capture systems.
+    """Refuse tracks whose y axis points up, a convention of motion-capture systems.
 
-    In all tables y is almost constant beside x and z, and the path in the plane of x and z turns
-    through three quadrants, which a path that ascends and descends does not.
+    In all tables y is almost constant in comparison with x and z, and the path in the plane of x
+    and z turns through three quadrants, which a path that ascends and descends does not.
 
     Args:
         path: first table.
@@ -102,8 +102,8 @@ def project_on_horizontal(
 ) -> list[RawTable]:
     """Return logs whose u and v are horizontal, along and across the heading, for tests of frames.
 
-    Velocities along the axes of a vessel that rolls and pitches are not those of its track. They
-    are projected by the attitude, in the frame of the file: with R = R_z(yaw) R(tilt), the result
+    Velocities along the axes of a vessel that rolls and pitches are not horizontal. They are
+    projected by the attitude, in the frame of the file: with R = R_z(yaw) R(tilt), the result
     is R(tilt) (u, v, w). Without a column of w, the heave velocity follows from the depth.
 
     Args:
@@ -203,7 +203,7 @@ def draft_vertical_motion(
 ) -> dict[str, dict[str, Any]]:
     """Draft the vertical motion of an underwater vessel whose attitude is a quaternion.
 
-    The columns are the siblings of those of the planar motion, such as `position_z` of
+    The columns are the siblings of the columns of the planar motion, such as `position_z` of
     `position_x`. They are used if the depth follows from velocities and attitude.
 
     Args:

@@ -48,8 +48,8 @@ class ClockEstimate(NamedTuple):
         drift: share by which the clock of the yaw rate runs slow; 0 if it was not estimated.
         middle: time in the middle of the overlap in s, on the clock of the heading.
         correlation: correlation of the yaw rate with the derivative of the heading.
-        margin: logarithm of the likelihood ratio to the best offset farther than one second away.
-            Each 2 s of the overlap count as one independent sample of the yaw rate.
+        margin: logarithm of the likelihood ratio to the best offset that differs by more than one
+            second. Each 2 s of the overlap count as one independent sample of the yaw rate.
     """
 
     seconds: float

@@ -57,8 +57,8 @@ def compare(hypotheses: Mapping[str, Hypothesis], step: float) -> list[RankedHyp
     """Rank hypotheses about the channels of a log by their evidence, the best first.
 
     Successive residuals of filtered channels are not independent. The differences of the BIC are
-    therefore multiplied by the share of independent samples of the best hypothesis, that of an
-    autoregressive process of first order.
+    therefore multiplied by the share of independent samples of the best hypothesis, for which the
+    residuals are an autoregressive process of first order.
 
     Args:
         hypotheses: name -> hypothesis.
@@ -67,19 +67,22 @@ def compare(hypotheses: Mapping[str, Hypothesis], step: float) -> list[RankedHyp
     Raises:
         DataError: see `reconstruct`.
     """
-    fits = {
+    reconstructions = {
         name: reconstruct(hypothesis.sensors, hypothesis.errors, step)
         for name, hypothesis in hypotheses.items()
     }
-    ranking = sorted(fits, key=lambda name: fits[name].bic)
-    best = fits[ranking[0]]
+    ranking = sorted(reconstructions, key=lambda name: reconstructions[name].bic)
+    best = reconstructions[ranking[0]]
     share = min(
         (1.0 - sensor.autocorrelation) / (1.0 + max(sensor.autocorrelation, 0.0))
         for sensor in best.sensors.values()
     )
     share = float(np.clip(share, _MIN_EFFECTIVE_SHARE, 1.0))
     return [
-        RankedHypothesis(name, share * (fits[name].bic - best.bic), fits[name]) for name in ranking
+        RankedHypothesis(
+            name, share * (reconstructions[name].bic - best.bic), reconstructions[name]
+        )
+        for name in ranking
     ]
 
 

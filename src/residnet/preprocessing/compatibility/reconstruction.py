@@ -218,7 +218,7 @@ class _Residuals:
         group: name of the noise level.
         nodes: node before each residual [N].
         values: whitened residuals [N].
-        by_state: state (those of the next node follow after the ninth) -> derivative [N].
+        by_state: state -> derivative [N]; states 0 to 8 are of the node, 9 to 17 of the next node.
         by_error: index of an error -> derivative [N].
         sensor: sensor of a measurement; None for a dynamic equation.
         squares: squared norm [N] over all columns of the sensor, so that the weights of a position
@@ -743,8 +743,8 @@ class _Problem:
         flat_gradient = gradient[:n_nodes].reshape(-1)
         flat_border = border[:, :n_nodes].reshape(n_errors, n_nodes * N_STATES)
         factor = cholesky_banded(flat_band, lower=True, overwrite_ab=True, check_finite=False)
-        right_sides = np.vstack([flat_gradient[None], flat_border]).T
-        solution = cho_solve_banded((factor, True), right_sides, check_finite=False)
+        right_hand_sides = np.vstack([flat_gradient[None], flat_border]).T
+        solution = cho_solve_banded((factor, True), right_hand_sides, check_finite=False)
         border_solution = solution[:, 1:]
         return _Solver(
             factor,
@@ -768,22 +768,22 @@ class _Problem:
         names = ["jerk 0", "jerk 1", "jerk 2"]
         names += [f"sensor {k}" for k, s in enumerate(self.sensors) if not s.is_noise_known]
         groups_by_name = {name: [g for g in residuals if g.group == name] for name in names}
-        right_sides = []
+        right_hand_sides = []
         by_errors = []
         for name in names:
             for _ in range(_N_PROBES):
                 by_states, by_error = self._multiply_signs(groups_by_name[name], rng)
-                right_sides.append(by_states)
+                right_hand_sides.append(by_states)
                 by_errors.append(by_error)
         solutions = cho_solve_banded(
-            (solver.banded_factor, True), np.array(right_sides).T, check_finite=False
+            (solver.banded_factor, True), np.array(right_hand_sides).T, check_finite=False
         )
         schur_inverse = np.linalg.inv(solver.schur) if self.names else solver.schur
         largest_change = 0.0
         for k, name in enumerate(names):
             used = []
             for probe in range(k * _N_PROBES, (k + 1) * _N_PROBES):
-                trace = float(right_sides[probe] @ solutions[:, probe])
+                trace = float(right_hand_sides[probe] @ solutions[:, probe])
                 reduced = by_errors[probe] - solver.border @ solutions[:, probe]
                 used.append(trace + float(reduced @ schur_inverse @ reduced))
             n_residuals = sum(group.values.size for group in groups_by_name[name])
@@ -895,8 +895,8 @@ class _Problem:
         the cluster-robust covariance CR3 (Cameron and Miller 2015, J. Human Resources 50, sec. VI).
         A sandwich would be too small: the estimates fit the scores of few sections.
 
-        Both are those of an M-estimator (Huber 1981, Robust Statistics, sec. 7.6): the weights of
-        the Student distribution overstate the information of noise without outliers.
+        Scores and information are corrected for the weights of the M-estimator (Huber 1981, Robust
+        Statistics, sec. 7.6), which overstate the information of noise without outliers.
         """
         if not errors.size:
             return np.zeros(0)
@@ -984,8 +984,8 @@ def _linearize_score(group: _Residuals) -> _Residuals:
     """Return Gaussian residuals with the information and the scores of a group with weights.
 
     With the score psi = w r, the information of a residual is E[psi']^2 / E[psi^2] (Huber 1981,
-    Robust Statistics, eq. 7.6.2), reduced by the autocorrelation of successive scores to that of an
-    autoregressive process of first order.
+    Robust Statistics, eq. 7.6.2). It is reduced by the autocorrelation of successive scores, which
+    are taken for an autoregressive process of first order.
     """
     if group.squares is None:
         return group
@@ -1042,8 +1042,8 @@ def _integrate_position(
     """Return the change of the position over a step beyond Simpson's rule, and its derivatives.
 
     Returns:
-        The changes [N] north and east; and for each of them: state of a node (those of the next
-        node follow after the ninth) -> derivative [N].
+        The changes [N] north and east; and for each of them: state (0 to 8 of the node, 9 to 17 of
+        the next node) -> derivative [N].
     """
     rates = {PSI: R, U: U_DOT, V: V_DOT}
     points = {

@@ -289,7 +289,7 @@ def differentiate_interpolation(
         weights: weights of the interpolation; None if all samples are on their first node.
 
     Returns:
-        State of a node (those of the next node follow after the ninth) -> derivative [N].
+        State (0 to 8 of the node, 9 to 17 of the next node) -> derivative [N].
     """
     if weights is None:
         return {state: 1.0}

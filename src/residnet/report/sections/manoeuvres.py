@@ -242,7 +242,7 @@ def _difference_text(
     crafts: Mapping[str, Mapping[str, BookletIndex]],
     name: str,
 ) -> str:
-    """Return the value of the second of two crafts minus that of the first, for display."""
+    """Return the difference of an index, second craft minus first, as text."""
     first, second = (craft_indices.get(name) for craft_indices in crafts.values())
     difference = None if first is None or second is None else second.value - first.value
     return _format_index(content, name, difference)[0]

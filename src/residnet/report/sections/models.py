@@ -61,7 +61,7 @@ def models_section(run: RunFiles) -> Section | None:
 
 
 def _baseline_section(run: RunFiles) -> Section | None:
-    """Return the coefficient tables, with the first baseline expanded; None if there are none."""
+    """Return the coefficient tables, with the first baseline expanded; None without tables."""
     blocks: list[Block] = [
         Text(
             "Each acceleration (du/dt, dv/dt, dr/dt) is the sum of its terms. A value below twice"

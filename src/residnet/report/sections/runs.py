@@ -339,7 +339,7 @@ def _motion_panels(title: str, units: DisplayUnits, dof: DegreesOfFreedom) -> li
 def _select_windows(
     run: RunFiles, windows: Sequence[StoredWindow]
 ) -> list[tuple[StoredWindow, str]]:
-    """Return the selectable free runs, each with its rank among those of its manoeuvre kind."""
+    """Return the selectable free runs, each with its rank within its kind of manoeuvre."""
     groups: dict[tuple[int, str], list[StoredWindow]] = {}
     for window in windows:
         if run.main_model in window.predicted:

@@ -45,7 +45,7 @@ _SLICE_STYLES = {
 def slice_figure(content: SweepFile) -> Figure:
     """Draw a slice for each key: the value of the key of every trial over its objective.
 
-    The objective is on the horizontal axis of all panels, so that values beside the vertical axes
+    The objective is on the horizontal axis of all panels, so that the tick labels of the keys
     are not rotated.
     """
     trials = [trial for trial, _ in content.completed]

@@ -84,7 +84,7 @@ class Programme(Config):
         step: time step of the logs; null for the step of the model, or 0.05 s without a model.
         substeps: number of simulation steps of the vessel within one step of the logs.
         initial: initial states by name; others have the default of the vessel.
-        length: length in m of the hull, for indices in lengths; null for that of the vessel.
+        length: length in m of the hull, for indices in lengths; null for the vessel's.
         reader: reader of the logs that are replayed.
         noise: noise of the sensors in the logs; indices are computed from the motion without noise.
         disturbance: wind, current and waves; a learned model responds only to the wind, if it was
@@ -195,7 +195,7 @@ class SimulateConfig(PackageTask, ComputingTask):
 
     Attributes:
         programme: a list of manoeuvres of a vessel, a learned model, or both; logs are written to
-            logs/<log>.parquet, those of a model in addition to a vessel to model_logs.
+            logs/<log>.parquet, logs of a model in addition to a vessel to model_logs.
         data: trials drawn and split as by the task `fit`; logs are written to
             logs/<split>/<log>.parquet.
     """

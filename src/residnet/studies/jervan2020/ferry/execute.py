@@ -780,7 +780,7 @@ def _judging_table(results: StudyResults) -> Table:
 
 
 def _residual_table(config: FerryStudyConfig, results: StudyResults) -> Table:
-    """Build the table of test errors and those of Jervan 2020 (Tables 4.2, 4.5, 4.7, 4.15)."""
+    """Build the table of test errors and published errors (Tables 4.2, 4.5, 4.7, 4.15)."""
     unmodelled = results["unmodelled_test_mse"]
     published_base = config.published.mse
     rows = []

@@ -29,7 +29,7 @@ _MAX_DRAWS: Final = 1000
 
 @final
 class ExportedFeedForward(nn.Module):
-    """A feed-forward as it is exported: mirrored, and limited to its training range.
+    """A feed-forward in its exported form: mirrored, and limited to its training range.
 
     Args:
         model: the believed force and its correction.
@@ -53,7 +53,7 @@ def draw_judging_courses(
     """Draw courses that resemble the identification course but consist of other manoeuvres.
 
     Positions lie in the area of the course, and segments are at most as long as its longest one, so
-    that speeds stay in the training range.
+    that speeds are in the training range.
 
     Args:
         course: the identification course.
