@@ -411,8 +411,10 @@ def save_png(canvas: Canvas, path: Path, title: str, caption: str) -> None:
     from PIL.PngImagePlugin import PngInfo
 
     assert isinstance(canvas.canvas, FigureCanvasAgg)
+    # Any: matplotlib does not type the method
+    pixels: Any = canvas.canvas.buffer_rgba()  # type: ignore[no-untyped-call]
     picture = (
-        Image.fromarray(np.asarray(canvas.canvas.buffer_rgba()))
+        Image.fromarray(np.asarray(pixels))
         .convert("RGB")
         .quantize(128, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     )

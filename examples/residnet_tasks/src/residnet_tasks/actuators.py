@@ -13,6 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from residnet.core.config import Config, ExistingPath
 from residnet.core.errors import DataError, UsageError
+from residnet.core.files import read_json
 from residnet.core.format import DASH, format_interval, format_number
 from residnet.core.names import suggest_name, to_si
 from residnet.io.readers.text_tables import open_as_utf8
@@ -38,7 +39,6 @@ from residnet.report.figure import (
     join_with_gaps,
 )
 from residnet.report.figure_files import read_figures, write_figures
-from residnet.report.run_reader import JsonObject, RunFiles
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import SummaryMetric, Task, TaskOutcome
 
@@ -278,7 +278,7 @@ class ActuatorsTaskConfig(Task):
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        actuator_json = RunFiles(run.path).read_json("actuators.json")
+        actuator_json = read_json(run.path / "actuators.json")
         figures = read_figures(run.figures)
         blocks: list[Block] = [
             *(figure.preview() for figure in figures[:1]),
@@ -339,7 +339,7 @@ def _read_columns(path: Path, columns: Sequence[CsvColumn]) -> tuple[np.ndarray,
 
 def build_parameter_table(actuator_json: Mapping[str, Any]) -> Table:
     """Return a table of the parameters of actuators.json with 95 % confidence intervals."""
-    rows: list[JsonObject] = []
+    rows: list[dict[str, str]] = []
     for test, test_results in actuator_json.items():
         estimates = test_results.items() if isinstance(test_results, Mapping) else ()
         for name, estimate in estimates:

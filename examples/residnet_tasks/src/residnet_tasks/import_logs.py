@@ -12,7 +12,7 @@ from pydantic import Field
 
 from residnet.core.config import ConfigPath
 from residnet.core.errors import ConfigError
-from residnet.core.files import make_file_stem
+from residnet.core.files import make_file_stem, read_json
 from residnet.core.format import display_unit, format_integer, format_minus_signs, format_number
 from residnet.core.log import Log
 from residnet.core.names import suggest_name
@@ -31,7 +31,6 @@ from residnet.report.figure import (
     Panel,
 )
 from residnet.report.figure_files import write_figure
-from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import SummaryMetric, Task, TaskOutcome
 
@@ -113,9 +112,7 @@ class ImportConfig(Task):
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        findings: Mapping[str, Sequence[Mapping[str, Any]]] = RunFiles(run.path).read_json(
-            "findings.json"
-        )
+        findings: Mapping[str, Sequence[Mapping[str, Any]]] = read_json(run.path / "findings.json")
         logs = [Log.load(path) for path in sorted((run.path / "logs").glob("*.parquet"))]
         channels = [Section(log.name, [tabulate_channels(log)], is_folded=True) for log in logs]
         table = tabulate_logs([describe_log(log, findings.get(log.name, [])) for log in logs])
