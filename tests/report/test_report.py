@@ -472,7 +472,7 @@ def test_metrics_alone_make_a_report_and_folders_without_are_refused(tmp_path: P
     write_json(file, content)
     text = shown(tmp_path)
     Page(text)
-    assert "These data are not unseen: read with care." in text
+    assert "Fit or selection used these data: errors on new data are larger." in text
     assert "Provenance" not in text
 
 

@@ -48,8 +48,7 @@ from residnet.preprocessing.masks import MaskRule
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.preprocessing.prepare import PrepareConfig, PreparedLog
 from residnet.preprocessing.prepare import prepare_log as prepare_log
-from residnet.quality import inspect_log as examine
-from residnet.quality import inspect_log_set
+from residnet.quality import inspect_log, inspect_log_set
 from residnet.tasks.drafting import ConfigDraft, describe_missing_steering, draft_fit_config
 from residnet.tasks.input_selection import choose_inputs, find_unexcited_inputs
 from residnet.tasks.naval_draft import NavalParticulars
@@ -61,7 +60,6 @@ if TYPE_CHECKING:
 
 LogsLike = PathLikeArg | Log | Sequence[PathLikeArg] | Sequence[Log]
 """Logs, or the paths to read them from."""
-"""Recipes by name."""
 
 
 def read_logs(
@@ -122,8 +120,7 @@ def read_logs(
                 "kind": "parquet" if files[0].suffix == ".parquet" else "csv",
                 "time": _parse_column(time, "time", "s"),
                 "channels": {
-                    name: _parse_column(source_entry, name)
-                    for name, source_entry in channels.items()
+                    name: _parse_column(column, name) for name, column in channels.items()
                 },
                 "manoeuvre": manoeuvre,
                 **({} if names is None else {"names": list(names)}),
@@ -134,13 +131,15 @@ def read_logs(
         if names is not None:
             answers[*READER_KEY, "names"] = ",".join(names)
         logs = (
-            _read_drafted_logs(files, answers) if settings is None else _read_with(settings, files)
+            _read_drafted_logs(files, answers)
+            if settings is None
+            else _read_with_reader(settings, files)
         )
     log_names = assign_log_names(logs)
     return [logs[file].replace(name=log_names[file]) for file in files if file in logs]
 
 
-def _read_with(reader_settings: Any, files: Sequence[Path]) -> dict[Path, Log]:
+def _read_with_reader(reader_settings: Any, files: Sequence[Path]) -> dict[Path, Log]:
     """Read files with a reader that the caller describes; other files are skipped."""
     reader = validate_config(to_builtin(reader_settings), ReaderConfig, "read_logs").build()
     logs = dict[Path, Log]()
@@ -222,7 +221,7 @@ def inspect(
     log_list = read_logs(logs)
     mask_rules = _validate_masks(masks, "inspect")
     quality_reports = [
-        *(examine(log, inputs, mask_rules) for log in log_list),
+        *(inspect_log(log, inputs, mask_rules) for log in log_list),
         inspect_log_set(log_list, inputs),
     ]
     columns = ["level", "code", "text", "action"]
@@ -427,9 +426,9 @@ def prepare(
     these velocities; if all logs measure the roll angle, the models include roll.
 
     Args:
-        logs: a list of logs (of each five, sorted by manoeuvre, the third is used for validation
-            and the fifth for testing; fewer than five are cut in time), a mapping from `train`,
-            `validation` and `test` to logs, or the `data` section of a config.
+        logs: a list of logs, a mapping from `train`, `validation` and `test` to logs, or the `data`
+            section of a config. A list is sorted by manoeuvre; of each five logs the third is for
+            validation and the fifth for the test. Fewer than five logs are cut in time.
         inputs: command channels that drive the model, in order; an empty list for a model without
             inputs.
         step: step of the grid in s.
@@ -478,12 +477,12 @@ def prepare(
             name for name in input_names if all(name in log.channels for log in all_logs)
         ]
         masks = _validate_masks(settings.get("masks") or (), "prepare")
-        preparation_recipe = PreparationPlan.from_logs(all_logs, common_inputs, dof, masks)
+        preparation_plan = PreparationPlan.from_logs(all_logs, common_inputs, dof, masks)
         if dof.description:
             log_message(f"velocities: {dof.description}")
-        log_message(f"recipe: {preparation_recipe.reason}")
+        log_message(f"recipe: {preparation_plan.reason}")
         evaluation_settings: dict[str, Any] = {}
-        preparation_settings = preparation_recipe.to_config()
+        preparation_settings = preparation_plan.to_config()
         grid = {"step": step, "held": held_channels}
         preparation_settings["grid"] |= {
             key: value for key, value in grid.items() if value is not None
@@ -492,7 +491,7 @@ def prepare(
             evaluation_settings["selection"] = _find_first_protocol(settings["protocols"])
         signals: dict[str, Any] = {
             "inputs": input_names if isinstance(input_names, str) else list(input_names),
-            "exogenous": preparation_recipe.wind_channels,
+            "exogenous": preparation_plan.wind_channels,
             "velocities": dof.velocities,
             "unexcited": unexcited,
         }
@@ -515,7 +514,7 @@ def prepare(
             make_evaluation_settings(
                 complete_logs,
                 durations,
-                preparation_recipe.correlation_time,
+                preparation_plan.correlation_time,
                 masks,
                 dof,
             )

@@ -87,15 +87,15 @@ class RegressorBaseline(ParametricBaseline):
         )
 
     def forward(self, z: Tensor) -> Tensor:
-        # terms that an axis lacks stay zero, whatever a refit stores in theta
+        # coefficients of terms that an axis lacks are masked, because a refit may change theta
         weights = (self.theta * self.term_mask).to(z.dtype)
         if self.bound is not None:
             clamped: Tensor = self.bound.clamp(z)
             phi: Tensor = self.library(clamped)
             restoring_acceleration: Tensor = self.bound.restoring_acceleration(clamped, z)
             return phi @ weights.T + restoring_acceleration
-        acceleration: Tensor = self.library(z)
-        return acceleration @ weights.T
+        terms: Tensor = self.library(z)
+        return terms @ weights.T
 
     def parameter_counts(self) -> list[float]:
         """Return the number of nonzero coefficients per axis."""
@@ -139,29 +139,29 @@ class RegressorBaseline(ParametricBaseline):
         """Return the precision matrix [P, P] of a prior for port/starboard symmetry."""
         phi, variance = self._terms_and_residual_variance(samples)
         terms = self.library.terms
-        energy = phi.square().mean(0)
-        images = mirror_terms(terms, samples.names)
-        if images is None:
+        mean_squares = phi.square().mean(0)
+        mirror_image_of_term = mirror_terms(terms, samples.names)
+        if mirror_image_of_term is None:
             # some terms have a known parity even if the mirror image of a channel is unknown
-            violates = [
+            has_wrong_parity = [
                 violates_symmetry(term, i, samples.names)
                 for i in range(self.n_dof)
                 for term in terms
             ]
-            images = {}
+            mirror_image_of_term = {}
         else:
-            violates = [False] * (self.n_dof * len(terms))
+            has_wrong_parity = [False] * (self.n_dof * len(terms))
         precision = torch.diag(
-            torch.tensor(violates, dtype=torch.float64) * energy.repeat(self.n_dof)
+            torch.tensor(has_wrong_parity, dtype=torch.float64) * mean_squares.repeat(self.n_dof)
         )
         for axis, axis_sign in enumerate(get_axis_parities(samples.names)):
-            for term_index, (image, sign) in images.items():
+            for term_index, (image, sign) in mirror_image_of_term.items():
                 # the contrast is zero for symmetric coefficients. A term of the wrong parity is its
                 # own image with the opposite sign: both entries add, so that the factors are 0.5
                 contrast = torch.zeros(self.n_dof * len(terms), dtype=torch.float64)
                 contrast[axis * len(terms) + term_index] += 0.5
                 contrast[axis * len(terms) + image] -= 0.5 * sign * axis_sign
-                precision += energy[term_index] * torch.outer(contrast, contrast)
+                precision += mean_squares[term_index] * torch.outer(contrast, contrast)
         # a penalty of the squared asymmetric acceleration, relative to the residual variance of the
         # axis
         precision = precision / variance.repeat_interleave(len(terms))[:, None]
@@ -186,7 +186,7 @@ class RegressorBaseline(ParametricBaseline):
         ]
 
     def undamped_terms(self, samples: Samples) -> list[int]:
-        """Return indices of free coefficients with the most negative damping of an axis."""
+        """Return the index of the free coefficient that destabilises each undamped axis most."""
         if not self.is_dissipative:
             return []
         free_index = self.free_indices().tolist()
@@ -323,25 +323,25 @@ def fit_regressors(
     Raises:
         FitError: if the data do not determine a coefficient.
     """
-    selected = select_manoeuvres(samples, config.manoeuvres)
+    selected_samples = select_manoeuvres(samples, config.manoeuvres)
     estimator = LeastSquares(config.ridge if isinstance(config.ridge, tuple) else (config.ridge,))
     terms = baseline.library.terms
-    term_values = evaluate_regressors(baseline.library, selected.z, range(len(terms)))
+    term_values = evaluate_regressors(baseline.library, selected_samples.z, range(len(terms)))
 
     def fit_axis(axis: int, columns: list[int]) -> list[Solution]:
         return estimator.fit(
             select_columns(term_values, columns),
-            selected.target[:, [axis]],
-            selected.group,
+            selected_samples.target[:, [axis]],
+            selected_samples.group,
             names=[terms[j] for j in columns],
             outputs=(baseline.output_names[axis],),
         )
 
     # inactive velocities are zero, and rates of angles follow from kinematics: none is fitted
-    learned_axes = get_dof(selected.names).regressed_indices
+    learned_axes = get_dof(selected_samples.names).regressed_indices
     axis_fits = {}
     velocity_slopes = (
-        _own_velocity_slopes(baseline.library, selected) if config.dissipative else None
+        _own_velocity_slopes(baseline.library, selected_samples) if config.dissipative else None
     )
     for axis in learned_axes:
         destabilising: set[str] = set()
@@ -352,7 +352,9 @@ def fit_regressors(
             ]
             axis_solutions = fit_axis(axis, columns)
             if config.dissipative and (
-                new_destabilising := _destabilising_in_all(axis_solutions, axis, selected.names)
+                new_destabilising := _find_common_destabilising_terms(
+                    axis_solutions, axis, selected_samples.names
+                )
             ):
                 destabilising |= new_destabilising
             elif velocity_slopes is not None and (
@@ -368,7 +370,7 @@ def fit_regressors(
                 break
         axis_fits[axis] = axis_solutions
     if config.particulars is not None:
-        _apply_semi_empirical_prior(config.particulars, baseline, selected, axis_fits)
+        _apply_semi_empirical_prior(config.particulars, baseline, selected_samples, axis_fits)
     axis_solutions = [
         baseline.combine_axis_fits(
             dict(zip(learned_axes, axis_candidates, strict=True)),
@@ -378,9 +380,9 @@ def fit_regressors(
     ]
     if not config.bounded:
         return axis_solutions
-    restoring = SoftVelocityLimit(_RANGE_MARGIN, len(selected.names), baseline.n_dof)
-    restoring.calibrate(selected)
-    state = {f"bound.{name}": value for name, value in restoring.state_dict().items()}
+    velocity_limit = SoftVelocityLimit(_RANGE_MARGIN, len(selected_samples.names), baseline.n_dof)
+    velocity_limit.calibrate(selected_samples)
+    state = {f"bound.{name}": value for name, value in velocity_limit.state_dict().items()}
     return [replace(solution, state={**solution.state, **state}) for solution in axis_solutions]
 
 
@@ -429,9 +431,9 @@ def _apply_semi_empirical_prior(
     slopes = directional_derivatives(baseline.library, z, directions)[:, 0]
     targets = torch.tensor(dynamics, dtype=torch.float64)
     for index in range(len(axis_fits[1])):
-        fits = {axis: axis_fits[axis][index] for axis in (1, 2)}
+        least_squares_solutions = {axis: axis_fits[axis][index] for axis in (1, 2)}
         posteriors = [
-            _combine_with_prior(fits, baseline, slopes, targets, factor)
+            _combine_with_prior(least_squares_solutions, baseline, slopes, targets, factor)
             for factor in _PRIOR_FACTORS
         ]
         best = max(range(len(posteriors)), key=lambda k: posteriors[k][0])
@@ -440,7 +442,7 @@ def _apply_semi_empirical_prior(
 
 
 def _combine_with_prior(
-    fits: Mapping[int, Solution],
+    least_squares_solutions: Mapping[int, Solution],
     baseline: RegressorBaseline,
     slopes: Tensor,
     targets: Tensor,
@@ -449,7 +451,7 @@ def _combine_with_prior(
     """Return the log evidence and the posterior solutions of sway and yaw for a width of the prior.
 
     Args:
-        fits: least-squares solution of sway and of yaw.
+        least_squares_solutions: solution of sway and of yaw.
         baseline: the baseline.
         slopes: derivatives of the terms by v and r [2, J].
         targets: semi-empirical derivatives of the accelerations of sway and yaw [2, 2].
@@ -457,7 +459,7 @@ def _combine_with_prior(
     """
     log_evidence = 0.0
     posteriors = {}
-    for axis, solution in fits.items():
+    for axis, solution in least_squares_solutions.items():
         columns = [baseline.library.terms.index(entry.term) for entry in solution.table]
         design = slopes[:, columns]
         target = targets[axis - 1]
@@ -489,7 +491,7 @@ def _combine_with_prior(
     return log_evidence, posteriors
 
 
-def _destabilising_in_all(
+def _find_common_destabilising_terms(
     solutions: Sequence[Solution], axis: int, names: Sequence[str]
 ) -> set[str]:
     """Return the terms with the sign of negative damping in every solution."""

@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 _ANGLE_PREFIXES = ("delta", "rudder", "azimuth")
-_BREAKS_A_COMMENT = ("*/", "/*", "//", "\\", '"')
+_COMMENT_DELIMITERS = ("*/", "/*", "//", "\\", '"')
 
 
 def require_plain_name(name: str) -> str:
@@ -47,7 +47,7 @@ def require_plain_name(name: str) -> str:
     Raises:
         ValueError: if a character is not printable, or a comment or text would end there.
     """
-    for part in _BREAKS_A_COMMENT:
+    for part in _COMMENT_DELIMITERS:
         if part in name:
             raise ValueError(f"the name {name!r} holds {part!r}; rename it")
     if not name.isprintable():
@@ -172,17 +172,20 @@ def suggest_name(name: str, valid: Iterable[str]) -> str:
 
 def azimuth_thrusters(names: Sequence[str]) -> dict[str, str]:
     """Return the angle channel of each azimuth thruster -> channel of its revolutions or thrust."""
-    name_of_base = {channel.removeprefix("cmd_"): channel for channel in names}
+    channel_of_base_name = {channel.removeprefix("cmd_"): channel for channel in names}
     thrust_of_angle = {}
-    for angle in (channel for channel in name_of_base if channel.startswith("azimuth")):
+    for angle in (channel for channel in channel_of_base_name if channel.startswith("azimuth")):
         suffix = angle.removeprefix("azimuth")
         thrust_quantity = next(
-            (n for n in ("n", "throttle", "thrust") if f"{n}{suffix}" in name_of_base), None
+            (n for n in ("n", "throttle", "thrust") if f"{n}{suffix}" in channel_of_base_name), None
         )
         if thrust_quantity and suffix != "_diff":
-            thrust_of_angle[name_of_base[angle]] = name_of_base[f"{thrust_quantity}{suffix}"]
+            thrust_of_angle[channel_of_base_name[angle]] = channel_of_base_name[
+                f"{thrust_quantity}{suffix}"
+            ]
     return thrust_of_angle
 
 
 WIND_CHANNELS = ("wind_u", "wind_v", "wind_mag")
+"""Relative wind along the body axes and its magnitude in m/s, computed from `WIND_INPUTS`."""
 FORCE_CHANNELS = ("tau_x", "tau_y", "tau_n")

@@ -257,7 +257,7 @@ def _lower_operation(target: Any, args: Any, keyword_arguments: Any, model_name:
         if i not in moved_arguments
         for leaf in tree.tree_leaves(arg)
     ]
-    # the same movement of the indices gives the entries of the result, unless it depends on values
+    # torch moves the indices of the entries in the same way, unless the movement depends on values
     if moved_arguments and all(
         leaf.is_constant for leaf in other_leaves if isinstance(leaf, TracedValue)
     ):
@@ -323,11 +323,15 @@ def _reduction_rows(value: TracedValue, dim: Any) -> tuple[Tensor, int]:
     """Return the indices [rows, n] of the entries that a reduction along `dim` combines, and n."""
     indices = value.indices
     dimensions = list(range(indices.dim()))
-    requested = [dim] if isinstance(dim, int) else dim
-    reduced = [d % indices.dim() for d in requested] if requested else dimensions
-    reordered = indices.permute(*(d for d in dimensions if d not in reduced), *reduced)
+    requested_dimensions = [dim] if isinstance(dim, int) else dim
+    reduced_dimensions = (
+        [d % indices.dim() for d in requested_dimensions] if requested_dimensions else dimensions
+    )
+    reordered = indices.permute(
+        *(d for d in dimensions if d not in reduced_dimensions), *reduced_dimensions
+    )
     size = 1
-    for d in reduced:
+    for d in reduced_dimensions:
         size *= indices.shape[d]
     return reordered.reshape(-1, size), size
 
@@ -347,7 +351,7 @@ def _lower_reduction(
         example: result at the examples.
         value: tensor that is reduced.
         dim: dimension or dimensions; None for all.
-        keepdim: ignored, because the shape of `example` has the answer.
+        keepdim: ignored, because `example` has the shape of the result.
     """
     rows, size = _reduction_rows(value, dim)
     if name in ("sum", "mean"):

@@ -204,7 +204,7 @@ def _extract_shared_part(
     placeholders = get_placeholders(graph)
     shared_placeholders = placeholders[len(row_examples) :]
     shared_nodes: dict[Node, None] = dict.fromkeys(shared_placeholders)
-    # constants depend on nothing: they must not make a node of a row a shared one, or vice versa
+    # constants are neither shared nor of a row, so that they do not decide what a node is
     constant_nodes: dict[Node, None] = {}
     for node in graph.nodes:
         inputs = node.all_input_nodes
@@ -350,7 +350,7 @@ def _extract_subgraph(
     graph: Graph,
     inputs: Sequence[Node],
     results: Sequence[Node],
-    constant: Mapping[Node, Any] = MappingProxyType({}),
+    constants: Mapping[Node, Any] = MappingProxyType({}),
 ) -> GraphModule:
     """Return the subgraph that computes some nodes from others.
 
@@ -358,7 +358,7 @@ def _extract_subgraph(
         graph: the recorded graph.
         inputs: nodes that become arguments.
         results: nodes that become results.
-        constant: values of nodes that become buffers.
+        constants: values of nodes that become buffers.
     """
     subgraph = Graph()
     owner = nn.Module()
@@ -366,9 +366,9 @@ def _extract_subgraph(
 
     def copy_node(node: Node) -> Node:
         if node not in copies:
-            if node in constant:
+            if node in constants:
                 name = f"constant_{len(copies)}"
-                owner.register_buffer(name, constant[node])
+                owner.register_buffer(name, constants[node])
                 copies[node] = subgraph.get_attr(name)
             elif node.op == "get_attr":
                 name = f"constant_{len(copies)}"

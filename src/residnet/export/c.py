@@ -130,13 +130,17 @@ class CFunction:
             )
         statements = statement_writer.used_statements(store_statements)
         used_words = set(re.findall(r"\w+", "\n".join(statements)))
-        unused_casts = [
+        unused_argument_statements = [
             f"(void){name};"
             for name in (*statement_writer.names, *names)
             if name not in used_words and name not in self.flags[:1]
         ]
         counters = [name for name in "hij" if name in used_words]
-        lines = [*([f"int {', '.join(counters)};"] if counters else []), *unused_casts, *statements]
+        lines = [
+            *([f"int {', '.join(counters)};"] if counters else []),
+            *unused_argument_statements,
+            *statements,
+        ]
         indented_lines = "".join(f"    {line}\n" for line in lines)
         return f"{self.render_prototype(prefix)} {{\n{indented_lines}}}\n"
 
@@ -162,12 +166,13 @@ def render_c_files(
         header_comment: comment at the top of the header that explains its use.
         header: name of the header, which the source includes.
         is_double_only: whether only double precision is supported.
-        build: build identity, which ends in hexadecimal digits; empty for none.
+        build: version and hash of the exported model, which ends in hexadecimal digits; empty for
+            none.
     """
     tables = Tables(f"{prefix}_")
     definitions = [function.render_definition(prefix, tables) for function in functions]
     definitions += [f"{prototype} {{\n{body}}}\n" for _, prototype, body in extra_functions]
-    names = {
+    template_names = {
         "prefix": prefix,
         "macro": f"{prefix.upper()}_DOUBLE",
         "build": build,
@@ -175,34 +180,33 @@ def render_c_files(
         "build_number": f"0x{build.rpartition('+')[2][:8]}UL",
     }
     used_words = set(re.findall(r"\w+", "\n".join(definitions)))
-    used_tables = [
-        entry_comment for name, entry_comment in tables.lines.items() if name in used_words
-    ]
+    used_tables = [table_line for name, table_line in tables.lines.items() if name in used_words]
     source = render_template(
-        "c_source.c", header=header, body="\n".join((*used_tables, *definitions)), **names
+        "c_source.c", header=header, body="\n".join((*used_tables, *definitions)), **template_names
     )
     declarations = [(function.comment, function.render_prototype(prefix)) for function in functions]
     declarations += [(comment, prototype) for comment, prototype, _ in extra_functions]
     return source, render_template(
         "c_header.h",
         comment="\n".join(
-            f" * {comment_line}".rstrip() for comment_line in _comment(header_comment).splitlines()
+            f" * {comment_line}".rstrip()
+            for comment_line in _escape_comment(header_comment).splitlines()
         ),
         guard=f"{prefix.upper()}_H",
         double_only=is_double_only,
-        **names,
+        **template_names,
         numbers="\n".join(
-            f"#define {prefix.upper()}_{name} {value} /* {_comment(entry_comment)} */"
+            f"#define {prefix.upper()}_{name} {value} /* {_escape_comment(entry_comment)} */"
             for name, (value, entry_comment) in constants.items()
         ),
         prototypes="\n\n".join(
-            f"/* {_comment(entry_comment)} */\n{prototype_line};"
+            f"/* {_escape_comment(entry_comment)} */\n{prototype_line};"
             for entry_comment, prototype_line in declarations
         ),
     )
 
 
-def _comment(text: str) -> str:
+def _escape_comment(text: str) -> str:
     """Return a text that cannot terminate a C comment."""
     return text.replace("*/", "* /").replace("/*", "/ *")
 
@@ -412,14 +416,19 @@ _FLOAT_BYTES = 4
 """Size of a single-precision number in bytes."""
 
 
-def report_footprint(file_name: str, size: Mapping[str, Any]) -> list[str]:
-    """Report stack and size to the user before a file is written; return the warnings."""
-    stack = size["largest_stack_bytes"]
-    code = size["code_bytes"]
+def report_footprint(file_name: str, footprint: Mapping[str, Any]) -> list[str]:
+    """Log the stack and size of a file and return the warnings.
+
+    Args:
+        file_name: name of the C file.
+        footprint: result of `measure_footprint`, with `memory_bytes` and `step_seconds`.
+    """
+    stack = footprint["largest_stack_bytes"]
+    code = footprint["code_bytes"]
     log_message(
-        f"  {file_name}: {stack:,} bytes of stack ({size['stack_from']}), {code:,} bytes of code"
-        f" and constants ({size['code_from']}), {size['memory_bytes']:,} bytes of memory between"
-        f" steps{_describe_step_time(size)} on {size['machine']}"
+        f"  {file_name}: {stack:,} bytes of stack ({footprint['stack_from']}), {code:,} bytes of"
+        f" code and constants ({footprint['code_from']}), {footprint['memory_bytes']:,} bytes of"
+        f" memory between steps{_describe_step_time(footprint)} on {footprint['machine']}"
     )
     warnings = []
     if stack > STACK_LIMIT:
@@ -437,9 +446,9 @@ def report_footprint(file_name: str, size: Mapping[str, Any]) -> list[str]:
     return warnings
 
 
-def _describe_step_time(size: Mapping[str, Any]) -> str:
+def _describe_step_time(footprint: Mapping[str, Any]) -> str:
     """Return the time of one step in words; empty if it was not measured."""
-    seconds = size.get("step_seconds")
+    seconds = footprint.get("step_seconds")
     return "" if seconds is None else f", {1e6 * seconds:.2g} us per step"
 
 
@@ -561,7 +570,7 @@ def _render_vessel_functions(prefix: str, exported: ExportedVessel) -> list[tupl
         P=prefix_upper,
         has_prediction_flag=exported.model.has_prediction_flag,
     )
-    unused_casts = "    (void)x;\n    (void)w;\n    (void)count;\n    (void)s;\n"
+    unused_argument_statements = "    (void)x;\n    (void)w;\n    (void)count;\n    (void)s;\n"
     band_table: BandTable | None = exported.spec.band
     steps = (1,) if band_table is None else band_table.steps
     band_channels = exported.spec.signals.dof.layout.band_channels
@@ -580,10 +589,10 @@ def _render_vessel_functions(prefix: str, exported: ExportedVessel) -> list[tupl
             zero_loop if has_memory else "    (void)s;\n",
         ),
         (
-            "memory that a measured past leaves: count states and inputs, oldest first",
+            "memory after a measured past: count states and inputs, oldest first",
             f"void {prefix}_warmup(const {real_type} *x, const {real_type} *w, size_t count,"
             f" {real_type} *s)",
-            warmup_body if has_memory else unused_casts,
+            warmup_body if has_memory else unused_argument_statements,
         ),
         (
             f"half widths of the {level_text}prediction intervals of"
@@ -729,12 +738,14 @@ class CExporter(Exporter):
             dtype, (c_files, parity) = run_in_sufficient_precision(exported, write_and_check)
             if dtype == torch.float64:
                 card |= {"dtype": get_dtype_name(dtype)}
-            size = measure_footprint(temporary_path)
-            size["memory_bytes"] = measure_memory(exported)
+            footprint = measure_footprint(temporary_path)
+            footprint["memory_bytes"] = measure_memory(exported)
             # the first library has the precision that the file has without a macro
-            size["step_seconds"] = measure_step_time(libraries[0], f"{prefix}_step", step_sizes)
-            size["warnings"] = report_footprint(file.name, size)
-            card |= {"size": size, "parity": parity}
+            footprint["step_seconds"] = measure_step_time(
+                libraries[0], f"{prefix}_step", step_sizes
+            )
+            footprint["warnings"] = report_footprint(file.name, footprint)
+            card |= {"size": footprint, "parity": parity}
             write_card(file, card)
             file.with_suffix(".h").write_text(c_files.header)
             file.write_text(c_files.source)

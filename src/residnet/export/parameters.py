@@ -50,16 +50,16 @@ class VesselCoefficients:
         mass: M [3, 3], rigid body and added mass together.
         linear: D [3, 3].
         quadratic: D_n [3, 3], coefficients of |nu| nu.
-        left_out: fraction of the force of the baseline that these matrices do not represent, by
-            axis.
-        terms_left_out: terms of the baseline that these matrices do not contain, by axis.
+        unrepresented_share: root mean square force of the baseline that these matrices do not
+            represent, relative to the root mean square force, by axis.
+        unrepresented_terms: terms of the baseline that are not of this form, by axis.
     """
 
     mass: Matrix
     linear: Matrix
     quadratic: Matrix
-    left_out: dict[str, float]
-    terms_left_out: dict[str, list[str]]
+    unrepresented_share: dict[str, float]
+    unrepresented_terms: dict[str, list[str]]
 
 
 def compute_coriolis_force(mass: Matrix, nu: Matrix) -> Matrix:
@@ -96,7 +96,7 @@ def tabulate_accelerations(
 def list_unidentifiable(
     theta: Matrix, terms: Sequence[str], axis_names: Sequence[str]
 ) -> list[str]:
-    """Return what the accelerations do not determine, one sentence each; empty if they do.
+    """Return the parameters that the accelerations do not determine, one sentence each.
 
     The coefficients of tau_x, tau_y and tau_n are the inverse of the mass matrix.
 
@@ -128,9 +128,9 @@ def identify_coefficients(spec: ModelSpec, model: HybridDynamics) -> VesselCoeff
         UsageError: if the baseline is not a sum of terms of velocities and forces.
     """
     theta, terms, _ = _baseline_terms(spec, model)
-    force_columns_theta = theta[:, [terms.index(name) for name in FORCE_CHANNELS]]
+    force_coefficients = theta[:, [terms.index(name) for name in FORCE_CHANNELS]]
     # nu_dot = M^-1 (tau - ...): the coefficients of the forces are the inverse of the mass matrix
-    mass: Matrix = np.linalg.inv(force_columns_theta).astype(np.float64)
+    mass: Matrix = np.linalg.inv(force_coefficients).astype(np.float64)
     lower = np.array(spec.low[:3])
     upper = np.array(spec.high[:3])
     nu = np.random.default_rng(0).uniform(lower, upper, (_N_SAMPLES, 3))
@@ -159,7 +159,7 @@ def identify_coefficients(spec: ModelSpec, model: HybridDynamics) -> VesselCoeff
             np.sqrt(np.mean(residual_force**2) / max(np.mean(force[:, i] ** 2), 1e-30))
         )
     return VesselCoefficients(
-        mass, linear, quadratic, residual_share, _unplaced_terms(theta, terms)
+        mass, linear, quadratic, residual_share, _find_unrepresented_terms(theta, terms)
     )
 
 
@@ -180,17 +180,19 @@ def _baseline_terms(
     )
 
 
-def _unplaced_terms(theta: Matrix, terms: list[str]) -> dict[str, list[str]]:
+def _find_unrepresented_terms(theta: Matrix, terms: list[str]) -> dict[str, list[str]]:
     """Return the terms of each axis that are neither damping, Coriolis force nor actuator force."""
     damping_terms = {f"{name}" for name in VELOCITY_NAMES} | {
         f"{name}|{name}|" for name in VELOCITY_NAMES
     }
-    placed_terms = (
+    represented_terms = (
         damping_terms | set(FORCE_CHANNELS) | {"v r", "r v", "u r", "r u", "u v", "v u", "r^2"}
     )
     return {
         ACCELERATION_NAMES[i]: [
-            term for j, term in enumerate(terms) if theta[i, j] != 0 and term not in placed_terms
+            term
+            for j, term in enumerate(terms)
+            if theta[i, j] != 0 and term not in represented_terms
         ]
         for i in range(3)
     }
@@ -205,11 +207,11 @@ _VRX_NAMES = ("xDotU", "yDotV", "nDotR", "xU", "yV", "nR")
 def render_simulator_files(
     name: str, vessel_coefficients: VesselCoefficients, rigid_body: Mapping[str, float]
 ) -> dict[str, str]:
-    """Return the files of the simulators by file name suffix.
+    """Return the text of each simulator's file by the suffix of its name.
 
-    SDF for the plugins of Gazebo and VRX with rigid-body masses (Gazebo's coefficients are forces
-    and therefore negative; VRX's are resistances), a MATLAB function with six-by-six matrices as in
-    MSS vessels, and a vehicle of PythonVehicleSimulator.
+    The SDF file has rigid-body masses and coefficients for the plugins of Gazebo, which are forces
+    and therefore negative, and of VRX, which are resistances. The other files are a MATLAB function
+    with six-by-six matrices as in MSS, and a vehicle of PythonVehicleSimulator.
     """
     matrices = {
         "M": vessel_coefficients.mass,
@@ -221,16 +223,17 @@ def render_simulator_files(
         matrices_6x6[letter][np.ix_(_PLANAR_INDICES, _PLANAR_INDICES)] = matrix
     rigid_body_mass = (rigid_body["mass"], rigid_body["mass"], rigid_body["inertia"])
     added_mass = (vessel_coefficients.mass.diagonal() - rigid_body_mass).tolist()
-    damping_entries = dict(zip(_VRX_NAMES, added_mass, strict=False))
+    sdf_coefficients = dict(zip(_VRX_NAMES, added_mass, strict=False))
     for i, axis in enumerate("xyn"):
         for j, velocity_letter in enumerate("UVR"):
             if vessel_coefficients.linear[i, j] or vessel_coefficients.quadratic[i, j]:
-                damping_entries[f"{axis}{velocity_letter}"] = float(
+                sdf_coefficients[f"{axis}{velocity_letter}"] = float(
                     vessel_coefficients.linear[i, j]
                 )
-                damping_entries[f"{axis}{velocity_letter}abs{velocity_letter}"] = float(
+                sdf_coefficients[f"{axis}{velocity_letter}abs{velocity_letter}"] = float(
                     vessel_coefficients.quadratic[i, j]
                 )
+    # VRX writes quadratic damping as xUU, Gazebo as xUabsU
     vrx_names = {key: key for key in _VRX_NAMES}
     vrx_names |= {f"{key}{key[-1]}": f"{key}abs{key[-1]}" for key in _VRX_NAMES[3:]}
     class_name = "".join(name_part.capitalize() for name_part in name.split("_"))
@@ -241,7 +244,7 @@ def render_simulator_files(
     }
     return {
         ".sdf": render_template(
-            "gazebo.sdf", name=name, rigid=rigid_body, entries=damping_entries, simple=vrx_names
+            "gazebo.sdf", name=name, rigid=rigid_body, entries=sdf_coefficients, simple=vrx_names
         ),
         "_parameters.m": render_template(
             "parameters.m",
@@ -325,8 +328,8 @@ class ParametersExporter(Exporter):
             "M": vessel_coefficients.mass.tolist(),
             "D": vessel_coefficients.linear.tolist(),
             "D_n": vessel_coefficients.quadratic.tolist(),
-            "share_left_out": vessel_coefficients.left_out,
-            "terms_left_out": vessel_coefficients.terms_left_out,
+            "share_left_out": vessel_coefficients.unrepresented_share,
+            "terms_left_out": vessel_coefficients.unrepresented_terms,
             "accelerations": accelerations,
             "not_identifiable": [],
             "head_left_out": head_left_out,

@@ -19,7 +19,7 @@ from residnet.core.errors import FitError, UsageError
 from residnet.core.samples import Samples
 from residnet.core.trust import is_trusted
 from residnet.heads.base import ClosedFormHead, Features, ResidualScale
-from residnet.heads.scikit_estimators import _parse_step, make_estimator
+from residnet.heads.scikit_estimators import make_estimator, parse_step
 from residnet.heads.scikit_state import StateError, decode, encode
 from residnet.regression.estimator import Solution
 
@@ -31,8 +31,8 @@ _DIFFERENCE_STEP = 0.1
 
 It is large, because trees are piecewise constant.
 """
-_STATE = "_extra_state"
-_STORED_STATE = 1
+_STATE_KEY = "_extra_state"
+_STORED_STATE_KEY = 1
 """First byte of a stored state that holds the arrays of fitted estimators."""
 _STORED_SAMPLES = 2
 """First byte of a stored state that holds samples; the estimators are fitted again on loading."""
@@ -71,18 +71,18 @@ class SklearnHead(ClosedFormHead):
         # layout of the stored bytes: kind, number of samples (four bytes), content
         count = np.array([len(rows)], dtype="<u4").view(np.uint8)
         if self.config.is_storable:
-            names = [_parse_step(step)[0] for step in self.config.pipeline]  # type: ignore[index]
+            names = [parse_step(step)[0] for step in self.config.pipeline]  # type: ignore[index]
             try:
                 content = encode([list(zip(names, axis, strict=True)) for axis in axes])
             except StateError as error:
                 raise FitError(f"the fitted pipeline {error}") from None
-            parts = [[_STORED_STATE], count, np.frombuffer(content, dtype=np.uint8)]
+            parts = [[_STORED_STATE_KEY], count, np.frombuffer(content, dtype=np.uint8)]
         else:
             training_data = np.ascontiguousarray(np.column_stack((features, y)))
             parts = [[_STORED_SAMPLES], count, training_data.reshape(-1).view(np.uint8)]
         stored = torch.from_numpy(np.concatenate([np.asarray(p, dtype=np.uint8) for p in parts]))
         self.set_extra_state(stored)
-        return [Solution({}, {_STATE: stored}, notes={"fitted_on": len(rows)})]
+        return [Solution({}, {_STATE_KEY: stored}, notes={"fitted_on": len(rows)})]
 
     def _fit(self, x: np.ndarray, y: np.ndarray) -> list[list[Any]]:
         """Fit the steps of each axis to features [N, F] and targets [N, n]."""
@@ -123,7 +123,7 @@ class SklearnHead(ClosedFormHead):
             raise UsageError("a head of kind sklearn: its state is truncated; run the fit again")
         self.sample_count = int(stored[1:5].copy().view("<u4")[0])
         content = stored[5:]
-        if stored[0] == _STORED_STATE and self.config.is_storable:
+        if stored[0] == _STORED_STATE_KEY and self.config.is_storable:
             self.axis_pipelines = self._restore(content.tobytes())
         elif stored[0] == _STORED_SAMPLES and is_trusted():
             width = self.features.n_features + self.n_dof
@@ -146,7 +146,7 @@ class SklearnHead(ClosedFormHead):
     def _restore(self, content: bytes) -> list[list[Any]]:
         """Restore the steps of each axis, and check them by a trial prediction."""
         axes = [[make_estimator(step) for step in self.config.pipeline] for _ in self.output_names]
-        names = [_parse_step(step)[0] for step in self.config.pipeline]  # type: ignore[index]
+        names = [parse_step(step)[0] for step in self.config.pipeline]  # type: ignore[index]
         remedy = "restore the model, or run the fit again with this version of scikit-learn"
         try:
             decode(

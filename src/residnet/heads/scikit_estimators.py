@@ -15,7 +15,7 @@ _STORES_PICKLES = ("memory",)
 """Parameters that configure a joblib cache, which unpickles its files."""
 
 
-def _parse_step(step: Any) -> tuple[str, Mapping[str, Any]] | None:
+def parse_step(step: Any) -> tuple[str, Mapping[str, Any]] | None:
     """Return the class name and parameters of a step; None for a plain value."""
     if isinstance(step, str) and step.startswith("sklearn."):
         return step, {}
@@ -28,13 +28,13 @@ def _parse_step(step: Any) -> tuple[str, Mapping[str, Any]] | None:
 
 def _is_listed(step: Any, names: Any) -> bool:
     """Return whether a class and the classes in its parameters are on the allow-lists."""
-    parsed_step = _parse_step(step)
+    parsed_step = parse_step(step)
     if parsed_step is None:
         return False
     class_name, parameters = parsed_step
     if class_name not in names:
         return False
-    return all(_is_listed(value, KERNELS) for value in parameters.values() if _parse_step(value))
+    return all(_is_listed(value, KERNELS) for value in parameters.values() if parse_step(value))
 
 
 def make_estimator(step: Any, *, listed: Any = FITTED) -> Any:
@@ -47,7 +47,7 @@ def make_estimator(step: Any, *, listed: Any = FITTED) -> Any:
     Raises:
         ValueError: if the class or a parameter does not exist or is not allowed.
     """
-    parsed_step = _parse_step(step)
+    parsed_step = parse_step(step)
     if parsed_step is None:
         raise ValueError(
             f"{step!r} is not a class below `sklearn`; give a name such as sklearn.svm.SVR"
@@ -95,7 +95,7 @@ def _parameter(owner: str, key: str, value: Any) -> Any:
         raise ValueError(
             f"{owner}: {key}: is a cache of pickles, which residnet does not open; remove it"
         )
-    if _parse_step(value):
+    if parse_step(value):
         return make_estimator(value, listed=KERNELS)
     if isinstance(value, list | tuple):
         return [_parameter(owner, key, part) for part in value]

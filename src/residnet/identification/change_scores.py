@@ -1,4 +1,4 @@
-"""Score statistics of system changes: robust sums, whitening and scatter over clean logs."""
+"""Score tests of system changes: scores, information, and their variance over clean logs."""
 
 from __future__ import annotations
 
@@ -41,14 +41,15 @@ def compute_robust_score_sums(
     whitening_matrices: Sequence[np.ndarray],
     prior_precision: np.ndarray,
 ) -> ScoreSums:
-    """Return sums over windows of scores and information, from whole windows and from parts.
+    """Return sums over windows of scores and information.
 
-    A window that no plausible change explains holds a manoeuvre outside the model. It is weighted
-    by the inverse of its unexplained residual.
+    The innovations of a window are given several times, for the whole window and for divisions of
+    it into shorter free runs. A window that no plausible change explains has a manoeuvre outside
+    the range of the model. It is weighted by the inverse of its unexplained residual.
 
     Args:
-        innovations_and_effects: innovations [B, parts n] and effects [B, C, parts n] of each
-            division.
+        innovations_and_effects: for each division into free runs of n values, the innovations
+            [B, runs n] of B windows and their derivatives by the sizes of C changes [B, C, runs n].
         whitening_matrices: matrix [n, n] of each division.
         prior_precision: prior precision of the sizes of the changes [C, C].
     """
@@ -133,22 +134,22 @@ def estimate_model_bias(
         hypotheses: Q changes.
         n_channels: number of channels of the innovations.
     """
-    n_causes = len(hypotheses)
+    n_changes = len(hypotheses)
     # clean logs are assumed to have correct sensors: a sensor fault such as a gain is nearly
     # collinear with the motion itself and would absorb other biases
     prior_std = np.array([0.0 if cause.sensor else cause.size * PRIOR_STD for cause in hypotheses])
-    bias_by_channel = np.zeros((n_causes, n_channels))
+    bias_by_channel = np.zeros((n_changes, n_channels))
     for channel in range(n_channels):
         channel_innovations = innovation[:, channel::n_channels].ravel()
         channel_effects = (
-            effects[:, :n_causes, channel::n_channels]
+            effects[:, :n_changes, channel::n_channels]
             .swapaxes(1, 2)
-            .reshape(len(channel_innovations), n_causes)
+            .reshape(len(channel_innovations), n_changes)
             * prior_std
         )
         regularized_gram = channel_effects.T @ channel_effects + np.mean(
             channel_innovations**2
-        ) * np.eye(n_causes)
+        ) * np.eye(n_changes)
         bias_by_channel[:, channel] = prior_std * np.linalg.solve(
             regularized_gram, channel_effects.T @ channel_innovations
         )
@@ -156,7 +157,12 @@ def estimate_model_bias(
 
 
 def compute_whitening_matrix(innovations: np.ndarray, n_parts: int) -> np.ndarray:
-    """Return the matrix [n, n] that makes innovations [B, parts n] of clean logs uncorrelated."""
+    """Return the matrix [n, n] that makes innovations of clean logs uncorrelated.
+
+    Args:
+        innovations: innovations [B, n_parts n] of windows in `n_parts` free runs.
+        n_parts: number of free runs of a window.
+    """
     # windows with a diverged free run have zero innovations, see `compute_innovations`
     innovations = innovations[(innovations != 0.0).any(axis=1)]
     innovations = innovations.reshape(len(innovations) * n_parts, -1)
@@ -195,7 +201,7 @@ class GroupScores:
 
     Attributes:
         log_index: log of each group [G].
-        score: score of each change [G, Q]; [G, F, Q] with F cross-fitted values.
+        score: score of each change [G, Q]; [G, F, Q] for the models of F folds.
         information: Fisher information of the changes [G, Q, Q].
     """
 
@@ -236,7 +242,8 @@ class ScoreDistribution:
         mean_size_variance: variance of the mean size over all clean logs [Q].
         correlation: correlation of the scores of different changes [Q, Q].
         n_groups: number of clean groups.
-        inflation_factor: ratio of the scatter of long clean segments to the scatter in this model.
+        inflation_factor: standard deviation of the sizes of long clean segments, relative to their
+            standard errors by this distribution.
     """
 
     noise_factor: np.ndarray
@@ -260,17 +267,17 @@ class ScoreDistribution:
         Optimal weights from few groups underestimate the variance (R. N. Kackar and D. A. Harville,
         1984); the factors are those of the Wishart distribution.
         """
-        n_causes = len(self.noise_factor)
-        degrees_of_freedom = max(self.n_groups - n_causes - 1, 1)
+        n_changes = len(self.noise_factor)
+        degrees_of_freedom = max(self.n_groups - n_changes - 1, 1)
         return (
             max((self.n_groups - 1) / degrees_of_freedom, 1.0)
             * self.n_groups
             / (degrees_of_freedom + 1)
         )
 
-    def select_causes(self, cause_indices: Sequence[int]) -> ScoreDistribution:
+    def select_changes(self, change_indices: Sequence[int]) -> ScoreDistribution:
         """Return the distribution of selected changes, by index."""
-        indices = list(cause_indices)
+        indices = list(change_indices)
         selected_fields = {
             name: getattr(self, name)[indices]
             for name in (
@@ -311,10 +318,8 @@ class ScoreDistribution:
     def estimate_sizes(self, groups: GroupScores) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the size of each change alone [Q], its standard error, and the explained square.
 
-        All scores are used jointly for each change. The explained square is the reduction of the
-        joint score statistic. All changes are compared on the same scores: agreement between logs
-        on the size of one change, or its small variance on clean logs, is no evidence for another
-        one.
+        The explained square of a change is the reduction of the joint score statistic of all
+        changes, so that changes are compared on the same scores.
         """
         weighted_scores, weighted_information, design_effect = self.weigh_by_log(groups)
         weighted_scores = weighted_scores / design_effect
@@ -358,7 +363,7 @@ def fit_score_distribution(groups: GroupScores) -> ScoreDistribution:
     """Estimate the distribution of the scores of groups of clean windows about zero."""
     score = groups.score
     diagonal_information = groups.diagonal_information
-    n_groups, n_causes = score.shape
+    n_groups, n_changes = score.shape
     noise_factor, size_variance = np.array(
         [
             _fit_variance_components(*values)
@@ -370,10 +375,10 @@ def fit_score_distribution(groups: GroupScores) -> ScoreDistribution:
     second_moment = standardized_scores.T @ standardized_scores / n_groups
     root_mean_squares = np.sqrt(np.diag(second_moment)) + _TINY_INFORMATION
     # correlations estimated from few groups are unreliable: shrinkage towards independence
-    shrinkage_weight = n_groups / (n_groups + n_causes)
+    shrinkage_weight = n_groups / (n_groups + n_changes)
     correlation = shrinkage_weight * second_moment / np.outer(
         root_mean_squares, root_mean_squares
-    ) + (1.0 - shrinkage_weight) * np.eye(n_causes)
+    ) + (1.0 - shrinkage_weight) * np.eye(n_changes)
     np.fill_diagonal(correlation, 1.0)
     # covariance of pairs of groups within logs: (sum)^2 - sum of squares = sum over pairs; without
     # any pair all variance is assumed to be common, the conservative case
@@ -398,7 +403,7 @@ def fit_score_distribution(groups: GroupScores) -> ScoreDistribution:
 
 
 def estimate_score_inflation(
-    groups: GroupScores, fold_of_group: np.ndarray, groups_per_stretch: int
+    groups: GroupScores, fold_of_group: np.ndarray, groups_per_segment: int
 ) -> float:
     """Return the observed scatter of clean segments, relative to that expected from other logs.
 
@@ -408,15 +413,15 @@ def estimate_score_inflation(
     Args:
         groups: groups of clean windows in time order.
         fold_of_group: fold of each group [G].
-        groups_per_stretch: number of groups per segment.
+        groups_per_segment: number of groups per segment.
     """
     standardized_sizes = []
     for held_out_fold in np.unique(fold_of_group):
         fold_indices = np.flatnonzero(fold_of_group == held_out_fold)
         distribution = fit_score_distribution(groups[fold_of_group != held_out_fold])
-        for stretch_start in range(0, len(fold_indices), groups_per_stretch):
+        for segment_start in range(0, len(fold_indices), groups_per_segment):
             sizes, standard_errors, _ = distribution.estimate_sizes(
-                groups[fold_indices[stretch_start : stretch_start + groups_per_stretch]]
+                groups[fold_indices[segment_start : segment_start + groups_per_segment]]
             )
             standardized_sizes.append(sizes / standard_errors)
     return max(1.0, float(np.sqrt(np.mean(np.square(standardized_sizes)))))

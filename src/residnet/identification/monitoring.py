@@ -393,11 +393,11 @@ class ChangeDetector:
         self.bias_by_fold, cross_validated_groups = self._cross_validate(
             innovations_by_group, model_bias, log_of_group, fold_of_group, np.diag(prior_precisions)
         )
-        groups_per_stretch = max(round(config.stretch / config.group), 1)
+        groups_per_segment = max(round(config.stretch / config.group), 1)
         self.score_distribution = replace(
             fit_score_distribution(cross_validated_groups),
             inflation_factor=estimate_score_inflation(
-                cross_validated_groups, np.sort(fold_of_group), groups_per_stretch
+                cross_validated_groups, np.sort(fold_of_group), groups_per_segment
             ),
         )
         # two-sided threshold with a Bonferroni correction over tests in time and hypotheses

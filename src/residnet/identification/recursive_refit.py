@@ -372,7 +372,7 @@ class _InformationFilter:
         group_scores = GroupScores(np.zeros(len(groups_of_log)), score, information)
         # all groups belong to one log; the design effect accounts for their correlation
         weighted_scores, weighted_information, design_effect = (
-            self.detector.score_distribution.select_causes(self.cause_indices).weigh_by_log(
+            self.detector.score_distribution.select_changes(self.cause_indices).weigh_by_log(
                 group_scores
             )
         )

@@ -156,8 +156,10 @@ class Hull(nn.Module):
         The last n columns are the coefficients of tau.
         """
         # nu_dot = M^-1 C^T terms + M^-1 tau
-        response = torch.cat((self.inverse_mass @ self.coefficients.T, self.inverse_mass), dim=1)
-        return self.terms.terms, response.tolist()
+        coefficients = torch.cat(
+            (self.inverse_mass @ self.coefficients.T, self.inverse_mass), dim=1
+        )
+        return self.terms.terms, coefficients.tolist()
 
 
 @final
@@ -192,7 +194,7 @@ class HullPlant(Plant):
         self.actuators = actuators
         self.wind = wind
         self.n_dof = len(hull.mass)
-        self.has_roll = self.n_dof == ROLLING_LAYOUT.n_dof
+        self.has_roll_without_pitch = self.n_dof == ROLLING_LAYOUT.n_dof
         self.is_submerged = self.n_dof == SUBMERGED_LAYOUT.n_dof
         self.has_environment = True
         self.state_names = (*_LAYOUT_OF_DOF[self.n_dof].state_names, *actuators.state_names)
@@ -304,7 +306,7 @@ class HullPlant(Plant):
         """Return velocities, and roll and pitch of a vessel that has them: the hull's channels."""
         if self.is_submerged:
             return torch.cat((nu, pose[..., 3:5]), dim=-1)
-        return torch.cat((nu, pose[..., 2:3]), dim=-1) if self.has_roll else nu
+        return torch.cat((nu, pose[..., 2:3]), dim=-1) if self.has_roll_without_pitch else nu
 
     def _pose_derivative(self, pose: Tensor, nu: Tensor) -> Tensor:
         """Return the derivative [B, n] of the pose (Woo et al. 2018, eq. (1), Gouletas 2020).
@@ -320,7 +322,7 @@ class HullPlant(Plant):
             return torch.cat(
                 (torch.stack((north, east, velocity_down), dim=-1), nu[..., 3:]), dim=-1
             )
-        if not self.has_roll:
+        if not self.has_roll_without_pitch:
             return torch.stack((*to_earth(u, v, pose[..., 2]), nu[..., 2]), dim=-1)
         # without pitch and heave, roll only tilts the sway velocity and the yaw axis
         cos_phi = torch.cos(pose[..., 2])
@@ -335,7 +337,7 @@ class HullPlant(Plant):
                 (*horizontal_to_body(north, east, pose[..., 3:]), zero, zero, zero), dim=-1
             )
         body_x, body_y = to_body(north, east, pose[..., -1])
-        if self.has_roll:
+        if self.has_roll_without_pitch:
             return torch.stack((body_x, body_y * torch.cos(pose[..., 2]), zero, zero), dim=-1)
         return torch.stack((body_x, body_y, zero), dim=-1)
 
@@ -352,7 +354,7 @@ class HullPlant(Plant):
         body_x, body_y = to_body(north, east, pose[..., -1])
         zero = torch.zeros_like(body_x)
         r = nu[..., -1]
-        if not self.has_roll:
+        if not self.has_roll_without_pitch:
             current = torch.stack((body_x, body_y, zero), dim=-1)
             return current, torch.stack((r * body_y, -r * body_x, zero), dim=-1)
         cos_phi = torch.cos(pose[..., 2])
@@ -371,7 +373,11 @@ class HullPlant(Plant):
             -speed * torch.cos(direction), -speed * torch.sin(direction), pose
         )
         force = self.wind.wind_forces(air_velocity[:, 0] - nu[:, 0], air_velocity[:, 1] - nu[:, 1])
-        return force if self.has_roll else torch.cat((force[:, :2], force[:, 3:]), dim=-1)
+        return (
+            force
+            if self.has_roll_without_pitch
+            else torch.cat((force[:, :2], force[:, 3:]), dim=-1)
+        )
 
     def finish_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
         """Update the actuator states in x [B, nx] at the end of a time step of dt seconds.

@@ -232,10 +232,12 @@ def draft_fit_config(
     missing_text = _explain_missing_steering(
         inputs, draft_logs.dof, list(draft_logs.complete_logs.values()), draft_notes
     )
-    unexcited = find_unexcited_inputs(list(draft_logs.complete_logs.values()), inputs)
-    # commands beside measured angles are not inputs, but show the response of the steering gear
+    reasons_by_unexcited_input = find_unexcited_inputs(
+        list(draft_logs.complete_logs.values()), inputs
+    )
+    # commands that are not inputs, because the angles are measured, show the lag of the actuators
     logs_with_commands = dict(draft_logs.complete_logs)
-    all_inputs = draft_logs.keep_inputs((*inputs, *unexcited), draft_notes)
+    all_inputs = draft_logs.restrict_to_inputs((*inputs, *reasons_by_unexcited_input), draft_notes)
     inputs = all_inputs[: len(inputs)]
     dof = draft_logs.dof
     finding_codes, quality_warnings = _data_quality_warnings(list(draft_logs.logs.values()), inputs)
@@ -252,40 +254,36 @@ def draft_fit_config(
     # masks, channels and preparation
     mask_settings = _choose_mask_settings(finding_codes, dof)
     masks = validate_config({"grid": {"step": 1.0}, **mask_settings}, PrepareConfig, "draft").masks
-    preparation_recipe = PreparationPlan.from_logs(
+    preparation_plan = PreparationPlan.from_logs(
         list(draft_logs.complete_logs.values()), inputs, dof, masks
     )
     signals = _choose_signals(
         inputs,
-        dict(zip(all_inputs[len(inputs) :], unexcited.values(), strict=True)),
+        dict(zip(all_inputs[len(inputs) :], reasons_by_unexcited_input.values(), strict=True)),
         dof,
-        preparation_recipe.wind_channels,
+        preparation_plan.wind_channels,
         draft_notes,
     )
-    _note_unused_channels(draft_logs, draft_notes, has_wind=bool(preparation_recipe.wind_channels))
-    preparation = preparation_recipe.to_config()
+    _note_unused_channels(draft_logs, draft_notes, has_wind=bool(preparation_plan.wind_channels))
+    preparation = preparation_plan.to_config()
     for text in quality_warnings:
         draft_notes.add_note(("data",), f"data doctor: {text}")
     preparation |= mask_settings
-    usable_logs = draft_logs.select_usable(
-        (*inputs, *preparation_recipe.wind_channels), preparation
-    )
+    usable_logs = draft_logs.select_usable((*inputs, *preparation_plan.wind_channels), preparation)
     # split of the logs, and the evaluation that their lengths allow
     root, split_entries = _split_logs(
         draft_logs, usable_logs, folder, draft_notes, holds_out_manoeuvres=naval is not None
     )
     if not splits_from_names(list(usable_logs.values())):
         # a split given by the names of folders is not changed
-        _move_short_logs_to_training(
-            split_entries, preparation_recipe.correlation_time, draft_notes
-        )
+        _move_short_logs_to_training(split_entries, preparation_plan.correlation_time, draft_notes)
     split = {name: [entry for entry, *_ in members] for name, members in split_entries.items()}
     splits = {name: [log for _, log, _ in members] for name, members in split_entries.items()}
     durations = {name: [time for *_, time in members] for name, members in split_entries.items()}
     evaluation_settings = make_evaluation_settings(
-        splits, durations, preparation_recipe.correlation_time, masks, dof
+        splits, durations, preparation_plan.correlation_time, masks, dof
     )
-    _note_choices(draft_notes, preparation_recipe.reason, evaluation_settings["selection"])
+    _note_choices(draft_notes, preparation_plan.reason, evaluation_settings["selection"])
     config = {
         "task": "fit",
         "name": name,
@@ -352,7 +350,7 @@ def _has_current(settings: FitConfig, logs: Sequence[Log], draft_notes: DraftNot
     """Test whether logs over ground ran in currents, by the accelerations of a hull model.
 
     Args:
-        settings: of the fit, without `current`.
+        settings: settings of the fit, without `current`.
         logs: logs with complete motion.
         draft_notes: receives the currents.
     """
@@ -376,7 +374,7 @@ def _has_current(settings: FitConfig, logs: Sequence[Log], draft_notes: DraftNot
     try:
         prepared = prepare_splits({"train": logs[:_MAX_INSPECTED_LOGS]}, settings)["train"]
         # neighbouring samples are correlated, so that few of them suffice for a test
-        thinned = [
+        thinned_logs = [
             dataclasses.replace(
                 log,
                 trainable=log.trainable
@@ -384,7 +382,7 @@ def _has_current(settings: FitConfig, logs: Sequence[Log], draft_notes: DraftNot
             )
             for log in prepared
         ]
-        _, rows = estimate_currents(model, signals, thinned, CurrentConfig())
+        _, rows = estimate_currents(model, signals, thinned_logs, CurrentConfig())
     except ResidnetError:
         # logs without a usable sample are reported when the draft is run
         return False
@@ -395,13 +393,14 @@ def _has_current(settings: FitConfig, logs: Sequence[Log], draft_notes: DraftNot
     headings = [log.y[log.trainable, HEADING] for log in prepared]
     if is_explained_by_body_velocity(rows, headings):
         return False
-    listed = ", ".join(
+    listed_currents = ", ".join(
         f"{row.log} {row.speed:.2g} m/s (p = {row.p_value:.1g})" for row in currents[:3]
     )
     draft_notes.add_guess(
         ("current",),
         f"{len(currents)} of {len(rows)} logs ran in a significant constant current or wind:"
-        f" {listed}; the current of each log is estimated, remove this section for still water",
+        f" {listed_currents}; the current of each log is estimated, remove this section for still"
+        " water",
     )
     return True
 
@@ -441,10 +440,10 @@ def _explain_missing_steering(
     problem = describe_missing_steering(inputs, dof, logs)
     if not problem:
         return ""
-    unmatched = "; ".join(
+    unmatched_columns = "; ".join(
         text for _, text in draft_notes.notes if text.startswith(_UNMATCHED_COLUMN_NOTES)
     )
-    columns_text = f" ({unmatched})" if unmatched else ""
+    columns_text = f" ({unmatched_columns})" if unmatched_columns else ""
     return (
         f"{problem}; name the column that does under data.reader.channels and"
         f" signals.inputs{columns_text}, or give logs with it"
@@ -526,7 +525,7 @@ class _DraftLogs:
             reason = group_problems(self.exclusion_reasons)[0]
             raise DataError(f"{reason} ({unmatched_notes})" if unmatched_notes else reason)
 
-    def keep_inputs(self, inputs: Sequence[str], draft_notes: DraftNotes) -> tuple[str, ...]:
+    def restrict_to_inputs(self, inputs: Sequence[str], draft_notes: DraftNotes) -> tuple[str, ...]:
         """Rename forces to tau_x, tau_y, tau_n, drop unused channels, and return the inputs."""
         renamed_inputs = {
             name: next((f for f in ("tau_x", "tau_y", "tau_n") if name.startswith(f"{f}_")), name)
@@ -655,15 +654,15 @@ def _split_logs(
         else Path(relative_root).as_posix()
     )
     reason = (
-        "of each five logs, in the order of their manoeuvres, one is for validation and one for the"
-        " test, of eight logs or more three at least"
+        "sorted by manoeuvre, one of five logs is for validation and one for the test, and of eight"
+        " logs or more at least three are"
     )
     if splits_from_names(list(usable_logs.values())):
         reason = "folders or files are called after the splits"
     split_entries: dict[str, list[_SplitEntry]] = {split: [] for split in SPLITS}
-    whole_logs = choose_held_out_logs(usable_logs) if holds_out_manoeuvres else None
-    if whole_logs is not None:
-        for split, held_out_paths in whole_logs.items():
+    held_out_logs = choose_held_out_logs(usable_logs) if holds_out_manoeuvres else None
+    if held_out_logs is not None:
+        for split, held_out_paths in held_out_logs.items():
             split_entries[split] = [
                 (
                     path.resolve().relative_to(common_folder).as_posix(),
@@ -681,8 +680,8 @@ def _split_logs(
     for split, logs in split_logs(list(usable_logs.values())).items():
         for log in logs:
             segment_limits = log.meta.get("stretch")
-            # the name of a stretch starts with the name of its log; a shorter log name may match,
-            # too
+            # the name of a segment starts with the name of its log; of several such names the
+            # longest is that of the log
             matching_names = [
                 n for n in paths if n == log.name or (segment_limits and log.name.startswith(n))
             ]
@@ -712,7 +711,7 @@ def _split_logs(
             if duration:
                 split_entries[split].append((entry, log, duration))
             else:
-                text = f"{log.name} is left out: its gaps leave no stretch to learn from"
+                text = f"{log.name} is left out: no segment without a gap is long enough"
                 draft_notes.add_note(("data", "split"), text)
         if logs and not split_entries[split]:
             raise DataError(
@@ -721,20 +720,20 @@ def _split_logs(
                 " that may be interpolated, or give longer logs"
             )
     draft_notes.add_guess(
-        ("data", "split"), f"{reason}; logs of one day may be alike, so check the choice"
+        ("data", "split"), f"{reason}; logs of one day may be similar, so check the split"
     )
     return root, split_entries
 
 
 def _move_short_logs_to_training(
-    split_entries: dict[str, list[_SplitEntry]], memory_time: float, draft_notes: DraftNotes
+    split_entries: dict[str, list[_SplitEntry]], correlation_time: float, draft_notes: DraftNotes
 ) -> None:
     """Move logs that are too short for evaluation to the training split, except the last log."""
     from residnet.identification.recipe import choose_window_length, make_protocols
 
     for name in SPLITS[1:]:
         protocol_settings = make_protocols(
-            choose_window_length([time for *_, time in split_entries[name]], memory_time)
+            choose_window_length([time for *_, time in split_entries[name]], correlation_time)
         ).values()
         shortest = 1.2 * min(float(entry["length"].split()[0]) for entry in protocol_settings)
         for split_entry in list(split_entries[name]):

@@ -129,7 +129,7 @@ def find_paths(
     return TurnPaths(*(np.stack(part) for part in zip(*path_parts, strict=True)))
 
 
-def clear_of_circles(
+def find_clear_paths(
     positions: np.ndarray,
     headings: Array,
     target_positions: np.ndarray,
@@ -274,13 +274,18 @@ class _Poses:
         self.arc_entry = np.arange(n_poses)
         self.departure_cost = self.cost
 
-    def with_arc(self, turn_sign: int, turn_table_index: int, arc_radius: float) -> _Poses:
-        """Declare the last poses to lie on an arc about the buoy."""
+    def set_arc(self, turn_sign: int, turn_table_index: int, arc_radius: float) -> None:
+        """Record that the last `_ANGLES` poses are on an arc about the buoy.
+
+        Args:
+            turn_sign: +1 for an arc to starboard, -1 to port.
+            turn_table_index: index of the turn table for the turn along the arc.
+            arc_radius: radius in m.
+        """
         self.arc = slice(len(self.positions) - _ANGLES, len(self.positions))
         self.turn_sign = turn_sign
         self.turn_table_index = turn_table_index
         self.arc_radius = arc_radius
-        return self
 
     def update_departure_cost(self) -> None:
         """Compute the cost at departure from each pose, including motion along the arc."""
@@ -400,7 +405,8 @@ class RouteSearch:
         positions = np.concatenate([radius * np.exp(1j * angle) for radius in (*radii, arc_radius)])
         headings = np.tile(angle + turn_sign * 0.5 * math.pi, len(radii) + 1)
         poses = _Poses(circle.centre + positions, headings, number)
-        return poses.with_arc(turn_sign, circle.turn_table_index, arc_radius)
+        poses.set_arc(turn_sign, circle.turn_table_index, arc_radius)
+        return poses
 
     def _circles_between(self, number: int) -> list[int]:
         """Return the circles between a buoy and its predecessor, the nearest first."""
@@ -455,46 +461,51 @@ class RouteSearch:
         target.sources = list(sources)
         for source_index, source in enumerate(sources):
             departure_points, departure_lengths = self._path_ends(source, is_departure=True)
-            usable = np.flatnonzero(np.isfinite(source.departure_cost))
-            reachable = np.flatnonzero(is_clear)
-            if len(usable) == 0 or len(reachable) == 0:
+            departure_poses = np.flatnonzero(np.isfinite(source.departure_cost))
+            arrival_poses = np.flatnonzero(is_clear)
+            if len(departure_poses) == 0 or len(arrival_poses) == 0:
                 continue
             # straight parts before the first and after the last turn
-            path_starts = departure_points[usable] + self.turn_room.lead_in * np.exp(
-                1j * source.headings[usable]
+            path_starts = departure_points[departure_poses] + self.turn_room.lead_in * np.exp(
+                1j * source.headings[departure_poses]
             )
-            path_ends = arrival_points[reachable] - self.turn_room.lead_out * np.exp(
-                1j * target.headings[reachable]
+            path_ends = arrival_points[arrival_poses] - self.turn_room.lead_out * np.exp(
+                1j * target.headings[arrival_poses]
             )
             candidate_paths = find_paths(
                 path_starts[:, None],
-                source.headings[usable][:, None],
+                source.headings[departure_poses][:, None],
                 path_ends[None],
-                target.headings[reachable][None],
+                target.headings[arrival_poses][None],
                 self.turn_room,
             )
             cost = (
                 candidate_paths.length
-                + (source.departure_cost[usable] + departure_lengths[usable])[None, :, None]
-                + (arrival_lengths[reachable] + self.turn_room.lead_in + self.turn_room.lead_out)[
-                    None, None
+                + (source.departure_cost[departure_poses] + departure_lengths[departure_poses])[
+                    None, :, None
                 ]
+                + (
+                    arrival_lengths[arrival_poses]
+                    + self.turn_room.lead_in
+                    + self.turn_room.lead_out
+                )[None, None]
             )
-            best, path_number = self._cheapest_clear_paths(
+            lowest_cost, path_number = self._cheapest_clear_paths(
                 cost,
                 candidate_paths,
                 path_starts,
-                source.headings[usable],
+                source.headings[departure_poses],
                 path_ends,
-                target.headings[reachable],
+                target.headings[arrival_poses],
                 radii,
             )
-            is_cheaper = best < target.cost[reachable]
-            improved = reachable[is_cheaper]
-            target.cost[improved] = best[is_cheaper]
-            path_type, pose = np.divmod(path_number[is_cheaper], len(usable))
-            target.predecessor_indices[improved] = np.stack(
-                (np.full(len(improved), source_index), usable[pose], path_type), axis=-1
+            is_cheaper = lowest_cost < target.cost[arrival_poses]
+            improved_poses = arrival_poses[is_cheaper]
+            target.cost[improved_poses] = lowest_cost[is_cheaper]
+            path_type, pose = np.divmod(path_number[is_cheaper], len(departure_poses))
+            target.predecessor_indices[improved_poses] = np.stack(
+                (np.full(len(improved_poses), source_index), departure_poses[pose], path_type),
+                axis=-1,
             )
         target.update_departure_cost()
 
@@ -520,25 +531,25 @@ class RouteSearch:
             radii: radii of the circles [C] in m.
         """
         flat_cost = cost.reshape(-1, cost.shape[-1])
-        best = np.full(flat_cost.shape[1], np.inf)
+        lowest_cost = np.full(flat_cost.shape[1], np.inf)
         path_number = np.zeros(flat_cost.shape[1], dtype=np.intp)
         if not len(radii):
             path_number = flat_cost.argmin(axis=0)
             return flat_cost[path_number, np.arange(flat_cost.shape[1])], path_number
         n_sources = len(headings)
         n_candidates = min(_MAX_CANDIDATE_PATHS, len(flat_cost) - 1)
-        order = np.argpartition(flat_cost, n_candidates, axis=0)[: n_candidates + 1]
-        column_grid = np.broadcast_to(np.arange(flat_cost.shape[1]), order.shape)
-        rows = order.ravel()
+        candidate_rows = np.argpartition(flat_cost, n_candidates, axis=0)[: n_candidates + 1]
+        column_grid = np.broadcast_to(np.arange(flat_cost.shape[1]), candidate_rows.shape)
+        rows = candidate_rows.ravel()
         columns = column_grid.ravel()
-        finite = np.isfinite(flat_cost[rows, columns])
-        rows = rows[finite]
-        columns = columns[finite]
+        is_finite = np.isfinite(flat_cost[rows, columns])
+        rows = rows[is_finite]
+        columns = columns[is_finite]
         path_types, source_poses = np.divmod(rows, n_sources)
         selected_paths = TurnPaths(
             *(value.reshape(-1, flat_cost.shape[1])[rows, columns] for value in candidate_paths)
         )
-        is_clear = clear_of_circles(
+        is_clear = find_clear_paths(
             path_starts[source_poses],
             headings[source_poses],
             path_ends[columns],
@@ -553,9 +564,9 @@ class RouteSearch:
         columns = columns[is_clear]
         values = flat_cost[rows, columns]
         cost_order = np.argsort(-values, kind="stable")
-        best[columns[cost_order]] = values[cost_order]
+        lowest_cost[columns[cost_order]] = values[cost_order]
         path_number[columns[cost_order]] = rows[cost_order]
-        return best, path_number
+        return lowest_cost, path_number
 
     def _trace_outline(self, last_poses: _Poses) -> RouteOutline:
         """Trace the outline back from the final pose with the lowest cost."""
@@ -566,22 +577,22 @@ class RouteSearch:
         passed_buoys: list[tuple[int, ...]] = [()]
         is_last_group = True
         while group.sources:
-            buoy = () if group.buoy is None else (group.buoy,)
+            buoys = () if group.buoy is None else (group.buoy,)
             arc_angle = 0.0 if is_last_group else group.arc_angle(pose)
             entry_pose = pose if is_last_group else int(group.arc_entry[pose])
-            on_arc = group.arc is not None and pose >= group.arc.start
-            if on_arc and arc_angle > 0.0:
+            is_on_arc = group.arc is not None and pose >= group.arc.start
+            if is_on_arc and arc_angle > 0.0:
                 legs[0] += self.turn_room.lead_out
                 turn_specs.insert(
-                    0, TurnSpec(group.turn_sign, arc_angle, group.turn_table_index, buoy)
+                    0, TurnSpec(group.turn_sign, arc_angle, group.turn_table_index, buoys)
                 )
                 legs.insert(0, self.turn_room.lead_in)
                 passed_buoys.insert(0, ())
             else:
-                passed_buoys[0] = (*buoy, *passed_buoys[0])
+                passed_buoys[0] = (*buoys, *passed_buoys[0])
                 legs[0] += (
                     self.turn_room.lead_in + (0.0 if is_last_group else self.turn_room.lead_out)
-                    if on_arc
+                    if is_on_arc
                     else 0.0
                 )
             source_number, source_pose, path_type = (

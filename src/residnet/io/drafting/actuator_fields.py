@@ -73,10 +73,12 @@ def find_actuator_fields(
     fields_by_channel: dict[str, list[tuple[str, str]]] = {}
     for topic, series in recordings[0].series.items():
         for field in series.fields:
-            known = match_known_command(recordings[0], topic, field)
+            command_of_format = match_known_command(recordings[0], topic, field)
             # a source of MOOS is the name of a program, which says nothing about an actuator
             name = field if series.message_type == _MOOS_MESSAGE_TYPE else f"{topic} {field}"
-            channel = known[0] if known else match_input_channel(parse_name(name))
+            channel = (
+                command_of_format[0] if command_of_format else match_input_channel(parse_name(name))
+            )
             if channel is None or channel in MOTION_CHANNELS or (topic, field) in used_fields:
                 continue
             values = concatenate_field(recordings, topic, field)
@@ -92,13 +94,13 @@ def find_actuator_fields(
             candidate_fields.sort(
                 key=_rank_publishers(channel, recordings[0], candidate_fields, plan, draft_notes)
             )
-            followed_publisher = _publisher(candidate_fields[0][0])
+            followed_publisher = _publisher_of(candidate_fields[0][0])
         elif has_publishers and followed_publisher:
-            candidate_fields.sort(key=lambda entry: _publisher(entry[0]) != followed_publisher)
-            if _publisher(candidate_fields[0][0]) == followed_publisher:
+            candidate_fields.sort(key=lambda entry: _publisher_of(entry[0]) != followed_publisher)
+            if _publisher_of(candidate_fields[0][0]) == followed_publisher:
                 text = (
                     f"{candidate_fields[0][1]} is written by"
-                    f" {' and '.join(_publisher(topic) for topic, _ in candidate_fields)};"
+                    f" {' and '.join(_publisher_of(topic) for topic, _ in candidate_fields)};"
                     f" {followed_publisher} is taken, as for the rudder"
                 )
                 draft_notes.add_guess((*CHANNELS_KEY, channel), text)
@@ -121,7 +123,7 @@ def match_known_command(
     return KNOWN_COMMANDS.get((message_type, field))
 
 
-def _publisher(topic: str) -> str:
+def _publisher_of(topic: str) -> str:
     """Return the first part of a topic's name: the source of MOOS, the namespace of ROS."""
     return topic.strip("/").split("/", 1)[0]
 

@@ -86,8 +86,10 @@ def estimate_clock_from_rate(
     heading = heading[has_heading]
     rate_times = rate_times[has_rate]
     yaw_rate = yaw_rate[has_rate]
-    coarse = _correlate_rates(heading_times, heading, rate_times, yaw_rate)
-    return coarse and _refine_offset(coarse, heading_times, heading, rate_times, yaw_rate)
+    coarse_estimate = _correlate_rates(heading_times, heading, rate_times, yaw_rate)
+    return coarse_estimate and _refine_offset(
+        coarse_estimate, heading_times, heading, rate_times, yaw_rate
+    )
 
 
 def _correlate_rates(
@@ -137,17 +139,17 @@ def _correlate_rates(
     # log-likelihood ratio of a regression with this correlation, which grows with the overlap
     independent_share = min(step / 2.0, 1.0)
     scores = -0.5 * independent_share * counts * np.log(1.0 - correlation**2) * has_overlap
-    best = int(np.argmax(scores))
+    best_index = int(np.argmax(scores))
     lags = np.arange(size)
     lags = np.where(lags < reference.size, lags, lags - size)
-    is_distant = np.abs(lags - lags[best]) * step > _EXCLUDED_SECONDS
-    margin = float(scores[best] - scores[is_distant].max(initial=0.0))
-    seconds = float(grids[0][0] + lags[best] * step - grids[1][0])
-    return ClockEstimate(seconds, step, 0.0, 0.0, float(correlation[best]), margin)
+    is_distant = np.abs(lags - lags[best_index]) * step > _EXCLUDED_SECONDS
+    margin = float(scores[best_index] - scores[is_distant].max(initial=0.0))
+    seconds = float(grids[0][0] + lags[best_index] * step - grids[1][0])
+    return ClockEstimate(seconds, step, 0.0, 0.0, float(correlation[best_index]), margin)
 
 
 def _refine_offset(
-    coarse: ClockEstimate,
+    coarse_estimate: ClockEstimate,
     heading_times: np.ndarray,
     heading: np.ndarray,
     rate_times: np.ndarray,
@@ -156,7 +158,7 @@ def _refine_offset(
     """Refine an offset by regressing the heading on the shifted integral of the yaw rate.
 
     Args:
-        coarse: result of the cross-correlation.
+        coarse_estimate: result of the cross-correlation.
         heading_times: times of the heading [T] in s.
         heading: heading [T] in rad.
         rate_times: times of the yaw rate [K] in s on the clock of the gyro.
@@ -167,34 +169,34 @@ def _refine_offset(
     """
     half_steps = 0.5 * np.diff(rate_times)
     integral = np.append(0.0, np.cumsum(half_steps * (yaw_rate[1:] + yaw_rate[:-1])))
-    start = max(heading_times[0], rate_times[0] + coarse.seconds)
-    stop = min(heading_times[-1], rate_times[-1] + coarse.seconds)
+    start = max(heading_times[0], rate_times[0] + coarse_estimate.seconds)
+    stop = min(heading_times[-1], rate_times[-1] + coarse_estimate.seconds)
     middle = 0.5 * float(start + stop)
     in_overlap = (heading_times > start + 1.0) & (heading_times < stop - 1.0)
     # a heading within a gap of the yaw rate would be compared with an interpolated integral
     intervals = np.diff(rate_times)
-    next_sample = np.searchsorted(rate_times, heading_times - coarse.seconds).clip(
+    next_sample = np.searchsorted(rate_times, heading_times - coarse_estimate.seconds).clip(
         1, rate_times.size - 1
     )
     max_interval = 3.5 * float(np.median(intervals)) + 1e-9
     in_overlap &= intervals[next_sample - 1] < max_interval
     t = heading_times[in_overlap]
     nuisance = _make_nuisance_columns(
-        t, (float(start), float(stop)), rate_times + coarse.seconds, max_interval
+        t, (float(start), float(stop)), rate_times + coarse_estimate.seconds, max_interval
     )
     response = heading[in_overlap]
     if t.size < 30:
-        return coarse
-    seconds = coarse.seconds
+        return coarse_estimate
+    seconds = coarse_estimate.seconds
     has_drift = bool(stop - start > _MIN_DRIFT_SECONDS)
     drift = 0.0
     weights = np.ones(t.size)
     columns = np.zeros((t.size, 0))
     residual = response
     for _ in range(_MAX_ITERATIONS):
-        shifted = t - seconds - drift * (t - middle)
-        rate = np.interp(shifted, rate_times, yaw_rate)
-        columns = np.column_stack((np.interp(shifted, rate_times, integral), nuisance))
+        gyro_times = t - seconds - drift * (t - middle)
+        rate = np.interp(gyro_times, rate_times, yaw_rate)
+        columns = np.column_stack((np.interp(gyro_times, rate_times, integral), nuisance))
         slope = -rate * np.linalg.lstsq(columns, response, rcond=None)[0][0]
         columns = np.column_stack((slope, slope * (t - middle) * has_drift, columns))
         root_weights = np.sqrt(weights)[:, None]
@@ -211,10 +213,10 @@ def _refine_offset(
         drift += float(np.clip(solution[1], -1e-4, 1e-4)) if has_drift else 0.0
         if abs(solution[0]) < 1e-4:
             break
-    if abs(seconds - coarse.seconds) > 5.0 * max(coarse.standard_error, 0.2):
-        return coarse
+    if abs(seconds - coarse_estimate.seconds) > 5.0 * max(coarse_estimate.standard_error, 0.2):
+        return coarse_estimate
     standard_error = _compute_standard_error(columns, residual, weights)
-    return coarse._replace(
+    return coarse_estimate._replace(
         seconds=seconds, standard_error=standard_error, drift=drift, middle=middle
     )
 

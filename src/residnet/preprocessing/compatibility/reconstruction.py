@@ -62,7 +62,7 @@ _WEAKENED_SMOOTHNESS = 100.0
 motion the standard error of other errors grows.
 """
 _MIN_FREE_SHARE = 0.05
-"""Smallest share of the noise in the residuals of a sensor, in the rescaling to the noise."""
+"""Lower bound of the ratio of residual to noise variance of a sensor, in a denominator."""
 _PROBED_SMOOTHNESS = 10.0
 """Factor on the jerk intensities for the test whether smoothness changes the errors."""
 _N_REESTIMATIONS = 3
@@ -82,7 +82,10 @@ _HEADING_WINDOW = 1.0
 _VELOCITY_WINDOW = 2.0
 """Window in s of the polynomials for the initial velocities."""
 _POSE_TOLERANCES = (1e-7, 2e-6)
-"""Standard deviations in rad and m of the integration over a step, so that it is invertible."""
+"""Standard deviations in rad and m of the equations that integrate the pose over a step.
+
+They are not zero, so that the covariance of these equations is invertible.
+"""
 
 
 class Prior(NamedTuple):
@@ -244,7 +247,7 @@ class _Residuals:
 
     @property
     def cost(self) -> float:
-        """Minus twice the log-density without constants; the share of one column."""
+        """Contribution of one column to minus twice the log-density, without constants."""
         if self.squares is None:
             return float(self.values @ self.values)
         exponent = (_STUDENT_DOF + self.dimension) / self.dimension
@@ -296,9 +299,9 @@ class _Problem:
                 f"no sensor has {_MIN_SAMPLES} values for a data compatibility analysis; record a"
                 " longer log"
             )
-        reference = [sensor for sensor in self.sensors if not sensor.clock] or self.sensors
-        start = min(float(sensor.t[0]) for sensor in reference)
-        stop = max(float(sensor.t[-1]) for sensor in reference)
+        reference_sensors = [sensor for sensor in self.sensors if not sensor.clock] or self.sensors
+        start = min(float(sensor.t[0]) for sensor in reference_sensors)
+        stop = max(float(sensor.t[-1]) for sensor in reference_sensors)
         n_nodes = int(np.ceil((stop - start) / step - 1e-6)) + 1
         if n_nodes > _MAX_NODES:
             raise DataError(
@@ -320,10 +323,10 @@ class _Problem:
         states = self._guess_states()
         errors = self.prior_means.copy()
         residuals = self._linearize(states, errors)
-        n_calm = 0
+        n_stationary = 0
         for iteration in range(_MAX_ITERATIONS):
             solver = self._factorize(residuals, errors)
-            if iteration in _CURVATURE_ITERATIONS or n_calm == 1:
+            if iteration in _CURVATURE_ITERATIONS or n_stationary == 1:
                 self.curvature_gradient = self._differentiate_curvature(
                     states, errors, residuals, solver
                 )
@@ -335,19 +338,19 @@ class _Problem:
             state_step = -(solver.state_solution + solver.border_solution @ error_step)
             state_step = state_step.reshape(self.n_nodes, N_STATES)
             cost = self._compute_cost(residuals, errors)
-            share = 1.0
+            step_length = 1.0
             # backtracking line search
             for _ in range(6):
                 candidate = self._linearize(
-                    states + share * state_step, errors + share * error_step
+                    states + step_length * state_step, errors + step_length * error_step
                 )
-                new_cost = self._compute_cost(candidate, errors + share * error_step)
+                new_cost = self._compute_cost(candidate, errors + step_length * error_step)
                 is_accepted = new_cost < cost + 1e-6 * abs(cost) + 1e-3
                 if is_accepted:
                     break
-                share *= 0.4
-            states = states + share * state_step
-            errors = errors + share * error_step
+                step_length *= 0.4
+            states = states + step_length * state_step
+            errors = errors + step_length * error_step
             residuals = candidate
             noise_change = 0.0
             if iteration:
@@ -357,9 +360,9 @@ class _Problem:
                     residuals = self._whiten_again(residuals, inverse_noise)
                 else:
                     residuals = self._linearize(states, errors)
-            is_calm = abs(cost - new_cost) < 0.3 + 1e-5 * abs(cost) and noise_change < 0.03
-            n_calm = n_calm + 1 if is_calm and share == 1.0 else 0
-            if n_calm >= 2:
+            is_stationary = abs(cost - new_cost) < 0.3 + 1e-5 * abs(cost) and noise_change < 0.03
+            n_stationary = n_stationary + 1 if is_stationary and step_length == 1.0 else 0
+            if n_stationary >= 2:
                 break
         return self._summarize(states, errors, residuals)
 
@@ -458,39 +461,43 @@ class _Problem:
         """Return the residuals of white jerk and of the kinematics over each step."""
         h = self.step
         nodes = np.arange(self.n_nodes - 1)
-        ones = np.ones(nodes.size)
+        unit_column = np.ones(nodes.size)
         groups = []
         for axis, (state, rate) in enumerate(((U, U_DOT), (V, V_DOT), (R, R_DOT))):
             # covariance of velocity and acceleration under white jerk, decorrelated
             velocity_error = states[1:, state] - states[:-1, state] - h * states[:-1, rate]
             rate_error = states[1:, rate] - states[:-1, rate]
-            by_velocity = 1.0 / np.sqrt(self.jerk_intensity[axis] * h**3 / 3.0)
-            by_rate = 1.0 / np.sqrt(self.jerk_intensity[axis] * h / 4.0)
+            velocity_weight = 1.0 / np.sqrt(self.jerk_intensity[axis] * h**3 / 3.0)
+            rate_weight = 1.0 / np.sqrt(self.jerk_intensity[axis] * h / 4.0)
             slope = 1.5 / h
             name = f"jerk {axis}"
-            after = N_STATES + state
-            after_rate = N_STATES + rate
-            derivatives = {state: -by_velocity, rate: -h * by_velocity, after: by_velocity}
-            groups.append(
-                _Residuals(
-                    name,
-                    nodes,
-                    velocity_error * by_velocity,
-                    {key: factor * ones for key, factor in derivatives.items()},
-                )
-            )
+            next_state = N_STATES + state
+            next_rate = N_STATES + rate
             derivatives = {
-                state: slope * by_rate,
-                rate: (slope * h - 1.0) * by_rate,
-                after: -slope * by_rate,
-                after_rate: by_rate,
+                state: -velocity_weight,
+                rate: -h * velocity_weight,
+                next_state: velocity_weight,
             }
             groups.append(
                 _Residuals(
                     name,
                     nodes,
-                    (rate_error - slope * velocity_error) * by_rate,
-                    {key: factor * ones for key, factor in derivatives.items()},
+                    velocity_error * velocity_weight,
+                    {key: factor * unit_column for key, factor in derivatives.items()},
+                )
+            )
+            derivatives = {
+                state: slope * rate_weight,
+                rate: (slope * h - 1.0) * rate_weight,
+                next_state: -slope * rate_weight,
+                next_rate: rate_weight,
+            }
+            groups.append(
+                _Residuals(
+                    name,
+                    nodes,
+                    (rate_error - slope * velocity_error) * rate_weight,
+                    {key: factor * unit_column for key, factor in derivatives.items()},
                 )
             )
         heading_weight, position_weight = self._pose_weights
@@ -508,21 +515,25 @@ class _Problem:
                 nodes,
                 heading_error * heading_weight,
                 {
-                    side * N_STATES + key: factor * heading_weight * ones
+                    side * N_STATES + key: factor * heading_weight * unit_column
                     for side, part in enumerate(heading_derivatives)
                     for key, factor in part.items()
                 },
             )
         )
-        sides = [
+        states_by_end = [
             {key: states[rows, key] for key in range(N_STATES)}
             for rows in (slice(-1), slice(1, None))
         ]
         current = [parameters.get(name, 0.0) for name in CURRENT_NAMES]
-        position_errors, derivatives_by_axis = _integrate_position(sides[0], sides[1], h, *current)
+        position_errors, derivatives_by_axis = _integrate_position(
+            states_by_end[0], states_by_end[1], h, *current
+        )
         for axis, name in enumerate(CURRENT_NAMES):
             by_error = (
-                {self.names.index(name): -h * position_weight * ones} if name in self.names else {}
+                {self.names.index(name): -h * position_weight * unit_column}
+                if name in self.names
+                else {}
             )
             groups.append(
                 _Residuals(
@@ -530,7 +541,7 @@ class _Problem:
                     nodes,
                     position_errors[axis] * position_weight,
                     {
-                        key: factor * position_weight * ones
+                        key: factor * position_weight * unit_column
                         for key, factor in derivatives_by_axis[axis].items()
                     },
                     by_error,
@@ -596,22 +607,30 @@ class _Problem:
         values = sensor.values[is_inside]
         weights = None if fraction is None else compute_hermite_weights(self.step, fraction)
         node_states = sensor.select_states(is_on_nodes=fraction is None)
-        before = {key: states[nodes, key] for key in node_states}
+        node_values = {key: states[nodes, key] for key in node_states}
         next_nodes = np.minimum(nodes + 1, self.n_nodes - 1)
-        after = {key: states[next_nodes, key] for key in node_states}
-        sampled = interpolate_states(sensor.measured_states, before, after, weights, parameters)
+        next_node_values = {key: states[next_nodes, key] for key in node_states}
+        sampled = interpolate_states(
+            sensor.measured_states, node_values, next_node_values, weights, parameters
+        )
         predicted = sensor.measure(parameters, sampled)
         by_state: list[dict[int, np.ndarray]] = [{} for _ in predicted]
         # chain rule: by the states at the samples, which depend on those of the nodes
         for state in sensor.measured_states:
-            moved = {**sampled, state: sampled[state] + 1j * COMPLEX_STEP}
-            interpolation = differentiate_interpolation(state, before, after, weights)
-            for target, column in zip(by_state, sensor.measure(parameters, moved), strict=True):
+            perturbed_states = {**sampled, state: sampled[state] + 1j * COMPLEX_STEP}
+            interpolation = differentiate_interpolation(
+                state, node_values, next_node_values, weights
+            )
+            for target, column in zip(
+                by_state, sensor.measure(parameters, perturbed_states), strict=True
+            ):
                 slope = np.imag(column) / (sensor.noise_std * COMPLEX_STEP)
                 if slope.any():
                     for key, factor in interpolation.items():
                         target[key] = target.get(key, 0.0) + slope * factor
-        by_error = self._differentiate_by_errors(sensor, parameters, before, after, fraction)
+        by_error = self._differentiate_by_errors(
+            sensor, parameters, node_values, next_node_values, fraction
+        )
         differences = [
             sensor.subtract(column, values[:, k]) / sensor.noise_std
             for k, column in enumerate(predicted)
@@ -641,18 +660,20 @@ class _Problem:
     ) -> list[dict[int, np.ndarray]]:
         """Return the derivatives of whitened predictions by errors, for each column of a sensor."""
         weights = None if fraction is None else compute_hermite_weights(self.step, fraction)
-        moved_predictions: dict[str, list[np.ndarray]] = {}
+        perturbed_predictions: dict[str, list[np.ndarray]] = {}
         for name in {*sensor.error_names, *CURRENT_NAMES} & {*self.names}:
-            moved_parameters = {**parameters, name: parameters[name] + 1j * COMPLEX_STEP}
-            moved_predictions[name] = sensor.predict(moved_parameters, before, after, weights)
+            perturbed_parameters = {**parameters, name: parameters[name] + 1j * COMPLEX_STEP}
+            perturbed_predictions[name] = sensor.predict(
+                perturbed_parameters, before, after, weights
+            )
         if sensor.clock in self.names and fraction is not None:
-            moved_fraction = fraction + 1j * COMPLEX_STEP / self.step
-            moved_weights = compute_hermite_weights(self.step, moved_fraction)
-            moved_predictions[sensor.clock] = sensor.predict(
-                parameters, before, after, moved_weights
+            perturbed_fraction = fraction + 1j * COMPLEX_STEP / self.step
+            perturbed_weights = compute_hermite_weights(self.step, perturbed_fraction)
+            perturbed_predictions[sensor.clock] = sensor.predict(
+                parameters, before, after, perturbed_weights
             )
         derivatives: list[dict[int, np.ndarray]] = [{} for _ in range(sensor.values.shape[1])]
-        for name, columns in moved_predictions.items():
+        for name, columns in perturbed_predictions.items():
             for target, column in zip(derivatives, columns, strict=True):
                 # a sensor through the water does not depend on the current
                 if np.iscomplexobj(column):
@@ -681,19 +702,19 @@ class _Problem:
         gradient = np.zeros(errors.size)
         log_determinant = float(np.log(solver.banded_factor[0]).sum())
         for index, name in enumerate(self.names):
-            scaled = {
+            index_by_group = {
                 f"sensor {k}": k for k, sensor in enumerate(self.sensors) if sensor.scale == name
             }
-            if not scaled:
+            if not index_by_group:
                 continue
-            moved = errors.copy()
-            moved[index] += _CURVATURE_STEP
-            parameters = dict(zip(self.names, moved.tolist(), strict=True))
+            perturbed_errors = errors.copy()
+            perturbed_errors[index] += _CURVATURE_STEP
+            parameters = dict(zip(self.names, perturbed_errors.tolist(), strict=True))
             # other sensors and the dynamic equations do not depend on the scale
-            groups = [group for group in residuals if group.group not in scaled]
-            for k in scaled.values():
+            groups = [group for group in residuals if group.group not in index_by_group]
+            for k in index_by_group.values():
                 groups += self._linearize_sensor(k, self.sensors[k], states, parameters)
-            factor = self._factorize(groups, moved).banded_factor
+            factor = self._factorize(groups, perturbed_errors).banded_factor
             gradient[index] = (float(np.log(factor[0]).sum()) - log_determinant) / _CURVATURE_STEP
         return gradient
 
@@ -710,7 +731,7 @@ class _Problem:
         error_gradient = (errors - self.prior_means) / self.prior_stds**2
         for group in residuals:
             weights = group.weights
-            weighted = weights * group.values
+            weighted_values = weights * group.values
             # a dynamic equation belongs to each node but the last; a node may have several samples
             n_targets = n_nodes if group.sensor is not None else n_nodes - 1
             keys = np.array(sorted(group.by_state))
@@ -719,7 +740,9 @@ class _Problem:
                 side, state = divmod(first, N_STATES)
                 target = slice(side, n_targets + side)
                 first_derivative = derivatives[position]
-                gradient[target, state] += _sum_by_node(group, first_derivative * weighted, n_nodes)
+                gradient[target, state] += _sum_by_node(
+                    group, first_derivative * weighted_values, n_nodes
+                )
                 weighted_derivative = first_derivative * weights
                 products = _sum_by_node(
                     group, weighted_derivative * derivatives[position:], n_nodes
@@ -733,7 +756,7 @@ class _Problem:
                         group, weighted_derivative * derivative, n_nodes
                     )
             for index, derivative in group.by_error.items():
-                error_gradient[index] += float((derivative * weighted).sum())
+                error_gradient[index] += float((derivative * weighted_values).sum())
                 for other_index, other_derivative in group.by_error.items():
                     corner[index, other_index] += float(
                         (derivative * weights * other_derivative).sum()
@@ -781,17 +804,17 @@ class _Problem:
         schur_inverse = np.linalg.inv(solver.schur) if self.names else solver.schur
         largest_change = 0.0
         for k, name in enumerate(names):
-            used = []
+            used_dof = []
             for probe in range(k * _N_PROBES, (k + 1) * _N_PROBES):
                 trace = float(right_hand_sides[probe] @ solutions[:, probe])
-                reduced = by_errors[probe] - solver.border @ solutions[:, probe]
-                used.append(trace + float(reduced @ schur_inverse @ reduced))
+                reduced_product = by_errors[probe] - solver.border @ solutions[:, probe]
+                used_dof.append(trace + float(reduced_product @ schur_inverse @ reduced_product))
             n_residuals = sum(group.values.size for group in groups_by_name[name])
             squares = sum(
                 float((group.weights * group.values**2).sum()) for group in groups_by_name[name]
             )
-            free = max(n_residuals - float(np.mean(used)), 0.003 * n_residuals, 2.0)
-            ratio = squares / free
+            residual_dof = max(n_residuals - float(np.mean(used_dof)), 0.003 * n_residuals, 2.0)
+            ratio = squares / residual_dof
             kind, _, number = name.partition(" ")
             if kind == "jerk":
                 ratio = float(np.clip(ratio, 0.1, 10.0))
@@ -929,18 +952,18 @@ class _Problem:
         return np.asarray(np.sqrt(np.maximum(np.diag(covariance), variances)))
 
     def _summarize_sensors(self, residuals: Sequence[_Residuals]) -> dict[str, SensorFit]:
-        fits = {}
+        fit_by_sensor = {}
         for group in residuals:
             if group.sensor is None:
                 continue
-            weighted = np.sqrt(group.weights) * (group.values - group.values.mean())
-            energy = max(float(weighted @ weighted), 1e-300)
-            fits[group.sensor.name] = SensorFit(
+            weighted_values = np.sqrt(group.weights) * (group.values - group.values.mean())
+            energy = max(float(weighted_values @ weighted_values), 1e-300)
+            fit_by_sensor[group.sensor.name] = SensorFit(
                 group.sensor.noise_std,
-                float(weighted[1:] @ weighted[:-1]) / energy,
+                float(weighted_values[1:] @ weighted_values[:-1]) / energy,
                 float((np.abs(group.values) > 5.0).mean()),
             )
-        return fits
+        return fit_by_sensor
 
     def _compute_deviance(
         self, residuals: Sequence[_Residuals], errors: np.ndarray, solver: _Solver
@@ -1006,20 +1029,20 @@ def _linearize_score(group: _Residuals) -> _Residuals:
     autocorrelation = max(float(centred[1:] @ centred[:-1]) / energy, 0.0)
     information = mean_slope**2 / max(mean_square, 1e-300)
     information *= (1.0 - autocorrelation) / (1.0 + autocorrelation)
-    root = float(np.sqrt(information))
+    root_information = float(np.sqrt(information))
     return replace(
         group,
-        values=root / mean_slope * score,
-        by_state={key: root * derivative for key, derivative in group.by_state.items()},
-        by_error={key: root * derivative for key, derivative in group.by_error.items()},
+        values=root_information / mean_slope * score,
+        by_state={key: root_information * derivative for key, derivative in group.by_state.items()},
+        by_error={key: root_information * derivative for key, derivative in group.by_error.items()},
         squares=None,
     )
 
 
 def _compute_student_constant(dimension: int) -> float:
     """Return minus twice the logarithm of the Student density's constant, per dimension."""
-    half = 0.5 * _STUDENT_DOF
-    constant = math.lgamma(half + 0.5 * dimension) - math.lgamma(half)
+    half_dof = 0.5 * _STUDENT_DOF
+    constant = math.lgamma(half_dof + 0.5 * dimension) - math.lgamma(half_dof)
     return -2.0 * constant / dimension + float(np.log(_STUDENT_DOF * np.pi))
 
 
@@ -1039,11 +1062,11 @@ def _guess_noise(sensor: Sensor) -> Sensor:
 def _integrate_position(
     before: NodeStates, after: NodeStates, step: float, north: float, east: float
 ) -> tuple[list[np.ndarray], list[dict[int, np.ndarray | float]]]:
-    """Return the change of the position over a step beyond Simpson's rule, and its derivatives.
+    """Return the position at the next node minus its integral by Simpson's rule, and derivatives.
 
     Returns:
-        The changes [N] north and east; and for each of them: state (0 to 8 of the node, 9 to 17 of
-        the next node) -> derivative [N].
+        The differences [N] north and east; and for each of them: state (0 to 8 of the node, 9 to 17
+        of the next node) -> derivative [N].
     """
     rates = {PSI: R, U: U_DOT, V: V_DOT}
     points = {

@@ -255,7 +255,7 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         ),
         ""
         if run.report_split in UNSEEN_SPLITS and not run.logs_of_fit[0]
-        else "These data are not unseen: read with care.",
+        else "Fit or selection used these data: errors on new data are larger.",
         "Predictor: the model that is rated and exported by default. Selected: the best single"
         " model."
         if run.predictor != run.selected

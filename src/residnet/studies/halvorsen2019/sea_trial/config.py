@@ -37,13 +37,17 @@ CONTROLS = ("cmd_n", "cmd_nozzle")
 FORCES = ("tau_x", "tau_y", "tau_n")
 CHANNELS = (*VELOCITY_NAMES, *CONTROLS, *FORCES)
 ALL = "all"
+"""Name of the set of all samples."""
 STANDARD = "standard"
+"""Name of the standard model, fitted to all samples."""
 SEPARATE = "separate"
+"""Name of the standard models that are fitted to one speed regime each."""
 PLANT = "plant"
+"""Name of the equations of the simulated vessel."""
 SAMPLE_SETS = (*SPEED_REGIMES, ALL)
 """Sets of samples for fits and evaluations."""
 Published = dict[str, tuple[float, float, float, float, float, float]]
-"""Numbers of the document by acceleration."""
+"""Acceleration -> published RMSE, C_p, adjusted R^2, mean absolute residual and its interval."""
 
 
 class ProgrammeConfig(Config):
