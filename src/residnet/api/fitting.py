@@ -346,7 +346,7 @@ class Models(dict[str, Model]):
 
     @cached_property
     def runs(self) -> dict[str, FreeRuns]:
-        """Free runs of all models by split."""
+        """Simulated windows of the logs with their errors, by split, of all models."""
         splits = self.settings.evaluation.splits
         return {split: free_run(self, self.data, split) for split in splits}
 

@@ -684,7 +684,7 @@ class CrossingConfig(Config):
         return self
 
     def filter_config(self) -> ReferenceFilterConfig:
-        """Return the settings of the reference filter."""
+        """Return the config of the filter that makes smooth references from the waypoints."""
         final_waypoint = (*self.points[-1], 0.0)
         frequencies = (self.frequency,) * 3
         return ReferenceFilterConfig(

@@ -255,7 +255,7 @@ class DegreesOfFreedom:
 
     @property
     def layout(self) -> StateLayout:
-        """Layout of the states."""
+        """Smallest layout with these velocities: planar, with roll, or six degrees of freedom."""
         if "w" in self.velocities or "q" in self.velocities:
             return SIX_DOF_LAYOUT
         return ROLL_LAYOUT if "p" in self.velocities else PLANAR_LAYOUT

@@ -75,7 +75,7 @@ class Samples:
         return channel_moments, target_moments
 
     def channel(self, name: str) -> Tensor:
-        """Return one channel [N] by its name."""
+        """Return the column [N] of z with the name of a channel."""
         return self.z[:, self.names.index(name)]
 
 

@@ -133,7 +133,7 @@ class WindowErrors(NamedTuple):
 
     @property
     def n_logs(self) -> int:
-        """Number of logs."""
+        """Number of logs that the windows come from."""
         return len(np.unique(self.log_indices))
 
 

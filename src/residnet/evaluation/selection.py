@@ -63,7 +63,7 @@ class SelectionCandidate:
 
     @property
     def mean_log_error(self) -> float:
-        """The mean log error over the blocks."""
+        """Mean logarithm of the error: the sum of the contributions of all blocks."""
         return float(self.block_scores.sum())
 
     @property

@@ -68,7 +68,7 @@ class LoadedExport(ABC):
 
     @abstractmethod
     def step(self, *step_arguments: NumberArray) -> tuple[Any, ...]:
-        """Return the results of one step."""
+        """Evaluate the exported step; the results are in the order of `Exportable.results`."""
 
     def step_rows(self, *step_arguments: NumberArray) -> tuple[Any, ...]:
         """Return the results of one step of many rows."""

@@ -173,7 +173,7 @@ class LeaveFoldOutModels:
         return model.eval().requires_grad_(False)
 
     def _samples_without_fold(self, fold: int) -> Samples:
-        """Return the samples of all folds but one."""
+        """Return the training samples of a cross-validation model, whose fold is left out."""
         return self.training_samples.select(self.fold_of_log[self.training_samples.group] != fold)
 
 

@@ -109,7 +109,7 @@ class ForceModel(nn.Module):
     def with_correction(
         self, correction: ForceCorrection, earth_force: Tensor | None = None
     ) -> ForceModel:
-        """Return a model with one more correction."""
+        """Return a copy of the model to whose force a learned correction is added."""
         total_earth_force = (
             self.earth_force if earth_force is None else self.earth_force + earth_force
         )

@@ -154,7 +154,7 @@ class SignalsConfig(Config):
 
     @property
     def dof(self) -> DegreesOfFreedom:
-        """Degrees of freedom of the model."""
+        """Degrees of freedom that follow from `velocities`."""
         return DegreesOfFreedom(self.velocities)
 
     def with_thrusters(self) -> SignalsConfig:

@@ -334,7 +334,7 @@ def _ship_input_products(
 
 
 def _combine_products(*choices: Sequence[str]) -> list[str]:
-    """Return all products with one factor from each list."""
+    """Return the names of all products with one factor from each list; an empty factor is one."""
     return [" ".join(factor for factor in factors if factor) for factors in product(*choices)]
 
 

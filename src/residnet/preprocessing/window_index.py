@@ -39,7 +39,7 @@ class WindowIndex:
 
     @classmethod
     def from_logs(cls, logs: Sequence[PreparedLog]) -> WindowIndex:
-        """Build the index from prepared logs."""
+        """Count the samples before and after each sample within its gapless segment."""
         n_remaining, n_elapsed = count_segment_samples([log.segment for log in logs])
         return cls(
             np.concatenate([log.usable for log in logs]),

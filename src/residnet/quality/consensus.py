@@ -374,7 +374,7 @@ class Fleet:
         )
 
     def assemble(self, log: LogStatistics) -> BlockData:
-        """Return the unscaled data of a log."""
+        """Return integrals of regressors and changes of velocities over blocks of a log, in SI units."""
         length = len(log)
         if length >= MIN_SAMPLES:
             length = max(round(self.block_seconds / log.sampling_interval), 4)
@@ -415,7 +415,7 @@ class Fleet:
         )
 
     def assemble_scaled(self, log: LogStatistics) -> BlockData:
-        """Return the data of any log in the scales of the fleet."""
+        """Return block data divided by the standard deviations over all logs of the fleet."""
         return self._scale_data(self.assemble(log))
 
     def with_data(self, data: Mapping[int, BlockData]) -> Fleet:

@@ -85,7 +85,7 @@ class Algebra:
         self._product_cache: dict[tuple[Product, Product], Product] = {}
 
     def make_channel(self, name: str) -> Sum:
-        """Return the sum that is a single channel."""
+        """Return a channel as a sum of one product with one factor."""
         return {(self.channels.index(name),): 1.0}
 
     def add(self, a: Sum, b: Sum, sign: float = 1.0) -> Sum:

@@ -241,7 +241,7 @@ class Figure:
         return [name for name in self.styles if name in present]
 
     def has_integer_axis(self, panel: int) -> bool:
-        """Return whether the horizontal values of a panel are integers."""
+        """Return whether a panel needs integer ticks, because all its x values are integers."""
         x_values = [x for case in self.cases for x, _ in case.curves[panel].values()]
         finite_values = [x[np.isfinite(x)] for x in x_values]
         # values that are read from a file were rounded to 16 bits, see `figure_files`

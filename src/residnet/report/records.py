@@ -60,7 +60,7 @@ class SweepFile(FileRecord):
 
     @property
     def completed(self) -> list[tuple[SweepTrial, float]]:
-        """The trials with a value of the objective, and this value."""
+        """Trials that ended with an objective, as pairs of trial and objective."""
         return [(trial, trial.value) for trial in self.trials if trial.value is not None]
 
 

@@ -247,7 +247,7 @@ class RunFiles:
 
     @property
     def rows(self) -> Sequence[MetricsRow]:
-        """The rows of metrics.json."""
+        """Errors by model, split, protocol and manoeuvre."""
         return self.metrics.rows
 
     def read_task_metrics(self, record_type: type[RecordT]) -> RecordT:
@@ -477,7 +477,7 @@ class RunFiles:
 
     @property
     def evaluation(self) -> EvaluationSettings:
-        """The settings of the evaluation by free runs."""
+        """Protocols, scales and selection of the fit."""
         return self.fit_settings.evaluation
 
     @cached_property

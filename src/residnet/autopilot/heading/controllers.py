@@ -163,7 +163,7 @@ class TunableConfig(ControllerConfig, ABC):
         """Build a controller with separate parameters [B] for every row."""
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Self:
-        """Return a copy with parameter values."""
+        """Return a copy in which the given parameters replace earlier or missing ones."""
         return type(self).model_validate(self.model_dump() | dict(parameters))
 
     def complete_parameters(self) -> dict[str, float]:
@@ -562,7 +562,7 @@ class _PolicySpec(Stored):
 
     @property
     def nomoto(self) -> NomotoModel:
-        """Nomoto model of that vessel."""
+        """Nomoto model of the vessel used in training, on a straight course."""
         return NomotoModel(self.gain, self.time, self.speed, self.righting)
 
 
@@ -582,7 +582,7 @@ class ObserverPolicySpec(_PolicySpec):
     units: int = Field(ge=0, le=10_000)
 
     def build(self) -> ObserverPolicy:
-        """Build the policy with an untrained network."""
+        """Build the policy with random initial weights."""
         return ObserverPolicy(
             self.state,
             nomoto=self.nomoto,

@@ -45,7 +45,7 @@ def name_bare_numbers(
 
 
 def concatenate_field(recordings: Sequence[Recording], topic: str, field: str) -> np.ndarray:
-    """Return the values of a field in all recordings with this field."""
+    """Return the values of a field of a topic in one array, recording after recording."""
     series_with_topic = [r.series[topic] for r in recordings if topic in r.series]
     return np.concatenate(
         [series[field] for series in series_with_topic if series.has_field(field)]

@@ -104,7 +104,7 @@ class ChannelMapper:
         self._heading_offset: HeadingOffset | None = None
 
     def draft_entries(self) -> dict[str, dict[str, Any]]:
-        """Return channel -> entry."""
+        """Choose units, signs and frames, and return the entry of each channel in a channel map."""
         if {"x", "y", "psi"} <= set(self._names):
             self._choose_velocity_meaning()
             self.choose_frame()

@@ -233,7 +233,7 @@ def _match_shaft_speeds(parsed_names: Mapping[str, ParsedName]) -> dict[str, str
 
 
 def _match_name(column: str, parsed: ParsedName) -> str | None:
-    """Return the channel of a column by its name, or None."""
+    """Return the state or input that a column name stands for; None for an unknown name."""
     channel = match_state_channel(parsed) or match_input_channel(parsed)
     if channel is None and parsed.has_all("pitch") and parse_header_unit(column, "-") == "%":
         # a pitch in per cent is that of a propeller's blades

@@ -67,7 +67,7 @@ class ScaleFit(NamedTuple):
 
     @property
     def is_significant(self) -> bool:
-        """Whether the correlation is significant."""
+        """Whether the correlation is large enough to determine factor and sign."""
         return (
             self.correlation >= MIN_CORRELATION and np.isfinite(self.factor) and self.factor != 0.0
         )

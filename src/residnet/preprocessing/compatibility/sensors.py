@@ -209,7 +209,7 @@ def compute_angle(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def compute_ground_velocity(
     node: NodeStates, current_north: complex, current_east: complex
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the velocity over ground, north and east."""
+    """Rotate u and v to north and east, and add the current."""
     cosine = np.cos(node[PSI])
     sine = np.sin(node[PSI])
     north = node[U] * cosine - node[V] * sine + current_north

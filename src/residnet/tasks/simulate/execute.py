@@ -161,7 +161,7 @@ def build_crafts(programme: Programme) -> list[tuple[SimulatedVessel, TrialEnvir
 def simulate_all(
     programme: Programme, craft: SimulatedVessel, sea: TrialEnvironment
 ) -> list[ManoeuvreRun]:
-    """Simulate all manoeuvres in one batch."""
+    """Simulate the manoeuvres of a programme as rows of one batch, which takes the least time."""
     step = programme.step or (
         craft.dynamics.dt if programme.model is not None else DEFAULT_TIME_STEP
     )

@@ -153,7 +153,7 @@ def execute(config: RollTaskConfig, folder: RunFolder) -> TaskOutcome:
 
 
 def make_simulation(config: RollTaskConfig, duration: float) -> RollSimulation:
-    """Return the simulations of the vessel of a config."""
+    """Build simulations in waves of the given duration in s, with the vessel of a config."""
     return RollSimulation(
         load_vessel(config.vessel).build(),
         config.hull.build_box(),

@@ -539,7 +539,7 @@ def _gain_sentences(regression_rows: Sequence[StudyResults]) -> list[str]:
 
 
 def _rows_by_force(results: StudyResults) -> dict[str, dict[str, StudyResults]]:
-    """Return the rows of the results, force -> model -> row."""
+    """Group the rows of study.json: force -> model -> row."""
     rows_by_force: dict[str, dict[str, StudyResults]] = {}
     for row in results["rows"]:
         rows_by_force.setdefault(row["force"], {})[row["model"]] = row
