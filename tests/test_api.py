@@ -261,6 +261,21 @@ def test_save_load_export(
         residnet.save(models["net"], tmp_path / "net")
 
 
+def prepare_by_config(config: dict[str, Any], **evaluation: Any) -> residnet.Dataset:
+    """Prepare the data of a config with the settings of its sections in Python."""
+    preparation = config["prepare"]
+    return residnet.prepare(
+        config["data"],
+        config["signals"]["inputs"],
+        forces=config["signals"]["forces"],
+        step=preparation["grid"]["step"],
+        derivative=preparation["derivative"],
+        hold="start",
+        held_channels=(),
+        **evaluation,
+    )
+
+
 @pytest.mark.long
 def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> None:
     config = copy.deepcopy(TINY)
@@ -268,18 +283,8 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(tiny_run: Path) -> No
     table = build_metrics_table(metrics.rows)
     result = residnet.run(config, report=False)
     pd.testing.assert_frame_equal(result.metrics, table, rtol=1e-12)
-    prepared = config["prepare"]
-    evaluation = config["evaluation"]
-    data = residnet.prepare(
-        config["data"],
-        config["signals"]["inputs"],
-        forces=config["signals"]["forces"],
-        step=prepared["grid"]["step"],
-        derivative=prepared["derivative"],
-        hold="start",
-        held_channels=(),
-        **{key: evaluation[key] for key in ("protocols", "selection", "scales")},
-    )
+    evaluation = {key: config["evaluation"][key] for key in ("protocols", "selection", "scales")}
+    data = prepare_by_config(config, **evaluation)
     models = residnet.fit(
         data,
         config["baseline"],
@@ -308,16 +313,7 @@ def test_currents_are_estimated_as_by_the_key_of_a_config() -> None:
     simulated = validate_config(config["data"], SimulatedTrials, "data")
     names = [log.name for log in simulate_trial_logs(simulated.draw_manoeuvres(), simulated)]
     truth = simulated.disturbance.draw_currents(len(names), simulated.seed)
-    prepared = config["prepare"]
-    data = residnet.prepare(
-        config["data"],
-        config["signals"]["inputs"],
-        forces=config["signals"]["forces"],
-        step=prepared["grid"]["step"],
-        derivative=prepared["derivative"],
-        hold="start",
-        held_channels=(),
-    )
+    data = prepare_by_config(config)
     models = residnet.fit(data, config["baseline"], current={}, bands=None)
     currents = models.currents.set_index("log")
     assert set(currents.index) == {log.log.name for logs in data.splits.values() for log in logs}

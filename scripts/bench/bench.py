@@ -6,10 +6,11 @@ It is imported before anything that counts the cores.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,29 @@ def options(about: str | None, **defaults: Any) -> argparse.Namespace:
         if isinstance(default, list) and getattr(given, name) is None:
             setattr(given, name, default)
     return given
+
+
+def read_records(files: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the records of earlier runs, one JSON object per line; empty names are skipped."""
+    return [
+        json.loads(line) for file in files if file for line in Path(file).read_text().splitlines()
+    ]
+
+
+def report_record(record: Mapping[str, Any], file: str | None) -> None:
+    """Print a record as one line of JSON, and append it to a file unless that is None."""
+    line = json.dumps(record)
+    print(line, flush=True)
+    if file:
+        with Path(file).open("a") as stream:
+            stream.write(f"{line}\n")
+
+
+def summarize_log_ratios(log_ratios: np.ndarray) -> tuple[float, float]:
+    """Return the geometric mean of paired ratios, and the standard error of its logarithm."""
+    n = len(log_ratios)
+    error = float(log_ratios.std(ddof=1)) / n**0.5 if n > 1 else 0.0
+    return float(np.exp(log_ratios.mean())), error
 
 
 def least(

@@ -26,10 +26,8 @@ of `recurrent.py`; each mean has the hull.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -221,8 +219,8 @@ def summarize(records: Sequence[Mapping[str, Any]]) -> str:
         cells = []
         for rule in ("equal", "evidence"):
             ratios = np.log([rules[rule] / rules["point"] for rules in chosen])
-            error = ratios.std(ddof=1) / len(ratios) ** 0.5 if len(ratios) > 1 else 0.0
-            cells.append(f"{np.exp(ratios.mean()):.3f} ± {error:.3f}")
+            ratio, error = bench.summarize_log_ratios(ratios)
+            cells.append(f"{ratio:.3f} ± {error:.3f}")
         mean = np.mean([rules["point"] for rules in chosen])
         changed = sum(rules["evidence"] != rules["point"] for rules in chosen)
         largest = max(rules["evidence"] / rules["point"] for rules in chosen)
@@ -238,17 +236,11 @@ def main() -> None:
     options = bench.options(
         __doc__, cases=list(CASES), seeds=[11], networks=False, save=None, summary=[""],
     )  # fmt: skip
-    records: list[dict[str, Any]] = []
-    files = [Path(file) for file in options.summary if file]
-    for file in files:
-        records += [json.loads(line) for line in file.read_text().splitlines()]
-    for seed in options.seeds if not files else []:
+    records = bench.read_records(options.summary)
+    for seed in options.seeds if not any(options.summary) else []:
         for case in options.cases:
             records.append(compare_rules(case, seed, options.networks))
-            print(json.dumps(records[-1]), flush=True)
-            if options.save:
-                with Path(options.save).open("a") as file:
-                    file.write(json.dumps(records[-1]) + "\n")
+            bench.report_record(records[-1], options.save)
     print(summarize(records))
 
 

@@ -17,9 +17,7 @@ for every value. The draws of a seed are for choices: report with another seed.
 
 from __future__ import annotations
 
-import json
 import time
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -204,9 +202,9 @@ def summarize(records: list[dict[str, Any]]) -> str:
         for name in dict.fromkeys(name for errors in chosen for name in errors):
             pairs = [(e[name], e[reference]) for e in chosen if name in e]
             ratios = np.log([error / base for error, base in pairs])
-            standard_error = ratios.std(ddof=1) / np.sqrt(len(ratios)) if len(ratios) > 1 else 0.0
+            ratio, standard_error = bench.summarize_log_ratios(ratios)
             lines.append(
-                f"  {name:44} {np.exp(ratios.mean()):.3f} ± {standard_error:.3f}, better in"
+                f"  {name:44} {ratio:.3f} ± {standard_error:.3f}, better in"
                 f" {int((ratios < 0).sum())} of {len(ratios)}, worst {np.exp(ratios.max()):.2f}"
             )
     by_draw: dict[Any, dict[float, float]] = {}
@@ -218,9 +216,10 @@ def summarize(records: list[dict[str, Any]]) -> str:
     pasts = sorted({record["past"] for record in records})
     if len(pasts) > 1:
         paired = [np.log(e[pasts[1]] / e[pasts[0]]) for e in by_draw.values() if len(e) > 1]
+        ratio, standard_error = bench.summarize_log_ratios(np.array(paired))
         lines.append(
             f"{reference}: error with a past of {pasts[1]:g} s relative to {pasts[0]:g} s:"
-            f" {np.exp(np.mean(paired)):.3f} ± {np.std(paired, ddof=1) / len(paired) ** 0.5:.3f}"
+            f" {ratio:.3f} ± {standard_error:.3f}"
         )
     return "\n".join(lines)
 
@@ -231,9 +230,7 @@ def main() -> None:
         __doc__, logs="measured", count=4, seed=100, first=0, minutes=5.0, past=[5.0],
         arms=list(ARMS), plain=[""], vessels=[], save=None, summary=[],
     )  # fmt: skip
-    records: list[dict[str, Any]] = []
-    for file in given.summary:
-        records += [json.loads(line) for line in Path(file).read_text().splitlines()]
+    records = bench.read_records(given.summary)
     source, names = SOURCES[given.logs]
     names = given.vessels or names
     for number in range(given.first, given.first + given.count if not given.summary else 0):
@@ -249,10 +246,7 @@ def main() -> None:
             record |= {"name": name, "draw": number, "seed": given.seed, "past": past}
             record["cpu"] = round(time.process_time() - begin, 1)
             records.append(record)
-            print(json.dumps(record), flush=True)
-            if given.save:
-                with Path(given.save).open("a") as file:
-                    file.write(json.dumps(record) + "\n")
+            bench.report_record(record, given.save)
     print(summarize(records))
 
 

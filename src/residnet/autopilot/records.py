@@ -37,6 +37,20 @@ nominal vessel exactly.
 CardSchema = Literal["residnet.policy_card/1", "residnet.course_card/1"]
 """Formats of the model card of a controller."""
 
+
+class ControlMetricsFile(FileRecord):
+    """Common keys of the metrics.json of tasks that compare controllers.
+
+    Attributes:
+        run: name of the run.
+        channels: metric -> its unit.
+    """
+
+    schema_name: Literal["residnet.metrics/1"] = Field(alias="schema")
+    run: str
+    channels: dict[str, str]
+
+
 # metrics.json of the task `autopilot`
 
 
@@ -133,20 +147,15 @@ class SimulatedSettings(Record):
     conditions: EvaluationConditions | None = None
 
 
-class AutopilotMetricsFile(FileRecord):
+class AutopilotMetricsFile(ControlMetricsFile):
     """metrics.json of the task `autopilot`: metrics of all controllers in all tests.
 
     Attributes:
-        run: name of the run.
-        channels: metric -> its unit.
         floor: name of the controller that knows the vessel exactly; None without one.
         flown: settings as simulated.
         rows: metrics of one controller in one test each.
     """
 
-    schema_name: Literal["residnet.metrics/1"] = Field(alias="schema")
-    run: str
-    channels: dict[str, str]
     floor: str | None
     flown: SimulatedSettings
     rows: tuple[HeadingRow, ...] = Field(min_length=1)
@@ -347,12 +356,10 @@ class BuoyFeasibility(Record):
     possible: bool
 
 
-class CourseMetricsFile(FileRecord):
+class CourseMetricsFile(ControlMetricsFile):
     """metrics.json of the task `course`: metrics of all controllers on all courses.
 
     Attributes:
-        run: name of the run.
-        channels: metric -> its unit.
         speed: service speed of the vessel in m/s.
         rudder: rudder limit in rad.
         smallest: the smallest steady turn.
@@ -360,9 +367,6 @@ class CourseMetricsFile(FileRecord):
         rows: metrics of one controller on one course each.
     """
 
-    schema_name: Literal["residnet.metrics/1"] = Field(alias="schema")
-    run: str
-    channels: dict[str, str]
     speed: float
     rudder: float
     smallest: SmallestTurn
@@ -488,12 +492,10 @@ class RollComparison(Record):
     n_larger_heading: int
 
 
-class RollMetricsFile(FileRecord):
+class RollMetricsFile(ControlMetricsFile):
     """metrics.json of the task `roll`: metrics of all controllers in all seas.
 
     Attributes:
-        run: name of the run.
-        channels: unit of each metric.
         speed: speed of the vessel in m/s.
         comparison: comparison of the policy with the best classical combination.
         controllers: the controllers with their constants.
@@ -501,9 +503,6 @@ class RollMetricsFile(FileRecord):
         rows: metrics of one controller in one sea each.
     """
 
-    schema_name: Literal["residnet.metrics/1"] = Field(alias="schema")
-    run: str
-    channels: dict[str, str]
     speed: float
     comparison: RollComparison
     controllers: tuple[RollController, ...] = Field(min_length=1)

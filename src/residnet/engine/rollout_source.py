@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from itertools import accumulate, chain, pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -314,6 +315,55 @@ def _write_function(
     )
 
 
+@dataclass(frozen=True)
+class _ProductArrays:
+    """Arrays of the products of a step in the C file.
+
+    Attributes:
+        products: the products by number.
+        sizes: number of entries of each factor, product and cotangent by name.
+        table_offsets: offset of the matrix of each product in the table, and the table's length.
+        shared_cotangents: for a cotangent that equals another one, the name of the other one.
+    """
+
+    products: Mapping[int, RowProduct]
+    sizes: Mapping[str, int]
+    table_offsets: Sequence[int]
+    shared_cotangents: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def matrix_products(self) -> list[int]:
+        """Numbers of the products that are no activations."""
+        return [k for k, product in self.products.items() if not product.activation]
+
+    def cotangent_of(self, k: int) -> str:
+        """Return the name of the array with the cotangent of a product."""
+        name = f"product_{k}_cotangent"
+        return self.shared_cotangents.get(name, name)
+
+    def declare_local(self, name: str) -> str:
+        """Return the C declaration of a local array for a factor, product or cotangent."""
+        return f"REAL {name}[{self.sizes[name]} * LANES] __attribute__((aligned(BYTES)));"
+
+
+class _GradientSource(NamedTuple):
+    """C code of the gradient of a step, and the values that it needs.
+
+    Attributes:
+        code: the function `step_vjp`.
+        arrays: arrays of the products, with the shared cotangents.
+        forward_storage: layout of the values that a step stores for its gradient.
+        backward_storage: layout of the cotangents of products.
+        stored_pointers: declarations of pointers to the stored values by name.
+    """
+
+    code: str
+    arrays: _ProductArrays
+    forward_storage: dict[str, slice]
+    backward_storage: dict[str, slice]
+    stored_pointers: dict[str, str]
+
+
 def write_rollout_source(
     parts: StepParts,
     sizes: Mapping[str, int],
@@ -335,108 +385,104 @@ def write_rollout_source(
         The C code, the layout of the values that a step stores for its gradient, and the layout of
         the cotangents of products.
     """
-    # arrays of the file: sizes of products, offsets of their matrices, strides of arguments
     step = to_scalar_function(parts.function)
     _require_compilable(step)
     products = dict(enumerate(parts.products))
-    matrices = [k for k, product in products.items() if not product.activation]
     table_offsets = [0, *accumulate(product.matrix_size for product in parts.products)]
-    sizes_by_name = _count_entries(products)
-    strides = dict.fromkeys(_STRIDED_ARRAYS, "stride")
-
-    def cotangent_of(k: int) -> str:
-        return shared_cotangents.get(name := f"product_{k}_cotangent", name)
-
-    def local(name: str) -> str:
-        return f"REAL {name}[{sizes_by_name[name]} * LANES] __attribute__((aligned(BYTES)));"
-
-    def calls(function_name: str, source_format: str, target_format: str) -> Calls:
-        return _write_product_calls(
-            products,
-            sizes_by_name,
-            table_offsets,
-            shared_cotangents,
-            function_name,
-            source_format,
-            target_format,
-        )
-
-    forward_storage = dict[str, slice]()
-    backward_storage = dict[str, slice]()
-    stored_pointers = dict[str, str]()
-    shared_cotangents = dict[str, str]()
-    backward = list[str]()
-    # the gradient: which values a step stores for it, and the function that uses them
-    if trained_indices is not None:
-        single_products = [k for k in matrices if products[k].n_repeats == 1]
-        vjp_function, shared_cotangents = _vector_jacobian_function(
-            step, sizes, len(products), trained_indices, single_products
-        )
-        is_needed = _find_needed_products(vjp_function, products)
-        forward_storage, stored_pointers = _build_layout(
-            sizes_by_name,
-            "history",
-            [name for name, needed in is_needed.items() if needed]
-            + [f"factor_{k}" for k in sorted(matrices, key=cotangent_of)],
-        )
-        backward_storage, declarations = _build_layout(
-            sizes_by_name, "product_cotangents", [*dict.fromkeys(map(cotangent_of, matrices))]
-        )
-        backward_storage |= {
-            f"product_{k}_cotangent": backward_storage[cotangent_of(k)] for k in matrices
-        }
-        declarations |= {name: stored_pointers.get(name, "") for name in is_needed}
-        declarations |= {
-            name: local(name)
-            for name in sizes_by_name
-            if name.endswith("_cotangent") and name not in declarations
-        }
-        backward = [
-            _write_function(
-                "step_vjp",
-                vjp_function,
-                strides | dict.fromkeys(("x_cotangent", "a_cotangent", "x_before"), "stride"),
-                calls("back_times", "product_{}_cotangent", "factor_{}_cotangent"),
-                declarations,
-                ("x_before", "gradient"),
-            )
-        ]
+    arrays = _ProductArrays(products, _count_entries(products), table_offsets)
+    if trained_indices is None:
+        gradient = _GradientSource("", arrays, {}, {}, {})
+    else:
+        gradient = _write_gradient(step, sizes, arrays, trained_indices)
     # the step: it writes stored values to the history, and all others to local arrays
-    forward = stored_pointers | {
-        name: local(name)
-        for name in sizes_by_name
-        if name not in stored_pointers and not name.endswith("_cotangent")
+    declarations = gradient.stored_pointers | {
+        name: arrays.declare_local(name)
+        for name in arrays.sizes
+        if name not in gradient.stored_pointers and not name.endswith("_cotangent")
     }
     step_code = _write_function(
         "step",
         _forward_function(step, len(products)),
-        strides,
-        calls("times", "factor_{}", "product_{}"),
-        forward,
+        dict.fromkeys(_STRIDED_ARRAYS, "stride"),
+        _write_product_calls(gradient.arrays, "times", "factor_{}", "product_{}"),
+        declarations,
     )
     # sizes as macros, which the loops over steps and rows use
     n_theta = len(trained_indices or ())
     counts = dict(sizes) | {
-        "history": count_stored_values(forward_storage),
-        "product_cotangents": count_stored_values(backward_storage),
+        "history": count_stored_values(gradient.forward_storage),
+        "product_cotangents": count_stored_values(gradient.backward_storage),
         "gradient": n_theta + has_row_gradients * table_offsets[-1],
     }
     definitions = [f"#define N_{name.upper()} {value}L\n" for name, value in counts.items()]
+    backward_loop = ""
     if trained_indices is not None:
-        outer = (
+        outer_products = (
             _write_outer_products(
                 products,
-                forward_storage,
-                backward_storage,
+                gradient.forward_storage,
+                gradient.backward_storage,
                 [n_theta + offset for offset in table_offsets],
             )
             if has_row_gradients
             else ""
         )
-        backward.append(BACKWARD_LOOP.replace("OUTER\n", outer))
-    # the loop over the steps follows the functions that it calls
-    code = (_write_prelude(dtype), *definitions, step_code, *backward[:1], FORWARD_LOOP)
-    return "".join((*code, *backward[1:])), forward_storage, backward_storage
+        backward_loop = BACKWARD_LOOP.replace("OUTER\n", outer_products)
+    # the loops over the steps follow the functions that they call
+    prelude = _write_prelude(dtype)
+    code = (prelude, *definitions, step_code, gradient.code, FORWARD_LOOP, backward_loop)
+    return "".join(code), gradient.forward_storage, gradient.backward_storage
+
+
+def _write_gradient(
+    step: ca.Function,
+    sizes: Mapping[str, int],
+    arrays: _ProductArrays,
+    trained_indices: Sequence[int],
+) -> _GradientSource:
+    """Write the vector-Jacobian product of a step, and choose the values that a step stores for it.
+
+    Args:
+        step: the step as a function of scalars.
+        sizes: number of entries of each argument, and of the applied inputs `a`.
+        arrays: arrays of the products.
+        trained_indices: indices in `theta` that have a gradient.
+    """
+    products = arrays.products
+    matrices = arrays.matrix_products
+    single_products = [k for k in matrices if products[k].n_repeats == 1]
+    vjp_function, shared_cotangents = _vector_jacobian_function(
+        step, sizes, len(products), trained_indices, single_products
+    )
+    arrays = replace(arrays, shared_cotangents=shared_cotangents)
+    is_needed = _find_needed_products(vjp_function, products)
+    forward_storage, stored_pointers = _build_layout(
+        arrays.sizes,
+        "history",
+        [name for name, needed in is_needed.items() if needed]
+        + [f"factor_{k}" for k in sorted(matrices, key=arrays.cotangent_of)],
+    )
+    backward_storage, declarations = _build_layout(
+        arrays.sizes, "product_cotangents", [*dict.fromkeys(map(arrays.cotangent_of, matrices))]
+    )
+    backward_storage |= {
+        f"product_{k}_cotangent": backward_storage[arrays.cotangent_of(k)] for k in matrices
+    }
+    declarations |= {name: stored_pointers.get(name, "") for name in is_needed}
+    declarations |= {
+        name: arrays.declare_local(name)
+        for name in arrays.sizes
+        if name.endswith("_cotangent") and name not in declarations
+    }
+    code = _write_function(
+        "step_vjp",
+        vjp_function,
+        dict.fromkeys((*_STRIDED_ARRAYS, "x_cotangent", "a_cotangent", "x_before"), "stride"),
+        _write_product_calls(arrays, "back_times", "product_{}_cotangent", "factor_{}_cotangent"),
+        declarations,
+        ("x_before", "gradient"),
+    )
+    return _GradientSource(code, arrays, forward_storage, backward_storage, stored_pointers)
 
 
 _STRIDED_ARRAYS = ("x", "w", "s", "q", "row_values", "x_after", "s_after", "q_after", "a")
@@ -532,21 +578,12 @@ def _write_outer_products(
 
 
 def _write_product_calls(
-    products: Mapping[int, RowProduct],
-    sizes: Mapping[str, int],
-    table_offsets: Sequence[int],
-    shared_cotangents: Mapping[str, str],
-    function_name: str,
-    source_format: str,
-    target_format: str,
+    arrays: _ProductArrays, function_name: str, source_format: str, target_format: str
 ) -> Calls:
     """Write the calls of the loops over products, or over their transposes for a gradient.
 
     Args:
-        products: the products of the step by number.
-        sizes: number of entries of each quantity.
-        table_offsets: offset of the matrix of each product in the table.
-        shared_cotangents: for a cotangent that equals another one, the name of the other one.
+        arrays: arrays of the products of the step.
         function_name: `times`, or `back_times` for the vector-Jacobian product.
         source_format: format of the name of the multiplied vector, with the number of the product.
         target_format: format of the name of the result.
@@ -555,14 +592,14 @@ def _write_product_calls(
         For each source, the results that are computed once it is complete, with their statements.
     """
     statements: dict[str, list[tuple[str, str]]] = {}
-    for k, product in products.items():
+    for k, product in arrays.products.items():
         source = source_format.format(k)
         target = target_format.format(k)
-        source = shared_cotangents.get(source, source)
-        n_source = sizes[source] // product.n_repeats
-        n_target = sizes[target] // product.n_repeats
+        source = arrays.shared_cotangents.get(source, source)
+        n_source = arrays.sizes[source] // product.n_repeats
+        n_target = arrays.sizes[target] // product.n_repeats
         text = "".join(
-            f"{function_name}(tables + {table_offsets[k]}, {n_source}, {n_target},"
+            f"{function_name}(tables + {arrays.table_offsets[k]}, {n_source}, {n_target},"
             f" {source} + {r * n_source} * LANES,"
             f" {target} + {r * n_target} * LANES);"
             for r in range(product.n_repeats)

@@ -563,7 +563,7 @@ class Fitter:
         return (score.diverged, score.error) > baseline_score
 
     def build_acceleration_ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
-        """Build, store and reload an ensemble that integrates the mean acceleration of its members."""
+        """Build, store and reload an ensemble of the mean acceleration of its members."""
         return self._save_and_reload(self._build_ensemble(name, members, "accelerations"))
 
     def build_trajectory_ensemble(

@@ -374,7 +374,7 @@ class Fleet:
         )
 
     def assemble(self, log: LogStatistics) -> BlockData:
-        """Return integrals of regressors and changes of velocities over blocks of a log, in SI units."""
+        """Return integrals of regressors and changes of velocities over blocks of a log, in SI."""
         length = len(log)
         if length >= MIN_SAMPLES:
             length = max(round(self.block_seconds / log.sampling_interval), 4)
