@@ -14,7 +14,8 @@ import bench
 import numpy as np
 from simulated_motion import Boat, TrueMotion, simulate_motion
 
-from residnet.preprocessing.compatibility.reconstruction import ErrorEstimate, Prior, reconstruct
+from residnet.preprocessing.compatibility.estimates import ErrorEstimate, Prior
+from residnet.preprocessing.compatibility.reconstruction import reconstruct
 from residnet.preprocessing.compatibility.sensors import Sensor
 
 BOATS = {

@@ -9,17 +9,14 @@ import pytest
 from simulated_motion import BOATS, TrueMotion, simulate_motion
 
 from residnet.core.errors import DataError
+from residnet.preprocessing.compatibility.estimates import Prior, Reconstruction
 from residnet.preprocessing.compatibility.hypotheses import (
     MIN_MARGIN,
     Hypothesis,
     choose_stretch,
     compare,
 )
-from residnet.preprocessing.compatibility.reconstruction import (
-    Prior,
-    Reconstruction,
-    reconstruct,
-)
+from residnet.preprocessing.compatibility.reconstruction import reconstruct
 from residnet.preprocessing.compatibility.sensors import Sensor, SensorKind
 
 TIMES = np.arange(1.0, 99.0, 0.4)

@@ -14,13 +14,13 @@ from residnet.core.frames import unwrap_angle
 from residnet.core.log import Log
 from residnet.core.names import POSE_NAMES
 from residnet.preprocessing.channel_values import mask_held_values, nan_median, nan_std
+from residnet.preprocessing.compatibility.estimates import Prior
 from residnet.preprocessing.compatibility.hypotheses import (
     Hypothesis,
     RankedHypothesis,
     choose_stretch,
     compare,
 )
-from residnet.preprocessing.compatibility.reconstruction import Prior
 from residnet.preprocessing.compatibility.sensors import CURRENT_NAMES, Sensor, SensorKind
 from residnet.quality.records import CompatibilityRow, CurrentTest, InstrumentErrorRow
 

@@ -265,7 +265,10 @@ ColumnValue: TypeAlias = Callable[[RowT], object] | str
 separate nested keys).
 """
 ColumnFormat: TypeAlias = int | Callable[[Any], str | Cell]
-"""The format of a value: a number of decimals, or a function that maps the value to text."""
+"""The format of a value: a number of decimals, or a function that maps the value to text.
+
+The argument is Any, because the type of a value that a key selects is not known statically.
+"""
 Column: TypeAlias = (
     tuple[str, ColumnValue[RowT]]
     | tuple[str, ColumnValue[RowT], ColumnFormat]

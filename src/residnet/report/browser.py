@@ -18,7 +18,7 @@ from residnet.report.figure import TEXT_COLOR, Case, Figure, GlyphStyle
 from residnet.report.figure_files import pack_columns
 
 if TYPE_CHECKING:
-    from bokeh.models import ColumnDataSource
+    from bokeh.models import ColumnDataSource, DataRange1d, Range1d, Renderer
     from bokeh.plotting import figure as Canvas
 
 _FONT = "12px"
@@ -64,12 +64,12 @@ def _build_canvases(figure: Figure) -> list[Canvas]:
     from bokeh import models
     from bokeh.models.annotations import Span
 
-    groups: dict[str, Any] = {}
+    groups: dict[str, DataRange1d | Range1d] = {}
     cursor = Span(dimension="height", line_dash="dotted", line_width=1)
     canvases = []
     for number, panel in enumerate(figure.panels):
         # the script of the page fills in the first case, so that its values are stored only once
-        columns: dict[str, Any] = {
+        columns: dict[str, Sequence[float]] = {
             name: [] for name in _panel_columns(figure, figure.cases[0], number)
         }
         group = panel.group if panel.kind == "curves" else f"{number} alone"
@@ -81,14 +81,16 @@ def _build_canvases(figure: Figure) -> list[Canvas]:
     return canvases
 
 
-def _axis_range(limits: Sequence[float]) -> Any:
+def _axis_range(limits: Sequence[float]) -> DataRange1d | Range1d:
     """Return the range of an axis: the given limits, or those of all visible curves."""
     from bokeh.models import DataRange1d, Range1d
 
     return Range1d(start=limits[0], end=limits[1]) if limits else DataRange1d(only_visible=True)
 
 
-def _build_canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataSource) -> Canvas:
+def _build_canvas(
+    figure: Figure, number: int, x_range: DataRange1d | Range1d, source: ColumnDataSource
+) -> Canvas:
     """Return the Bokeh canvas of one panel of a figure.
 
     Args:
@@ -172,7 +174,7 @@ def _build_canvas(figure: Figure, number: int, x_range: Any, source: ColumnDataS
     return canvas
 
 
-def _build_renderer(name: str, style: GlyphStyle, source: ColumnDataSource) -> Any:
+def _build_renderer(name: str, style: GlyphStyle, source: ColumnDataSource) -> Renderer:
     """Return the Bokeh renderer of a named curve; the caller adds it to a panel."""
     from bokeh import models
     from bokeh.models.renderers import GlyphRenderer

@@ -11,11 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from residnet.preprocessing.compatibility.reconstruction import (
-    Prior,
-    Reconstruction,
-    reconstruct,
-)
+from residnet.preprocessing.compatibility.estimates import Prior, Reconstruction
+from residnet.preprocessing.compatibility.reconstruction import reconstruct
 from residnet.preprocessing.compatibility.sensors import Sensor
 
 MIN_MARGIN = 20.0

@@ -10,10 +10,8 @@ Laplace's approximation.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
@@ -21,6 +19,19 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from residnet.core.errors import DataError
 from residnet.core.frames import unwrap_angle
 from residnet.core.result_cache import cache_results
+from residnet.preprocessing.compatibility.estimates import (
+    ErrorEstimate,
+    Prior,
+    Reconstruction,
+    SensorFit,
+)
+from residnet.preprocessing.compatibility.residuals import (
+    ResidualGroup,
+    compute_position_residuals,
+    compute_student_constant,
+    linearize_score,
+    sum_by_node,
+)
 from residnet.preprocessing.compatibility.sensors import (
     COMPLEX_STEP,
     CURRENT_NAMES,
@@ -36,15 +47,11 @@ from residnet.preprocessing.compatibility.sensors import (
     V,
     X,
     Y,
-    compute_ground_velocity,
     compute_hermite_weights,
-    differentiate_ground_velocity,
     differentiate_interpolation,
     interpolate_states,
 )
 
-_STUDENT_DOF = 5.0
-"""Degrees of freedom of the Student distribution of the measurement noise."""
 _MAX_ITERATIONS = 25
 """Largest number of Gauss-Newton iterations."""
 _CURVATURE_ITERATIONS = (4, 8)
@@ -61,16 +68,10 @@ _WEAKENED_SMOOTHNESS = 100.0
 """Factor on the jerk intensities in the test whether sensors determine an error: without a smooth
 motion the standard error of other errors grows.
 """
-_MIN_FREE_SHARE = 0.05
-"""Lower bound of the ratio of residual to noise variance of a sensor, in a denominator."""
 _PROBED_SMOOTHNESS = 10.0
 """Factor on the jerk intensities for the test whether smoothness changes the errors."""
 _N_REESTIMATIONS = 3
 """Number of Gauss-Newton steps with this factor."""
-_MIN_T_STATISTIC = 3.5
-"""Smallest ratio of a significant error to its standard error."""
-_MAX_GROWTH = 3.0
-"""Largest growth of the standard error of an error that the sensors determine."""
 _MAX_NODES = 20_000
 """Largest number of nodes."""
 _CACHE_BYTES = 50_000_000
@@ -86,112 +87,6 @@ _POSE_TOLERANCES = (1e-7, 2e-6)
 
 They are not zero, so that the covariance of these equations is invertible.
 """
-
-
-class Prior(NamedTuple):
-    """Normal prior of an instrument error.
-
-    Attributes:
-        mean: expected value.
-        std: standard deviation.
-    """
-
-    mean: float
-    std: float
-
-
-@dataclass(frozen=True)
-class ErrorEstimate:
-    """Estimated instrument error.
-
-    Attributes:
-        value: estimate in SI units.
-        statistical_error: larger one of the standard errors from the curvature and from a jackknife
-            over sections of the log.
-        change: change of the value if the jerk intensities are ten times larger.
-        growth: factor on the standard error if the jerk intensities are a hundred times larger.
-        prior_std: standard deviation of the prior.
-    """
-
-    value: float
-    statistical_error: float
-    change: float
-    growth: float
-    prior_std: float
-
-    @property
-    def is_independent_of_smoothness(self) -> bool:
-        """Whether less smoothness changes the value by no more than its standard error.
-
-        This is a specification test (Hausman 1978, Econometrica 46).
-        """
-        return self.growth <= _MAX_GROWTH and abs(self.change) <= self.statistical_error
-
-    @property
-    def standard_error(self) -> float:
-        """Standard error; it contains the effect of smoothness on errors that depend on it."""
-        if self.is_independent_of_smoothness:
-            return self.statistical_error
-        return float(np.hypot(self.growth * self.statistical_error, self.change))
-
-    @property
-    def is_determined(self) -> bool:
-        """Whether sensors determine the error; otherwise the smoothness of the motion does.
-
-        An error that is significant beyond the effect of smoothness is determined, too.
-        """
-        is_distinct = abs(self.value) > _MIN_T_STATISTIC * self.standard_error
-        has_information = self.standard_error < 0.5 * self.prior_std
-        return has_information and (self.is_independent_of_smoothness or is_distinct)
-
-    @property
-    def is_significant(self) -> bool:
-        """Whether the error is determined and differs from zero by 3.5 standard errors."""
-        total = float(np.hypot(self.statistical_error, self.change))
-        return self.is_determined and abs(self.value) > _MIN_T_STATISTIC * total
-
-
-@dataclass(frozen=True)
-class SensorFit:
-    """Residuals of a sensor.
-
-    Attributes:
-        noise_std: standard deviation of the noise in the unit of the values.
-        autocorrelation: correlation of successive residuals.
-        outlier_share: share of residuals beyond five standard deviations.
-    """
-
-    noise_std: float
-    autocorrelation: float
-    outlier_share: float
-
-
-@dataclass(frozen=True)
-class Reconstruction:
-    """Reconstructed motion of a log.
-
-    Attributes:
-        t: times of the nodes [K] in s.
-        states: x, y, psi, u, v, r through the water, and the derivatives of u, v, r, [K, 9].
-        errors: name -> estimate.
-        sensors: name of a sensor -> its residuals.
-        jerk_intensity: power spectral densities of the jerk of u, v, r.
-        deviance: minus twice the logarithm of the evidence.
-        n_measurements: number of measured values.
-    """
-
-    t: np.ndarray
-    states: np.ndarray
-    errors: dict[str, ErrorEstimate]
-    sensors: dict[str, SensorFit]
-    jerk_intensity: np.ndarray
-    deviance: float
-    n_measurements: int
-
-    @property
-    def bic(self) -> float:
-        """Bayesian information criterion."""
-        return self.deviance + len(self.errors) * float(np.log(max(self.n_measurements, 2)))
 
 
 @cache_results(_CACHE_BYTES)
@@ -211,58 +106,6 @@ def reconstruct(
     """
     problem = _Problem(sensors, errors, step)
     return problem.estimate()
-
-
-@dataclass
-class _Residuals:
-    """Whitened residuals of one group and their derivatives.
-
-    Attributes:
-        group: name of the noise level.
-        nodes: node before each residual [N].
-        values: whitened residuals [N].
-        by_state: state -> derivative [N]; states 0 to 8 are of the node, 9 to 17 of the next node.
-        by_error: index of an error -> derivative [N].
-        sensor: sensor of a measurement; None for a dynamic equation.
-        squares: squared norm [N] over all columns of the sensor, so that the weights of a position
-            do not depend on its axes; None for a dynamic equation.
-        dimension: number of columns of the sensor.
-    """
-
-    group: str
-    nodes: np.ndarray
-    values: np.ndarray
-    by_state: dict[int, np.ndarray]
-    by_error: dict[int, np.ndarray] = field(default_factory=dict)
-    sensor: Sensor | None = None
-    squares: np.ndarray | None = None
-    dimension: int = 1
-
-    @property
-    def weights(self) -> np.ndarray | float:
-        """Weights [N] of the Student distribution."""
-        if self.squares is None:
-            return 1.0
-        return np.asarray((_STUDENT_DOF + self.dimension) / (_STUDENT_DOF + self.squares))
-
-    @property
-    def cost(self) -> float:
-        """Contribution of one column to minus twice the log-density, without constants."""
-        if self.squares is None:
-            return float(self.values @ self.values)
-        exponent = (_STUDENT_DOF + self.dimension) / self.dimension
-        return float(exponent * np.log1p(self.squares / _STUDENT_DOF).sum())
-
-    def scale(self, factor: float, sensor: Sensor | None) -> _Residuals:
-        """Return the residuals of a sensor, or of a dynamic equation, times a factor."""
-        return replace(
-            self,
-            values=factor * self.values,
-            by_state={key: factor * derivative for key, derivative in self.by_state.items()},
-            by_error={key: factor * derivative for key, derivative in self.by_error.items()},
-            sensor=sensor,
-            squares=None if self.squares is None else factor**2 * self.squares,
-        )
 
 
 @dataclass
@@ -447,7 +290,7 @@ class _Problem:
 
     # --- linearisation -----------------------------------------------------------------------
 
-    def _linearize(self, states: np.ndarray, errors: np.ndarray) -> list[_Residuals]:
+    def _linearize(self, states: np.ndarray, errors: np.ndarray) -> list[ResidualGroup]:
         """Return the whitened residuals of all equations and their derivatives."""
         parameters = dict(zip(self.names, errors.tolist(), strict=True))
         groups = self._linearize_dynamics(states, parameters)
@@ -457,7 +300,7 @@ class _Problem:
 
     def _linearize_dynamics(
         self, states: np.ndarray, parameters: Mapping[str, float]
-    ) -> list[_Residuals]:
+    ) -> list[ResidualGroup]:
         """Return the residuals of white jerk and of the kinematics over each step."""
         h = self.step
         nodes = np.arange(self.n_nodes - 1)
@@ -479,7 +322,7 @@ class _Problem:
                 next_state: velocity_weight,
             }
             groups.append(
-                _Residuals(
+                ResidualGroup(
                     name,
                     nodes,
                     velocity_error * velocity_weight,
@@ -493,7 +336,7 @@ class _Problem:
                 next_rate: rate_weight,
             }
             groups.append(
-                _Residuals(
+                ResidualGroup(
                     name,
                     nodes,
                     (rate_error - slope * velocity_error) * rate_weight,
@@ -510,7 +353,7 @@ class _Problem:
             {PSI: 1.0, R: -h / 2.0, R_DOT: h**2 / 12.0},
         )
         groups.append(
-            _Residuals(
+            ResidualGroup(
                 "heading",
                 nodes,
                 heading_error * heading_weight,
@@ -526,7 +369,7 @@ class _Problem:
             for rows in (slice(-1), slice(1, None))
         ]
         current = [parameters.get(name, 0.0) for name in CURRENT_NAMES]
-        position_errors, derivatives_by_axis = _integrate_position(
+        position_errors, derivatives_by_axis = compute_position_residuals(
             states_by_end[0], states_by_end[1], h, *current
         )
         for axis, name in enumerate(CURRENT_NAMES):
@@ -536,7 +379,7 @@ class _Problem:
                 else {}
             )
             groups.append(
-                _Residuals(
+                ResidualGroup(
                     "position",
                     nodes,
                     position_errors[axis] * position_weight,
@@ -557,8 +400,8 @@ class _Problem:
         return factors
 
     def _whiten_again(
-        self, residuals: Sequence[_Residuals], inverse_noise: Mapping[str, float]
-    ) -> list[_Residuals]:
+        self, residuals: Sequence[ResidualGroup], inverse_noise: Mapping[str, float]
+    ) -> list[ResidualGroup]:
         """Return residuals at the present noise levels.
 
         Args:
@@ -568,7 +411,10 @@ class _Problem:
         factors = self._compute_inverse_noise()
         sensors = {f"sensor {k}": sensor for k, sensor in enumerate(self.sensors)}
         return [
-            group.scale(factors[group.group] / inverse_noise[group.group], sensors.get(group.group))
+            group.scale(
+                factors[group.noise_name] / inverse_noise[group.noise_name],
+                sensors.get(group.noise_name),
+            )
             for group in residuals
         ]
 
@@ -601,7 +447,7 @@ class _Problem:
 
     def _linearize_sensor(
         self, index: int, sensor: Sensor, states: np.ndarray, parameters: dict[str, float]
-    ) -> list[_Residuals]:
+    ) -> list[ResidualGroup]:
         """Return the residuals of a sensor by complex-step differentiation."""
         is_inside, nodes, fraction = self._locate(sensor, parameters)
         values = sensor.values[is_inside]
@@ -637,7 +483,7 @@ class _Problem:
         ]
         squares = np.sum(np.square(differences), axis=0)
         return [
-            _Residuals(
+            ResidualGroup(
                 f"sensor {index}",
                 nodes,
                 differences[k],
@@ -681,7 +527,7 @@ class _Problem:
                     target[self.names.index(name)] = slope
         return derivatives
 
-    def _compute_cost(self, residuals: Sequence[_Residuals], errors: np.ndarray) -> float:
+    def _compute_cost(self, residuals: Sequence[ResidualGroup], errors: np.ndarray) -> float:
         """Return minus twice the log-density, with the linearised curvature of the states."""
         prior = float((((errors - self.prior_means) / self.prior_stds) ** 2).sum())
         curvature = 2.0 * float(self.curvature_gradient @ errors)
@@ -691,7 +537,7 @@ class _Problem:
         self,
         states: np.ndarray,
         errors: np.ndarray,
-        residuals: Sequence[_Residuals],
+        residuals: Sequence[ResidualGroup],
         solver: _Solver,
     ) -> np.ndarray:
         """Return the gradient [P] of half the log-determinant of the states' Hessian.
@@ -711,7 +557,7 @@ class _Problem:
             perturbed_errors[index] += _CURVATURE_STEP
             parameters = dict(zip(self.names, perturbed_errors.tolist(), strict=True))
             # other sensors and the dynamic equations do not depend on the scale
-            groups = [group for group in residuals if group.group not in index_by_group]
+            groups = [group for group in residuals if group.noise_name not in index_by_group]
             for k in index_by_group.values():
                 groups += self._linearize_sensor(k, self.sensors[k], states, parameters)
             factor = self._factorize(groups, perturbed_errors).banded_factor
@@ -720,7 +566,7 @@ class _Problem:
 
     # --- normal equations --------------------------------------------------------------------
 
-    def _factorize(self, residuals: Sequence[_Residuals], errors: np.ndarray) -> _Solver:
+    def _factorize(self, residuals: Sequence[ResidualGroup], errors: np.ndarray) -> _Solver:
         """Factorise the normal equations, banded in the states and dense in the errors."""
         n_nodes = self.n_nodes
         n_errors = errors.size
@@ -740,19 +586,17 @@ class _Problem:
                 side, state = divmod(first, N_STATES)
                 target = slice(side, n_targets + side)
                 first_derivative = derivatives[position]
-                gradient[target, state] += _sum_by_node(
+                gradient[target, state] += sum_by_node(
                     group, first_derivative * weighted_values, n_nodes
                 )
                 weighted_derivative = first_derivative * weights
-                products = _sum_by_node(
-                    group, weighted_derivative * derivatives[position:], n_nodes
-                )
+                products = sum_by_node(group, weighted_derivative * derivatives[position:], n_nodes)
                 # a product of two states of the next node belongs to that node
                 n_products = min(n_targets, n_nodes - side)
                 offsets = keys[position:] - first
                 band[offsets, side : side + n_products, state] += products[:, :n_products]
                 for index, derivative in group.by_error.items():
-                    border[index, target, state] += _sum_by_node(
+                    border[index, target, state] += sum_by_node(
                         group, weighted_derivative * derivative, n_nodes
                     )
             for index, derivative in group.by_error.items():
@@ -781,7 +625,7 @@ class _Problem:
 
     # --- noise levels ------------------------------------------------------------------------
 
-    def _update_noise(self, residuals: Sequence[_Residuals], solver: _Solver) -> float:
+    def _update_noise(self, residuals: Sequence[ResidualGroup], solver: _Solver) -> float:
         """Update noise levels to the restricted maximum likelihood; return the largest change.
 
         A noise level is the sum of squares over the residual degrees of freedom. Those that the
@@ -790,7 +634,7 @@ class _Problem:
         rng = np.random.default_rng(0)
         names = ["jerk 0", "jerk 1", "jerk 2"]
         names += [f"sensor {k}" for k, s in enumerate(self.sensors) if not s.is_noise_known]
-        groups_by_name = {name: [g for g in residuals if g.group == name] for name in names}
+        groups_by_name = {name: [g for g in residuals if g.noise_name == name] for name in names}
         right_hand_sides = []
         by_errors = []
         for name in names:
@@ -833,7 +677,7 @@ class _Problem:
         return largest_change
 
     def _multiply_signs(
-        self, groups: Sequence[_Residuals], rng: np.random.Generator
+        self, groups: Sequence[ResidualGroup], rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the transposed derivatives of a group times random signs, by states and errors."""
         by_states = np.zeros((self.n_nodes + 1, N_STATES))
@@ -852,7 +696,7 @@ class _Problem:
     # --- results -----------------------------------------------------------------------------
 
     def _summarize(
-        self, states: np.ndarray, errors: np.ndarray, residuals: list[_Residuals]
+        self, states: np.ndarray, errors: np.ndarray, residuals: list[ResidualGroup]
     ) -> Reconstruction:
         """Return estimates with standard errors, growth and evidence."""
         solver = self._factorize(residuals, errors)
@@ -910,7 +754,7 @@ class _Problem:
         return errors
 
     def _compute_standard_errors(
-        self, residuals: Sequence[_Residuals], errors: np.ndarray
+        self, residuals: Sequence[ResidualGroup], errors: np.ndarray
     ) -> np.ndarray:
         """Return standard errors [P]: the larger of curvature and jackknife over sections.
 
@@ -923,7 +767,7 @@ class _Problem:
         """
         if not errors.size:
             return np.zeros(0)
-        groups = [_linearize_score(group) for group in residuals]
+        groups = [linearize_score(group) for group in residuals]
         solver = self._factorize(groups, errors)
         covariance = np.linalg.inv(solver.schur)
         prior_gradient = (errors - self.prior_means) / self.prior_stds**2
@@ -951,7 +795,7 @@ class _Problem:
         variances = (_N_SECTIONS - 1) / _N_SECTIONS * (changes**2).sum(axis=0)
         return np.asarray(np.sqrt(np.maximum(np.diag(covariance), variances)))
 
-    def _summarize_sensors(self, residuals: Sequence[_Residuals]) -> dict[str, SensorFit]:
+    def _summarize_sensors(self, residuals: Sequence[ResidualGroup]) -> dict[str, SensorFit]:
         fit_by_sensor = {}
         for group in residuals:
             if group.sensor is None:
@@ -966,7 +810,7 @@ class _Problem:
         return fit_by_sensor
 
     def _compute_deviance(
-        self, residuals: Sequence[_Residuals], errors: np.ndarray, solver: _Solver
+        self, residuals: Sequence[ResidualGroup], errors: np.ndarray, solver: _Solver
     ) -> float:
         """Return minus twice the log-evidence by Laplace's approximation.
 
@@ -979,71 +823,16 @@ class _Problem:
         for group in residuals:
             n = group.values.size
             if group.sensor is not None:
-                constant = _compute_student_constant(group.dimension)
+                constant = compute_student_constant(group.dimension)
                 deviance += n * (2.0 * float(np.log(group.sensor.noise_std)) + constant)
                 continue
             deviance += n * float(np.log(2.0 * np.pi))
-            if group.group.startswith("jerk"):
-                deviance += n * float(np.log(self.jerk_intensity[int(group.group[-1])]))
+            if group.noise_name.startswith("jerk"):
+                deviance += n * float(np.log(self.jerk_intensity[int(group.noise_name[-1])]))
         heading_weight, position_weight = self._pose_weights
         return deviance - 2.0 * (self.n_nodes - 1) * float(
             np.log(heading_weight) + 2.0 * np.log(position_weight)
         )
-
-
-def _sum_by_node(group: _Residuals, values: np.ndarray, n_nodes: int) -> np.ndarray:
-    """Sum values of the residuals [..., N] by node [..., K].
-
-    A dynamic equation has one value per node but the last.
-    """
-    if group.sensor is None:
-        return values
-    if values.ndim == 1:
-        return np.bincount(group.nodes, values, n_nodes)
-    return np.array([np.bincount(group.nodes, row, n_nodes) for row in values])
-
-
-def _linearize_score(group: _Residuals) -> _Residuals:
-    """Return Gaussian residuals with the information and the scores of a group with weights.
-
-    With the score psi = w r, the information of a residual is E[psi']^2 / E[psi^2] (Huber 1981,
-    Robust Statistics, eq. 7.6.2). It is reduced by the autocorrelation of successive scores, which
-    are taken for an autoregressive process of first order.
-    """
-    if group.squares is None:
-        return group
-    dimension = group.dimension
-    numerator = _STUDENT_DOF + dimension
-    weights = numerator / (_STUDENT_DOF + group.squares)
-    score = weights * group.values
-    # residuals are smaller than the noise, whose weighted mean square is one by its estimate
-    free_share = float((weights * group.squares).mean()) / dimension
-    noise_squares = group.squares / max(free_share, _MIN_FREE_SHARE)
-    denominator = _STUDENT_DOF + noise_squares
-    # means over all columns of a sensor
-    slope = numerator / denominator - 2.0 * numerator * noise_squares / (dimension * denominator**2)
-    mean_slope = max(float(slope.mean()), 0.1)
-    mean_square = float(((numerator / denominator) ** 2 * noise_squares).mean()) / dimension
-    centred = score - score.mean()
-    energy = max(float(centred @ centred), 1e-300)
-    autocorrelation = max(float(centred[1:] @ centred[:-1]) / energy, 0.0)
-    information = mean_slope**2 / max(mean_square, 1e-300)
-    information *= (1.0 - autocorrelation) / (1.0 + autocorrelation)
-    root_information = float(np.sqrt(information))
-    return replace(
-        group,
-        values=root_information / mean_slope * score,
-        by_state={key: root_information * derivative for key, derivative in group.by_state.items()},
-        by_error={key: root_information * derivative for key, derivative in group.by_error.items()},
-        squares=None,
-    )
-
-
-def _compute_student_constant(dimension: int) -> float:
-    """Return minus twice the logarithm of the Student density's constant, per dimension."""
-    half_dof = 0.5 * _STUDENT_DOF
-    constant = math.lgamma(half_dof + 0.5 * dimension) - math.lgamma(half_dof)
-    return -2.0 * constant / dimension + float(np.log(_STUDENT_DOF * np.pi))
 
 
 def _guess_noise(sensor: Sensor) -> Sensor:
@@ -1057,43 +846,3 @@ def _guess_noise(sensor: Sensor) -> Sensor:
     noise_std = float(np.median(differences)) / 0.6745 / np.sqrt(20.0)
     smallest = max(1e-6 * (1.0 + float(np.abs(values).max())), sensor.min_noise_std)
     return replace(sensor, noise_std=max(noise_std, smallest))
-
-
-def _integrate_position(
-    before: NodeStates, after: NodeStates, step: float, north: float, east: float
-) -> tuple[list[np.ndarray], list[dict[int, np.ndarray | float]]]:
-    """Return the position at the next node minus its integral by Simpson's rule, and derivatives.
-
-    Returns:
-        The differences [N] north and east; and for each of them: state (0 to 8 of the node, 9 to 17
-        of the next node) -> derivative [N].
-    """
-    rates = {PSI: R, U: U_DOT, V: V_DOT}
-    points = {
-        state: np.stack(
-            (
-                before[state],
-                0.5 * (before[state] + after[state]) + step / 8.0 * (before[rate] - after[rate]),
-                after[state],
-            )
-        )
-        for state, rate in rates.items()
-    }
-    velocities = compute_ground_velocity(points, north, east)
-    slopes_by_state = differentiate_ground_velocity(points)
-    errors: list[np.ndarray] = []
-    derivatives: list[dict[int, np.ndarray | float]] = []
-    for axis, state in enumerate((X, Y)):
-        velocity = velocities[axis]
-        integral = velocity[0] + 4.0 * velocity[1] + velocity[2]
-        errors.append(after[state] - before[state] - step / 6.0 * integral)
-        by_state: dict[int, np.ndarray | float] = {state: -1.0, N_STATES + state: 1.0}
-        for velocity_state, rate in rates.items():
-            slope = slopes_by_state[velocity_state][axis]
-            by_middle = -step / 6.0 * 4.0 * slope[1]
-            by_state[velocity_state] = 0.5 * by_middle - step / 6.0 * slope[0]
-            by_state[N_STATES + velocity_state] = 0.5 * by_middle - step / 6.0 * slope[2]
-            by_state[rate] = step / 8.0 * by_middle
-            by_state[N_STATES + rate] = -step / 8.0 * by_middle
-        derivatives.append(by_state)
-    return errors, derivatives

@@ -7,8 +7,9 @@ import numpy as np
 from residnet.core.errors import DataError
 from residnet.core.names import STATE_NAMES
 from residnet.preprocessing.channel_values import nan_std
+from residnet.preprocessing.compatibility.estimates import Prior
 from residnet.preprocessing.compatibility.hypotheses import MIN_MARGIN, Hypothesis, compare
-from residnet.preprocessing.compatibility.reconstruction import Prior, reconstruct
+from residnet.preprocessing.compatibility.reconstruction import reconstruct
 from residnet.preprocessing.compatibility.sensors import (
     CURRENT_NAMES,
     DERIVATIVE_OF,
