@@ -18,13 +18,13 @@ from residnet.evaluation.goodness import (
     block_bootstrap_interval,
     build_goodness_table,
     compute_autocovariance,
+    compute_command_mismatch,
     estimate_noise_variance,
     estimate_serial_dependence,
     find_pairs,
     goodness_of_fit_measures,
     independent_confidence_interval,
     ljung_box_test,
-    mismatch,
     paired_mae_difference,
 )
 from residnet.evaluation.protocol import WindowProtocol
@@ -193,7 +193,7 @@ def test_mismatch_equals_a_loop() -> None:
     given = rng.normal(5, 2, (17, 2))
     series = rng.normal(5, 2, (90, 2))
     plain = [np.sqrt(((series[k : k + 17] - given) ** 2).mean(0)).max() for k in range(90 - 17 + 1)]
-    np.testing.assert_allclose(mismatch(given, series), plain, rtol=1e-9)
+    np.testing.assert_allclose(compute_command_mismatch(given, series), plain, rtol=1e-9)
     assert mismatch(series, given).shape == (0,)
 
 

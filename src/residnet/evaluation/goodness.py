@@ -28,7 +28,7 @@ from residnet.preprocessing.prepare import PreparedLog
 _COMMAND_TOLERANCE = 0.05
 """Largest difference of the commands of repeated runs, relative to their range.
 
-A smaller value, and one of the next two constants, would leave few pairs.
+Smaller tolerances, or a coarser search, find few pairs.
 """
 _START_TOLERANCE = 0.25
 """Largest difference of the initial velocities of repeated runs, in scales."""
@@ -156,9 +156,9 @@ def find_pairs(
                 starts = np.arange(0, len(logs[other_index]) - length + 1, search_stride)
                 if len(starts) == 0:
                     continue
-                command_mismatch = mismatch(window_commands, coarse_commands[other_index])[
-                    : len(starts)
-                ]
+                command_mismatch = compute_command_mismatch(
+                    window_commands, coarse_commands[other_index]
+                )[: len(starts)]
                 other_log = logs[other_index]
                 start_differences = np.abs(
                     other_log.smoothed[starts, other_log.dof.dynamic_columns]
@@ -185,7 +185,7 @@ def find_pairs(
                     )
 
 
-def mismatch(reference_commands: np.ndarray, series: np.ndarray) -> np.ndarray:
+def compute_command_mismatch(reference_commands: np.ndarray, series: np.ndarray) -> np.ndarray:
     """Return the difference of commands [L, m] to every segment of a series [T, m], [T - L + 1].
 
     It is the root mean square difference of the worst column. The square is expanded, so that the
@@ -262,7 +262,7 @@ def _mean_differences(
     state_scales: np.ndarray,
     scored_columns: list[int],
 ) -> dict[str, float]:
-    """Return the fields of `records.RepeatDifferences` from the differences [P, n + 2] of pairs."""
+    """Return the fields of `RepeatDifferences` from the differences [P, n + 2] of pairs."""
     means = dict(
         zip((*dynamic_states, "position", "heading"), differences.mean(0).tolist(), strict=True)
     )
@@ -344,25 +344,25 @@ def estimate_serial_dependence(segments: Segments) -> SerialDependence:
     Politis and White 2004, Econometric Reviews 23, 53-70; corrected by Patton, Politis and White
     2009, 28, 372-375.
 
-    The flat-top window of the autocovariances R(k) reaches to twice the lag m from which on
-    correlations are no more than noise; with g = sum R(k) and G = sum |k| R(k) under it, the block
-    is (3 G^2 / (2 g^2) n)^(1/3), at most min(3 sqrt(n), n / 3).
+    Let m be the last lag with a significant correlation. A flat-top window of the autocovariances
+    R(k) extends to the lag 2 m. With the windowed sums g = sum R(k) and G = sum |k| R(k), the block
+    length is (3 G^2 / (2 g^2) n)^(1/3), at most min(3 sqrt(n), n / 3).
     """
     n = sum(len(segment) for segment in segments)
-    n_quiet_lags = max(5, math.ceil(math.sqrt(math.log10(n)))) if n > 1 else 5
-    max_lag = math.ceil(math.sqrt(n)) + n_quiet_lags
-    covariance = compute_autocovariance(segments, max_lag + n_quiet_lags)
+    n_insignificant_lags = max(5, math.ceil(math.sqrt(math.log10(n)))) if n > 1 else 5
+    max_lag = math.ceil(math.sqrt(n)) + n_insignificant_lags
+    covariance = compute_autocovariance(segments, max_lag + n_insignificant_lags)
     if covariance[0] <= 1e-300:
         return SerialDependence(1, 0.0, float(n))
     is_noise = np.abs(covariance[1:] / covariance[0]) < _CORRELATION_THRESHOLD * math.sqrt(
         math.log10(n) / n
     )
-    quiet_starts = np.flatnonzero(
-        np.lib.stride_tricks.sliding_window_view(is_noise, n_quiet_lags).all(axis=1)
+    insignificant_starts = np.flatnonzero(
+        np.lib.stride_tricks.sliding_window_view(is_noise, n_insignificant_lags).all(axis=1)
     )
     significant_lags = np.flatnonzero(~is_noise)
     last_significant_lag = (
-        int(quiet_starts[0]) if quiet_starts.size else int(significant_lags[-1]) + 1
+        int(insignificant_starts[0]) if insignificant_starts.size else int(significant_lags[-1]) + 1
     )
     bandwidth = min(2 * max(last_significant_lag, 1), max_lag)
     lag = np.arange(1, bandwidth + 1)
@@ -387,9 +387,9 @@ def block_bootstrap_interval(segments: Segments) -> BlockBootstrapInterval:
     """Return the mean of all samples with its 95 % interval by a moving-block bootstrap.
 
     `estimate_serial_dependence` gives the block length. Percentiles about the mean are widened by
-    Student's t for few blocks (see `residnet.evaluation.metrics`) and by the ratio of the long-run
-    standard error to the bootstrap standard error, between 1 and 1.5. The interval is valid for
-    further data of the same kind, not for other manoeuvres.
+    Student's t for few blocks (see `residnet.evaluation.intervals`) and by the ratio of the
+    long-run standard error to the bootstrap standard error, between 1 and 1.5. The interval is
+    valid for further data of the same kind, not for other manoeuvres.
     """
     dependence = estimate_serial_dependence(segments)
     n = sum(len(segment) for segment in segments)

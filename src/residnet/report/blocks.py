@@ -180,7 +180,7 @@ class Table:
 
     @property
     def text_columns(self) -> list[bool]:
-        """Return for each column whether it holds words rather than numbers."""
+        """Whether each column contains words, which are aligned to the left, instead of numbers."""
         marks = zip(*([cell.mark for cell in row.cells] for row in self.rows), strict=True)
         is_text = [all(mark == "text" for mark in column) for column in marks]
         return [True, *(is_text or [False] * (len(self.columns) - 1))]

@@ -64,7 +64,7 @@ def estimate_refit_covariance(
     cost, states = simulate(model, problem)
     hessian, _ = normal_equations(model, problem, cost, states)
     covariance = problem.cost_per_nat(cost) * problem.inverse(hessian)
-    # inverts the robust cost of a window, sqrt(mean square error + robust^2)
+    # the cost of a window is sqrt(mean square error + robust^2)
     return RefitUncertainty(covariance, float(cost.square() - config.robust**2))
 
 
@@ -113,8 +113,8 @@ def estimate_leave_one_out(
         )
         for k in range(n_folds)
     ]
-    # at the refitted parameters this gradient and that of the prior cancel, so that it also stands
-    # for the prior in the change of the gradient below
+    # at the refitted parameters the gradients of the cost and of the prior add to zero, so that the
+    # difference of gradients below contains the prior
     total_gradient = sum(
         (
             share * gradient
@@ -143,23 +143,23 @@ def estimate_leave_one_out(
             hessian, gradient_change.unsqueeze(1), driver="gelsd"
         ).solution.squeeze(1)
         step[problem.fixed] = 0.0
-        remaining = _select_windows(problem, fold_of_window != k)
-        baseline.set_free(_largest_improving_step(model, remaining, parameters, step))
+        remaining_windows = _select_windows(problem, fold_of_window != k)
+        baseline.set_free(_largest_improving_step(model, remaining_windows, parameters, step))
         thetas.append(baseline.theta.detach().clone())
         baseline.set_free(parameters)
     return thetas
 
 
 def _largest_improving_step(
-    model: HybridDynamics, remaining: Problem, parameters: Tensor, step: Tensor
+    model: HybridDynamics, problem: Problem, parameters: Tensor, step: Tensor
 ) -> Tensor:
     """Return the parameters after the largest fraction of the step that lowers the cost."""
     baseline = require_parametric_baseline(model)
-    initial_cost, _ = simulate(model, remaining)
+    initial_cost, _ = simulate(model, problem)
     for halving in range(_MAX_HALVINGS):
         trial = parameters + 0.5**halving * step
         baseline.set_free(trial)
-        trial_cost, _ = simulate(model, remaining)
+        trial_cost, _ = simulate(model, problem)
         baseline.set_free(parameters)
         if torch.isfinite(trial_cost) and trial_cost <= initial_cost:
             return trial

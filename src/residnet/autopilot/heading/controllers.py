@@ -355,11 +355,10 @@ class ObservedConfig(TunableConfig, ABC):
 
     Attributes:
         lag: dead time in s between a command and the rudder; 0 for no predictor.
-        heading_rate: observer gain from heading innovation to heading in 1/s; null to tune it, also
-            for the following gains.
-        yaw_rate_rate: observer gain from yaw-rate innovation to yaw rate in 1/s.
-        push_rate: observer gain from yaw-rate innovation to disturbance in 1/s.
-        cross_rate: observer gain from heading innovation to yaw rate in 1/s^2.
+        heading_rate: observer gain from heading innovation to heading in 1/s; null to tune it.
+        yaw_rate_rate: observer gain from yaw-rate innovation to yaw rate in 1/s; null to tune it.
+        push_rate: observer gain from yaw-rate innovation to disturbance in 1/s; null to tune it.
+        cross_rate: observer gain from heading innovation to yaw rate in 1/s^2; null to tune it.
     """
 
     lag: Seconds = Field(default=0.0, ge=0, le=60.0)

@@ -145,7 +145,7 @@ class Disturbance(Config):
     east: Newtons = 0.0
 
 
-def measured(x: Tensor, noise: Tensor) -> Tensor:
+def add_noise(x: Tensor, noise: Tensor) -> Tensor:
     """Return states [..., nx] with noise [..., 6] on pose and velocities."""
     return torch.cat((x[..., MOTION] + noise, x[..., ACTUATORS]), dim=-1)
 
@@ -163,7 +163,7 @@ class NoisyLoop(Source):
         return self.loop.initial(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        inputs, memory = self.loop(measured(x, w[:, -6:]), w[:, :-6], k, memory)
+        inputs, memory = self.loop(add_noise(x, w[:, -6:]), w[:, :-6], k, memory)
         return inputs, memory
 
 
@@ -311,14 +311,14 @@ class FerrySimulation:
 
         The paths are courses of equal duration, or the same crossing.
         """
-        gains = self.loop
+        loop_config = self.loop
         step = self.loop.step
         lags = [lag for _, lag in feeds]
         # all gains are multiples of the frequencies, so that zero frequencies switch the feedback
         # off
         if not feedback:
-            gains = gains.model_copy(update={"frequency": (0.0, 0.0, 0.0)})
-        pid = gains.build_pid(self.believed_hull.mass)
+            loop_config = loop_config.model_copy(update={"frequency": (0.0, 0.0, 0.0)})
+        pid = loop_config.build_pid(self.believed_hull.mass)
         policy = AllocatedPolicy(LagCompensatedPID(pid, lags, step), self.thrusters.allocate)
         n_inputs = len(self.plant.input_names)
         references = torch.zeros(len(feeds), 0, 0, dtype=torch.float64)
@@ -371,7 +371,7 @@ class FerrySimulation:
             states, applied_inputs, _ = model(*rollout_arguments)
             states = states[:, :-1]
             is_finite = torch.isfinite(states).flatten(1).all(dim=1).tolist()
-            measured_states = measured(states, noise[..., MOTION])
+            measured_states = add_noise(states, noise[..., MOTION])
             if isinstance(first_path, CrossingConfig):
                 memory = guidance.initial_state(states[:, 0])
                 rows = []
@@ -404,8 +404,8 @@ class FerrySimulation:
         desired = reference[:, :9]
         error = pid.body_error(measured_states, reference)
         feedback, _ = pid(measured_states, desired, (error.cumsum(0) - error) * loop.step)
-        rate = self.plant.derivative(x, w)
-        motion = torch.cat((x[:, VELOCITIES], rate[:, VELOCITIES]), dim=-1)
+        state_derivative = self.plant.derivative(x, w)
+        motion = torch.cat((x[:, VELOCITIES], state_derivative[:, VELOCITIES]), dim=-1)
         metrics = compute_tracking_metrics(
             x[:, POSE], motion, desired, command, feedback, loop.step
         )
@@ -416,12 +416,12 @@ class FerrySimulation:
         )
         t = torch.arange(len(x), dtype=torch.float64) * loop.step
         thruster_force = self.thrusters.force(x[:, ACTUATORS], commands, x[:, VELOCITIES])
-        measured_motion = torch.cat((x[:, MOTION], rate[:, VELOCITIES]), dim=-1) + noise
+        measured_motion = torch.cat((x[:, MOTION], state_derivative[:, VELOCITIES]), dim=-1) + noise
         return FerryRun(
             t[stride],
             x[stride, POSE],
             x[stride, VELOCITIES],
-            rate[stride, VELOCITIES],
+            state_derivative[stride, VELOCITIES],
             measured_motion[stride],
             command[stride],
             padded_command.unfold(0, 2 * half_window + 1, 1).mean(-1)[stride],
