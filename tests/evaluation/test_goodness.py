@@ -194,7 +194,7 @@ def test_mismatch_equals_a_loop() -> None:
     series = rng.normal(5, 2, (90, 2))
     plain = [np.sqrt(((series[k : k + 17] - given) ** 2).mean(0)).max() for k in range(90 - 17 + 1)]
     np.testing.assert_allclose(compute_command_mismatch(given, series), plain, rtol=1e-9)
-    assert mismatch(series, given).shape == (0,)
+    assert compute_command_mismatch(series, given).shape == (0,)
 
 
 def test_a_repeated_run_is_found_and_its_difference_measured() -> None:
