@@ -18,7 +18,8 @@ from residnet.report.figure import TEXT_COLOR, Case, Figure, GlyphStyle
 from residnet.report.figure_files import pack_columns
 
 if TYPE_CHECKING:
-    from bokeh.models import ColumnDataSource, DataRange1d, Range1d, Renderer
+    from bokeh.models import ColumnDataSource, DataRange1d, Range1d
+    from bokeh.models.renderers import GlyphRenderer
     from bokeh.plotting import figure as Canvas
 
 _FONT = "12px"
@@ -69,7 +70,7 @@ def _build_canvases(figure: Figure) -> list[Canvas]:
     canvases = []
     for number, panel in enumerate(figure.panels):
         # the script of the page fills in the first case, so that its values are stored only once
-        columns: dict[str, Sequence[float]] = {
+        columns: dict[str, Any] = {
             name: [] for name in _panel_columns(figure, figure.cases[0], number)
         }
         group = panel.group if panel.kind == "curves" else f"{number} alone"
@@ -174,7 +175,7 @@ def _build_canvas(
     return canvas
 
 
-def _build_renderer(name: str, style: GlyphStyle, source: ColumnDataSource) -> Renderer:
+def _build_renderer(name: str, style: GlyphStyle, source: ColumnDataSource) -> GlyphRenderer:
     """Return the Bokeh renderer of a named curve; the caller adds it to a panel."""
     from bokeh import models
     from bokeh.models.renderers import GlyphRenderer
