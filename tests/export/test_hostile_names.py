@@ -10,7 +10,7 @@ import pytest
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError
 from residnet.dynamics.store import ModelSpec
-from residnet.export.c import _comment
+from residnet.export.c import escape_comment
 from residnet.heads.linear import RidgeConfig
 from residnet.testing.checks import make_example_spec
 
@@ -38,4 +38,4 @@ def test_a_name_that_ends_a_comment_is_refused(name: str) -> None:
 
 
 def test_a_comment_ends_where_the_exporter_ends_it() -> None:
-    assert "*/" not in _comment("a */ b /* c */")
+    assert "*/" not in escape_comment("a */ b /* c */")

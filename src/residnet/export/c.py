@@ -190,23 +190,23 @@ def render_c_files(
         "c_header.h",
         comment="\n".join(
             f" * {comment_line}".rstrip()
-            for comment_line in _escape_comment(header_comment).splitlines()
+            for comment_line in escape_comment(header_comment).splitlines()
         ),
         guard=f"{prefix.upper()}_H",
         double_only=is_double_only,
         **template_names,
         numbers="\n".join(
-            f"#define {prefix.upper()}_{name} {value} /* {_escape_comment(entry_comment)} */"
+            f"#define {prefix.upper()}_{name} {value} /* {escape_comment(entry_comment)} */"
             for name, (value, entry_comment) in constants.items()
         ),
         prototypes="\n\n".join(
-            f"/* {_escape_comment(entry_comment)} */\n{prototype_line};"
+            f"/* {escape_comment(entry_comment)} */\n{prototype_line};"
             for entry_comment, prototype_line in declarations
         ),
     )
 
 
-def _escape_comment(text: str) -> str:
+def escape_comment(text: str) -> str:
     """Return a text that cannot terminate a C comment."""
     return text.replace("*/", "* /").replace("/*", "/ *")
 
