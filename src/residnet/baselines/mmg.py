@@ -447,14 +447,14 @@ def fit_mmg(config: MMGConfig, baseline: MMGBaseline, samples: Samples) -> Solut
 
     factors = _PRIOR_FACTORS if config.prior_weight == "evidence" else (1.0,)
     estimates = {factor: estimate(factor) for factor in factors}
-    chosen = max(estimates, key=lambda factor: estimates[factor][0])
-    _, theta_map, hessian = estimates[chosen]
+    best_factor = max(estimates, key=lambda factor: estimates[factor][0])
+    _, theta_map, hessian = estimates[best_factor]
     baseline.theta[free_index] = theta_map
-    baseline.prior_std = [chosen * deviation for deviation in baseline.prior_std]
+    baseline.prior_std = [best_factor * deviation for deviation in baseline.prior_std]
     standard_errors = torch.linalg.inv(hessian).diagonal().sqrt()
     notes: dict[str, Any] = {}
     if config.prior_weight == "evidence":
-        notes["prior_factor"] = chosen
+        notes["prior_factor"] = best_factor
         notes["log_evidence"] = {
             f"{factor:g}": round(entry[0], 3) for factor, entry in estimates.items()
         }

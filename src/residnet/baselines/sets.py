@@ -86,9 +86,11 @@ class ChannelRoles(NamedTuple):
                 " `drive` or `steer`"
             )
         if not self.steers or (needs_drive and not self.drives):
-            wanted = "thrust and one for steering" if needs_drive else "steering"
+            required_roles = "thrust and one for steering" if needs_drive else "steering"
             instruction = "them to `drive` and `steer`" if needs_drive else "it to `steer`"
-            raise ConfigError(f"set '{subject}' needs a channel for {wanted}; add {instruction}")
+            raise ConfigError(
+                f"set '{subject}' needs a channel for {required_roles}; add {instruction}"
+            )
         return self
 
 

@@ -66,9 +66,9 @@ class StoredFile(BaseModel):
         content = read_json_value(path, folder)
         if not isinstance(content, cls._json_type):
             expected = "list" if cls._json_type is list else "object"
-            found = "list" if isinstance(content, list) else type(content).__name__
+            found_type = "list" if isinstance(content, list) else type(content).__name__
             raise UsageError(
-                f"{path}: expected a JSON {expected}, found {found}; restore the file or"
+                f"{path}: expected a JSON {expected}, found {found_type}; restore the file or"
                 " repeat the run"
             )
         try:

@@ -109,20 +109,26 @@ class DomainCheck(nn.Module):
             for channel, gain in zip(relation.channels, relation.gains, strict=True):
                 row[names.index(channel)] -= gain
         self.gains = nn.Buffer(gains)
-        self.offsets = nn.Buffer(_column(dtype, [one.offset for one in domain.relations]))
-        self.tolerances = nn.Buffer(_column(dtype, [one.tolerance for one in domain.relations]))
-        self.has_heading = any(one.heading is not None for one in domain.relations)
-        self.headings = nn.Buffer(_column(dtype, [one.heading or 0.0 for one in domain.relations]))
+        self.offsets = nn.Buffer(_column(dtype, [relation.offset for relation in domain.relations]))
+        self.tolerances = nn.Buffer(
+            _column(dtype, [relation.tolerance for relation in domain.relations])
+        )
+        self.has_heading = any(relation.heading is not None for relation in domain.relations)
+        self.headings = nn.Buffer(
+            _column(dtype, [relation.heading or 0.0 for relation in domain.relations])
+        )
         self.heading_gains = nn.Buffer(
-            _column(dtype, [one.heading_gain for one in domain.relations])
+            _column(dtype, [relation.heading_gain for relation in domain.relations])
         )
         self.min_cosines = nn.Buffer(
             _column(
                 dtype,
                 [
                     # no cosine is below -2, so that a relation without heading is always fulfilled
-                    -2.0 if one.heading is None else math.cos(min(one.max_heading, math.pi))
-                    for one in domain.relations
+                    -2.0
+                    if relation.heading is None
+                    else math.cos(min(relation.max_heading, math.pi))
+                    for relation in domain.relations
                 ],
             )
         )

@@ -155,8 +155,8 @@ def build_booklet(
             # a repeated trial does not judge its own prediction
             [
                 other_errors
-                for other, other_errors in zip(pages, errors, strict=True)
-                if other is not page and other.manoeuvre.kind == page.manoeuvre.kind
+                for other_page, other_errors in zip(pages, errors, strict=True)
+                if other_page is not page and other_page.manoeuvre.kind == page.manoeuvre.kind
             ],
             length,
             scale,

@@ -420,8 +420,8 @@ def _find_operating_point(
     else:
         from scipy.optimize import brentq
 
-        left = int(crossings[-1])
-        share = float(brentq(surge, shares[left], shares[left + 1]))
+        left_index = int(crossings[-1])
+        share = float(brentq(surge, shares[left_index], shares[left_index + 1]))
     return _OperatingPoint(speed, inputs_at(share), surge(share))
 
 
@@ -448,13 +448,13 @@ def _modulus_terms(baseline: ParametricBaseline) -> dict[int, tuple[_Variable, .
     """
     if not isinstance(baseline, RegressorBaseline):
         return {}
-    plain = {"v": _Variable("v", 1, _VELOCITY), "r": _Variable("r", 2, _YAW_RATE)}
+    linear_variables = {"v": _Variable("v", 1, _VELOCITY), "r": _Variable("r", 2, _YAW_RATE)}
     magnitudes = {"v": _Variable("|v|", 1, _VELOCITY), "r": _Variable("|r|", 2, _YAW_RATE)}
     columns: dict[int, tuple[_Variable, ...]] = {}
     for column, term in enumerate(baseline.library.terms):
         match = re.fullmatch(r"(?P<plain>[vr]) ?\|(?P<magnitude>[vr])\|", term)
         if match:
-            columns[column] = (plain[match["plain"]], magnitudes[match["magnitude"]])
+            columns[column] = (linear_variables[match["plain"]], magnitudes[match["magnitude"]])
     return columns
 
 

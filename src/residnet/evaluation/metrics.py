@@ -513,7 +513,11 @@ class ProtocolEvaluation:
         for candidate in self.candidates:
             band = candidate.bands.get(self.free_run.protocol)
             predictions = self.free_run.predictions[candidate.name]
-            distances = [one.distance[-1] for one in predictions if one.distance is not None]
+            distances = [
+                prediction.distance[-1]
+                for prediction in predictions
+                if prediction.distance is not None
+            ]
             if band is not None and len(distances) == len(predictions) > 0:
                 shares[candidate.name] = float(np.mean(np.array(distances) > band.largest_distance))
         return shares

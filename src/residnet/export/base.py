@@ -180,8 +180,8 @@ class Exportable(ABC):
         digest.update(json.dumps(settings, sort_keys=True, default=str).encode())
         # not from the TorchScript module: numbers in a trace have no names
         module = self.build_step_module(self.precisions[-1])
-        numbers = {**dict(module.named_parameters()), **dict(module.named_buffers())}
-        for name, value in sorted(numbers.items()):
+        tensors = {**dict(module.named_parameters()), **dict(module.named_buffers())}
+        for name, value in sorted(tensors.items()):
             digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
             digest.update(value.detach().cpu().contiguous().numpy().tobytes())
         model = digest.hexdigest()

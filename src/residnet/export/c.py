@@ -386,8 +386,8 @@ def measure_deepest_stack(stack: Mapping[str, int], bodies: Mapping[str, str]) -
     """Return the stack in bytes of the deepest call chain within the file."""
 
     def depth(name: str) -> int:
-        called = set(re.findall(r"\b(\w+)\(", bodies.get(name, ""))) & (stack.keys() - {name})
-        return stack[name] + max(map(depth, called), default=0)
+        called_names = set(re.findall(r"\b(\w+)\(", bodies.get(name, ""))) & (stack.keys() - {name})
+        return stack[name] + max(map(depth, called_names), default=0)
 
     return max(map(depth, stack), default=0)
 

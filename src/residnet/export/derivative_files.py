@@ -100,8 +100,8 @@ def _write_vessel(table: DerivativesFile, stem: str) -> str:
     inputs = _inputs_of(table)
     rudders = [name for name in inputs if is_rudder(name)]
     shafts = [name for name in inputs if name.removeprefix("cmd_") == "n"]
-    others = [name for name in inputs if name not in (*rudders, *shafts)]
-    if len(rudders) != 1 or others:
+    other_inputs = [name for name in inputs if name not in (*rudders, *shafts)]
+    if len(rudders) != 1 or other_inputs:
         raise UsageError(
             "derivatives as a vessel file: it has one rudder and the revolutions of one propeller;"
             f" this model has the inputs {', '.join(inputs) or 'none'}: choose --format mss"

@@ -185,8 +185,8 @@ class TracedForce(nn.Module):
         rows = get_size(nu, 2, 0)
         require_shape("nu_dot", nu_dot, [rows, self.dof])
         require_shape("nu", nu, [rows, self.dof])
-        found: tuple[Tensor, Tensor] = self.force(nu_dot.double(), nu.double())
-        return found
+        result: tuple[Tensor, Tensor] = self.force(nu_dot.double(), nu.double())
+        return result
 
 
 def build_feed_forward(

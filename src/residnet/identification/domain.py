@@ -318,7 +318,7 @@ def _varying_channels(
     samples: Sequence[np.ndarray], names: Sequence[str], signals: SignalsConfig
 ) -> tuple[list[str], list[int]]:
     """Return names and columns of the velocities and inputs that vary."""
-    joined = np.concatenate(samples)
+    pooled_samples = np.concatenate(samples)
     columns = [
         k
         for k, name in enumerate(names)
@@ -326,7 +326,7 @@ def _varying_channels(
         and name not in signals.dof.unmodelled_states
         # the depth of a vessel that dives has no range
         and name != "z"
-        and joined[:, k].std() > 1e-6 * max(float(np.abs(joined[:, k]).max()), 1e-9)
+        and pooled_samples[:, k].std() > 1e-6 * max(float(np.abs(pooled_samples[:, k]).max()), 1e-9)
     ]
     return [names[k] for k in columns], columns
 
@@ -343,8 +343,8 @@ def _held_out_scores(
 ) -> list[np.ndarray]:
     """Return the root of the inverse Christoffel function of each sample by the other logs."""
     scores = [np.zeros(0)] * len(features)
-    for others, held_out in folds:
-        factor = _factorize(moments[others].mean(axis=0))
+    for other_logs, held_out in folds:
+        factor = _factorize(moments[other_logs].mean(axis=0))
         for k in held_out.tolist():
             scores[k] = np.linalg.norm(features[k] @ factor.T, axis=1)
     return scores
@@ -388,9 +388,9 @@ def _held_out_range_excesses(
     lowest = np.array([row.min(axis=0) for row in rows])
     highest = np.array([row.max(axis=0) for row in rows])
     excesses = [np.zeros(0)] * len(rows)
-    for others, held_out in folds:
-        lower = lowest[others].min(axis=0)
-        upper = highest[others].max(axis=0)
+    for other_logs, held_out in folds:
+        lower = lowest[other_logs].min(axis=0)
+        upper = highest[other_logs].max(axis=0)
         for k in held_out.tolist():
             excess = np.maximum(lower - rows[k], rows[k] - upper) / scale
             excesses[k] = np.maximum(excess.max(axis=1), 0.0)
@@ -407,9 +407,9 @@ def _held_out_deviations(
     designs = [_relation_regressors(relation, sample, names) for sample in samples]
     responses = [sample[:, names.index(relation.input)] for sample in samples]
     deviations = [np.zeros(0)] * len(samples)
-    for others, held_out in folds:
-        response = np.concatenate([responses[k] for k in others])
-        design = np.concatenate([designs[k] for k in others])
+    for other_logs, held_out in folds:
+        response = np.concatenate([responses[k] for k in other_logs])
+        design = np.concatenate([designs[k] for k in other_logs])
         if relation.kind == "held":
             # the level is a median, so that a few other values do not move it
             coefficients = np.array([np.median(response)])
@@ -444,11 +444,13 @@ def _relation_regressors(
 
 def _weighted_quantile(scores: Sequence[np.ndarray], level: float) -> float:
     """Return the quantile of samples, each log with the same weight."""
-    joined = np.concatenate(scores)
+    pooled_scores = np.concatenate(scores)
     weights = np.concatenate([np.full(len(score), 1.0 / len(score)) for score in scores])
-    order = np.argsort(joined)
+    order = np.argsort(pooled_scores)
     cumulative = np.cumsum(weights[order]) / weights.sum()
-    return float(joined[order][min(int(np.searchsorted(cumulative, level)), len(joined) - 1)])
+    return float(
+        pooled_scores[order][min(int(np.searchsorted(cumulative, level)), len(pooled_scores) - 1)]
+    )
 
 
 def _relate_unexcited_input(
@@ -458,11 +460,11 @@ def _relate_unexcited_input(
 
     The tolerance is the smallest one that the resolution of the input justifies.
     """
-    joined = np.concatenate(samples)
-    values = joined[:, names.index(name)]
+    pooled_samples = np.concatenate(samples)
+    values = pooled_samples[:, names.index(name)]
     best: tuple[float, str, np.ndarray] = (0.0, "", np.zeros(2))
     for input_name in input_names:
-        other = joined[:, names.index(input_name)]
+        other = pooled_samples[:, names.index(input_name)]
         if min(other.std(), values.std()) <= 1e-9:
             continue
         correlation = float(np.corrcoef(values, other)[0, 1])
@@ -488,14 +490,14 @@ def _relate_collinear_inputs(
     samples: Sequence[np.ndarray], names: Sequence[str], input_names: Sequence[str]
 ) -> list[InputRelation]:
     """Return the relations of inputs that another input before them explains almost completely."""
-    joined = np.concatenate(samples)
+    pooled_samples = np.concatenate(samples)
     relations = []
     for k, name in enumerate(input_names):
         relation = _relate_unexcited_input(name, samples, names, input_names[:k])
         if relation.kind != "proportional":
             continue
-        other = joined[:, names.index(relation.channels[0])]
-        correlation = float(np.corrcoef(joined[:, names.index(name)], other)[0, 1])
+        other = pooled_samples[:, names.index(relation.channels[0])]
+        correlation = float(np.corrcoef(pooled_samples[:, names.index(name)], other)[0, 1])
         if correlation**2 > 1.0 - 1.0 / MAX_VARIANCE_INFLATION:
             relations.append(relation)
     return relations
@@ -513,8 +515,8 @@ def _fit_control_law(
     if feedback.source != "the heading" or "psi" not in names:
         return None
     heading_column = names.index("psi")
-    joined = np.concatenate(samples)
-    reference = float(np.angle(np.exp(1j * joined[:, heading_column]).mean()))
+    pooled_samples = np.concatenate(samples)
+    reference = float(np.angle(np.exp(1j * pooled_samples[:, heading_column]).mean()))
     velocity_names = tuple(name for name in ("v", "r") if name in names)
     law = InputRelation(
         input=feedback.name,
@@ -530,7 +532,7 @@ def _fit_control_law(
     responses = [sample[:, names.index(law.input)] for sample in samples]
     if len(samples) < 2 or cross_validated_r2(designs, responses) < _MIN_LAW_R2:
         return None
-    design = np.column_stack((np.ones(len(joined)), np.concatenate(designs)))
+    design = np.column_stack((np.ones(len(pooled_samples)), np.concatenate(designs)))
     coefficients = np.linalg.lstsq(design, np.concatenate(responses), rcond=None)[0]
     return law.model_copy(
         update={

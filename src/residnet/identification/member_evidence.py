@@ -107,9 +107,9 @@ def select_members(
             mean_rmse = compute_rmse(np.asarray(np.mean([errors[m] for m in used], axis=0)))
             candidates = []
             for member in used:
-                others = [m for m in used if m != member]
+                other_members = [m for m in used if m != member]
                 rmse_without = compute_rmse(
-                    np.asarray(np.mean([errors[m] for m in others], axis=0))
+                    np.asarray(np.mean([errors[m] for m in other_members], axis=0))
                 )
                 difference = (mean_rmse - rmse_without)[:, velocity]
                 candidates.append((compute_p_value(difference, blocks), member))
@@ -138,8 +138,8 @@ def group_windows(windows: Sequence[Window]) -> np.ndarray:
         (window.log_index, (window.start - first_starts[window.log_index]) // max(lengths))
         for window in windows
     ]
-    numbers = {key: number for number, key in enumerate(dict.fromkeys(keys))}
-    return np.array([numbers[key] for key in keys])
+    number_of_key = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    return np.array([number_of_key[key] for key in keys])
 
 
 def compute_p_value(differences: np.ndarray, blocks: np.ndarray) -> float:

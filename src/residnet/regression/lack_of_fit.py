@@ -113,12 +113,14 @@ def estimate_lack_of_fit(
             best = int(np.argmax(gains))
             if gains[best] < _MIN_SHARE * initial_energy:
                 break
-            chosen = indices.pop(best)
-            shares[", ".join(families[chosen])] = round(gains[best] / initial_energy, 3)
+            chosen_index = indices.pop(best)
+            shares[", ".join(families[chosen_index])] = round(gains[best] / initial_energy, 3)
             # the next family must explain what this family does not
-            residual = _project_out(remaining[chosen], residual)
+            residual = _project_out(remaining[chosen_index], residual)
             remaining = [
-                _orthonormal_probes(remaining[chosen], columns) if i != chosen else columns
+                _orthonormal_probes(remaining[chosen_index], columns)
+                if i != chosen_index
+                else columns
                 for i, columns in enumerate(remaining)
             ]
     return shares

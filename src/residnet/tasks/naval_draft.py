@@ -66,15 +66,15 @@ class NavalParticulars:
         Raises:
             UsageError: if a value has a wrong unit or is not positive, or the length is missing.
         """
-        given = {name: text for name, text in options.items() if text is not None}
+        given_options = {name: text for name, text in options.items() if text is not None}
         if length is None:
-            if scale is not None or given:
-                name = "scale" if scale is not None else next(iter(given))
+            if scale is not None or given_options:
+                name = "scale" if scale is not None else next(iter(given_options))
                 raise UsageError(f"--{name}: needs --length too, the length in the logs")
             return None
         units = {"length": "m", "beam": "m", "draught": "m", "mass": "kg"}
         values = {}
-        for name, text in {"length": length, **given}.items():
+        for name, text in {"length": length, **given_options}.items():
             try:
                 values[name] = Quantity(units[name]).convert(_to_number(text))
             except ValueError as error:
@@ -312,5 +312,5 @@ def choose_held_out_logs(logs: Mapping[Path, Log]) -> dict[str, list[Path]] | No
         return None
     by_activity = sorted(logs, key=lambda path: float(np.nanstd(logs[path]["r"])))
     test = next((path for path in by_activity if logs[path].manoeuvre == "zigzag"), by_activity[0])
-    others = [path for path in by_activity if path != test]
-    return {"train": sorted(others[1:]), "validation": [others[0]], "test": [test]}
+    other_paths = [path for path in by_activity if path != test]
+    return {"train": sorted(other_paths[1:]), "validation": [other_paths[0]], "test": [test]}

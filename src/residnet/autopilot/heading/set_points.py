@@ -97,14 +97,14 @@ def fit_with_set_points(
     n_folds = min(len(records), _MAX_FOLDS)
     estimates = []
     for fold in range(n_folds):
-        others = [k for k in range(len(records)) if k % n_folds != fold]
-        other = _fit_explained_parts(
-            [records[k] for k in others],
-            [designs[k] for k in others],
+        training_records = [k for k in range(len(records)) if k % n_folds != fold]
+        fold_solution = _fit_explained_parts(
+            [records[k] for k in training_records],
+            [designs[k] for k in training_records],
             max_delay,
             commands=commands,
         )
-        estimates.append((other.gain, other.time, other.delay))
+        estimates.append((fold_solution.gain, fold_solution.time, fold_solution.delay))
     # delete-group jackknife: the residuals of the second stage hold no disturbances any more
     variances = (n_folds - 1) * np.var(np.array(estimates), axis=0)
     gain_error, time_error, delay_error = np.sqrt(variances).tolist()

@@ -148,8 +148,8 @@ class VariedPlant(Dynamics):
         angle = x[:, self.rudder : self.rudder + 1] * rho[:, :1] + rho[:, 1:2]
         effective_state = self._with_rudder_angle(x, angle)
         if not self.has_moving_rudder:
-            held: Tensor = self.plant.derivative_prepared(effective_state, p) * slowing
-            return held
+            slowed_derivative: Tensor = self.plant.derivative_prepared(effective_state, p) * slowing
+            return slowed_derivative
         hull = self.plant.derivative(effective_state, p) * slowing
         # the steering gear follows its actual angle, not the effective one
         actuator = self.plant.derivative(x, p)

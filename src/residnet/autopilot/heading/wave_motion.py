@@ -66,8 +66,8 @@ def estimate_wave_motion(residuals: Sequence[np.ndarray], dt: float) -> WaveMoti
             frequency <= _BAND[1] * peak_frequency
         )
         floor = float(np.median(density[frequency > _BAND[1] * peak_frequency]))
-        below = float(np.interp(0.5 * peak_frequency, frequency, density))
-        if density[peak] < _MIN_PEAK_RATIO * max(floor, below):
+        density_below_peak = float(np.interp(0.5 * peak_frequency, frequency, density))
+        if density[peak] < _MIN_PEAK_RATIO * max(floor, density_below_peak):
             continue
         # the heading is the integral of the yaw rate
         angle_density = (density[is_wave] - floor).clip(min=0.0) / (

@@ -275,7 +275,7 @@ def _flights_figure(series: pd.DataFrame, kinds: Mapping[str, str], test: StepTe
     value = axis_labels.columns[0]
     band_limits = axis_labels.scale * (change + settling_band * np.array([-1.0, 1.0]))
     panels = []
-    curves: list[dict[str, Curve]] = []
+    panel_curves: list[dict[str, Curve]] = []
     for name, kind in kinds.items():
         pivoted: Any = axis_labels.scale * series[series["controller"] == name].pivot_table(
             index="t", columns=["effect", "time"], values=value
@@ -283,7 +283,7 @@ def _flights_figure(series: pd.DataFrame, kinds: Mapping[str, str], test: StepTe
         values = pivoted.to_numpy()
         style_name = "learned" if kind in _LEARNED_KINDS else "classical"
         panels.append(Panel(title=name, height=90))
-        curves.append(
+        panel_curves.append(
             {
                 "corners": band_outline(pivoted.index, values.min(axis=1), values.max(axis=1)),
                 "settled": (np.zeros(2), band_limits),
@@ -291,7 +291,8 @@ def _flights_figure(series: pd.DataFrame, kinds: Mapping[str, str], test: StepTe
             }
         )
     upper_limit = 1.05 * max(
-        float(np.nanmax(np.abs(curve["corners"][1]), initial=band_limits[1])) for curve in curves
+        float(np.nanmax(np.abs(curve["corners"][1]), initial=band_limits[1]))
+        for curve in panel_curves
     )
     upper_limit = min(upper_limit, 2.0 * float(band_limits[1]))
     panels = [
@@ -313,7 +314,7 @@ def _flights_figure(series: pd.DataFrame, kinds: Mapping[str, str], test: StepTe
             "settled": replace(ZERO_LINE_STYLE, label="band", dash="dotted"),
         },
         panels,
-        [Case("", curves, has_static_image=False)],
+        [Case("", panel_curves, has_static_image=False)],
         columns=2,
         is_drawing=True,
     )

@@ -149,7 +149,7 @@ def _sea_figure(
     if not is_reduction:
         points = [HEADING_ONLY, *points]
     panels = []
-    curves: list[dict[str, Curve]] = []
+    curves_by_panel: list[dict[str, Curve]] = []
     for state in states:
         rows = [row for row in metrics.rows if row.sea_state == state]
         directions = [row.direction for row in rows if row.model == comparison.policy]
@@ -185,7 +185,7 @@ def _sea_figure(
                 y_limits=_reduction_limits(metrics) if is_reduction else (),
             )
         )
-        curves.append(panel_curves)
+        curves_by_panel.append(panel_curves)
     panels[-1] = Panel(
         **(vars(panels[-1]) | {"x_label": "waves travel to [deg]: 0 following, 180 head"})
     )
@@ -201,7 +201,7 @@ def _sea_figure(
         },
         "zero": ZERO_LINE_STYLE,
     }
-    return Figure(name, title, caption, styles, panels, [Case("all", curves)])
+    return Figure(name, title, caption, styles, panels, [Case("all", curves_by_panel)])
 
 
 def _reduction_limits(metrics: RollMetricsFile) -> tuple[float, float]:

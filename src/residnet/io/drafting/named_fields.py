@@ -203,8 +203,8 @@ def _convert_entries(
         topic, field = sources[entry.pop("column")]
         # a command of another topic applies until the next one
         is_motion = name in (*MOTION_CHANNELS, *SIX_DOF_LAYOUT.state_names)
-        hold = {} if topic == base_topic or is_motion else {"hold": True}
-        settings["channels"][name] = {"topic": topic, "field": field, **entry, **hold}
+        hold_setting = {} if topic == base_topic or is_motion else {"hold": True}
+        settings["channels"][name] = {"topic": topic, "field": field, **entry, **hold_setting}
     return settings
 
 

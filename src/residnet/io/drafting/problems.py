@@ -51,8 +51,8 @@ def name_files_in_errors(paths: Sequence[Path]) -> Iterator[None]:
         if any(str(path) in message for path in paths):
             raise
         labels = label_files(paths)
-        others = describe_other_files_with_problem([labels[path] for path in paths[1:]])
-        raise DataError(f"{paths[0]}: {message}{others}") from None
+        other_files_text = describe_other_files_with_problem([labels[path] for path in paths[1:]])
+        raise DataError(f"{paths[0]}: {message}{other_files_text}") from None
 
 
 def without_channel_map(error: ResidnetError) -> ResidnetError:
@@ -119,9 +119,9 @@ def group_problems(messages: Mapping[Path, str], *, has_full_paths: bool = True)
     labels = label_files(messages)
     for paths in paths_by_problem.values():
         first_message = strip_file_name(messages, messages[paths[0]])
-        others = describe_other_files_with_problem([labels[path] for path in paths[1:]])
+        other_files_text = describe_other_files_with_problem([labels[path] for path in paths[1:]])
         file = paths[0] if has_full_paths else labels[paths[0]]
-        lines.append(f"{file}: {first_message}{others}")
+        lines.append(f"{file}: {first_message}{other_files_text}")
     return lines
 
 

@@ -109,9 +109,11 @@ def draft_recordings(
     ):
         if name in known_channels or name in channels:
             continue
-        if (known := match_known_command(aligned[0], topic, field)) is not None:
-            settings_of_format = known[1]
-            scale_text = f"{settings_of_format.get('scale', 1.0):g} " * ("scale" in known[1])
+        if (command_of_format := match_known_command(aligned[0], topic, field)) is not None:
+            settings_of_format = command_of_format[1]
+            scale_text = f"{settings_of_format.get('scale', 1.0):g} " * (
+                "scale" in command_of_format[1]
+            )
             text = f"the format defines {field} in {scale_text}{settings_of_format['unit']}"
             draft_notes.add_note((*CHANNELS_KEY, name), text)
             channels[name] = {"topic": topic, "field": field, **settings_of_format, "hold": True}

@@ -294,8 +294,8 @@ def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]
         n for n, table in tables.items() if len(table.select_dtypes("number").columns) > 1
     ]
     if are_parts_of_recording([tables[name] for name in numeric_sheets]):
-        joined = join_excel_sheets(path, {name: tables[name] for name in numeric_sheets})
-        return joined, {"kind": "excel", "sheet": tuple(numeric_sheets)}
+        joined_sheets = join_excel_sheets(path, {name: tables[name] for name in numeric_sheets})
+        return joined_sheets, {"kind": "excel", "sheet": tuple(numeric_sheets)}
     name = next(iter([*numeric_sheets, *names]))
     table = tables[name]
     groups = (

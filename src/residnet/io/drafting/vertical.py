@@ -76,8 +76,8 @@ def refuse_vertical_y(
         if not {names["x"], names["y"], z} <= table.keys():
             return
         x, y, depth = (table[name] for name in (names["x"], names["y"], z))
-        spread = min(np.nanstd(x), np.nanstd(depth))
-        if not np.nanstd(y) < _MAX_FLAT_SHARE * spread:
+        smallest_std = min(np.nanstd(x), np.nanstd(depth))
+        if not np.nanstd(y) < _MAX_FLAT_SHARE * smallest_std:
             return
         span = max(1, x.size // _N_PATH_SPANS)
         steps = np.diff(x[::span] + 1j * depth[::span])

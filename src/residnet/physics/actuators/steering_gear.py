@@ -125,11 +125,13 @@ def identify_steering_gear(logs: Sequence[Log], command: str, angle: str) -> Ste
         FitError: if the rudder hardly moves in these logs.
     """
     recordings = _collect_recordings(logs, command, angle)
-    moved = max((float(np.ptp(recording.command)) for recording in recordings), default=0.0)
-    if moved < _MIN_TRAVEL:
+    largest_motion = max(
+        (float(np.ptp(recording.command)) for recording in recordings), default=0.0
+    )
+    if largest_motion < _MIN_TRAVEL:
         raise FitError(
-            f"steering gear: {command} changes by {math.degrees(moved):.2g} deg at most; a gear"
-            " needs logs whose rudder moves by 5 deg"
+            f"steering gear: {command} changes by {math.degrees(largest_motion):.2g} deg at most; a"
+            " gear needs logs whose rudder moves by 5 deg"
         )
     # resolution is the time step: a faster lag or delay cannot be identified
     dt = min(recording.dt for recording in recordings)
@@ -180,9 +182,11 @@ def _collect_recordings(logs: Sequence[Log], command: str, angle: str) -> list[_
         dt = float(np.median(np.diff(t)))
         grid = np.arange(t[0], t[-1], dt)[:_MAX_SAMPLES]
         # commands are steps: the last value holds
-        held = np.searchsorted(t, grid + 1e-9, side="right") - 1
+        last_sample = np.searchsorted(t, grid + 1e-9, side="right") - 1
         recordings.append(
-            _Recording(dt, log[command][is_finite][held], np.interp(grid, t, log[angle][is_finite]))
+            _Recording(
+                dt, log[command][is_finite][last_sample], np.interp(grid, t, log[angle][is_finite])
+            )
         )
         n_samples += len(grid)
     return recordings
@@ -258,8 +262,8 @@ def estimate_rudder_rate(logs: Sequence[Log], angle: str) -> SteeringGear:
         )
     rate = float(np.median(slopes))
     # standard error of a median, from the median absolute deviation
-    spread = 1.4826 * float(np.median(np.abs(np.array(slopes) - rate)))
-    deviation = _NORMAL_95 * 1.2533 * spread / math.sqrt(len(slopes))
+    slope_std = 1.4826 * float(np.median(np.abs(np.array(slopes) - rate)))
+    deviation = _NORMAL_95 * 1.2533 * slope_std / math.sqrt(len(slopes))
     interval = (max(rate - deviation, 0.0), rate + deviation)
     return SteeringGear(GearParameter(rate, interval), n_movements=len(slopes))
 

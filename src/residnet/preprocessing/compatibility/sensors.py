@@ -309,8 +309,8 @@ def differentiate_ground_velocity(node: NodeStates) -> dict[int, tuple[np.ndarra
     """Return the derivatives of the velocity over ground, north and east, by heading, u and v."""
     derivatives = {}
     for state in (PSI, U, V):
-        moved = {key: node[key] for key in (PSI, U, V)}
-        moved[state] = moved[state] + 1j * COMPLEX_STEP
-        north, east = compute_ground_velocity(moved, 0.0, 0.0)
+        perturbed_states = {key: node[key] for key in (PSI, U, V)}
+        perturbed_states[state] = perturbed_states[state] + 1j * COMPLEX_STEP
+        north, east = compute_ground_velocity(perturbed_states, 0.0, 0.0)
         derivatives[state] = (np.imag(north) / COMPLEX_STEP, np.imag(east) / COMPLEX_STEP)
     return derivatives

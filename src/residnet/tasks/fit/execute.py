@@ -225,12 +225,15 @@ def export_model(config: FitConfig, request: ExportRequest) -> Path:
     if name in aliases and not get_exporter(request.file_format).supports(spec):
         model_name, (spec, model) = find_supported_model(request, model_name)
     rows = [row for row in metrics.rows if row.model == model_name and row.manoeuvre == "all"]
-    found = collect_evidence(RunFiles(run.path), model_name)
+    evidence = collect_evidence(RunFiles(run.path), model_name)
     # a model without free runs on the reported split has no verdict
-    sentences = write_verdict(found) if model_name in found.rows_by_model else []
-    model_verdict = (rate_model(found), sentences)
+    sentences = write_verdict(evidence) if model_name in evidence.rows_by_model else []
+    model_verdict = (rate_model(evidence), sentences)
     file = request.write(
-        ExportedVessel(spec, model, rows), list_model_objections(found), model_name, model_verdict
+        ExportedVessel(spec, model, rows),
+        list_model_objections(evidence),
+        model_name,
+        model_verdict,
     )
     is_ensemble = model_name == metrics.selected_ensemble and model_name != metrics.selected
     if is_ensemble and get_exporter(request.file_format).is_for_microcontrollers:
