@@ -19,7 +19,7 @@ from residnet.report.figure_files import pack_columns
 
 if TYPE_CHECKING:
     from bokeh.models import ColumnDataSource, DataRange1d, Range1d
-    from bokeh.models.renderers import GlyphRenderer
+    from bokeh.models.renderers.renderer import DataRenderer
     from bokeh.plotting import figure as Canvas
 
 _FONT = "12px"
@@ -124,18 +124,19 @@ def _build_canvas(
     )
     # the page scrolls under a finger; dragging zooms only after a button was pressed
     canvas.stylesheets = [":host .bk-events { touch-action: pan-y pinch-zoom; }"]
-    renderers = [
-        _build_renderer(name, figure.styles[name], source) for name in figure.curve_names(number)
-    ]
-    canvas.renderers.extend(renderers)
+    renderers = {
+        name: _build_renderer(name, figure.styles[name], source)
+        for name in figure.curve_names(number)
+    }
+    canvas.renderers.extend(renderers.values())
     # with named positions on an axis the name of a point identifies it
     shows_values = panel.kind == "curves" and not panel.y_names
     tooltips: Any = [("$name", "@$name{0.000 a}")] if shows_values else [("", "$name")]
     hover = models.HoverTool(
         renderers=[
             renderer
-            for renderer in renderers
-            if figure.styles[renderer.name].kind in ("line", "points")
+            for name, renderer in renderers.items()
+            if figure.styles[name].kind in ("line", "points")
         ],
         mode="vline" if shows_values else "mouse",
         tooltips=tooltips,
@@ -175,7 +176,7 @@ def _build_canvas(
     return canvas
 
 
-def _build_renderer(name: str, style: GlyphStyle, source: ColumnDataSource) -> GlyphRenderer:
+def _build_renderer(name: str, style: GlyphStyle, source: ColumnDataSource) -> DataRenderer:
     """Return the Bokeh renderer of a named curve; the caller adds it to a panel."""
     from bokeh import models
     from bokeh.models.renderers import GlyphRenderer
