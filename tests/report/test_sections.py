@@ -75,11 +75,12 @@ def made_autopilot(run: Path) -> Path:
         swing = {f"{name}_rms": spread(2.0 * DEG) for name in ("heading", "rudder", "heel")}
         rows.append({**base, "protocol": "sea", **swing})
     metrics = {"schema": "residnet.metrics/1", "run": "made", "channels": {}, "floor": "net"}
-    write_json(run / "metrics.json", {**metrics, "flown": {}, "rows": rows})
+    write_json(run / "metrics.json", {**metrics, "flown": {"test": test}, "rows": rows})
     turning = {"gain": 0.5, "time": 1.0, "speed": 2.0, "righting": 0.0}
     controllers = {"schema": "residnet.controllers/1", "turning": turning}
     write_json(
-        run / "controllers.json", {**controllers, "controllers": {"pd": {"config": {"kp": 1.0}}}}
+        run / "controllers.json",
+        {**controllers, "controllers": {"pd": {"config": {"kind": "pd", "kp": 1.0}}}},
     )
     t = np.arange(0.0, 20.0, 0.5)
     flights = []

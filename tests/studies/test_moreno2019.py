@@ -16,7 +16,7 @@ from residnet.report.blocks import Cell, Table, Text
 from residnet.report.figure import Figure
 from residnet.report.run_reader import RunFiles
 from residnet.studies import moreno2019
-from residnet.studies.moreno2019 import grid_errors, grid_figures
+from residnet.studies.moreno2019 import GridNotes, grid_errors, grid_figures
 
 MODELS = (
     *(
@@ -101,7 +101,9 @@ def test_the_curves_are_what_the_search_tried() -> None:
     none = {"penalty": [], "validation": 1.0}
     choice = [entry | {"diverged": 0} for entry in (*tried, own_width, none)]
     errors = np.arange(1.0, 19.0).reshape(2, 3, 3)
-    notes = {"free_run_choice": choice, "cross_validated_error": errors.tolist()}
+    notes = GridNotes.model_validate(
+        {"free_run_choice": choice, "cross_validated_error": errors.tolist()}
+    )
     grid, one_step = grid_errors(notes)
     widths = {(one["penalty"][0], one["sigma"][0]): one["validation"] for one in tried}
     assert grid == widths

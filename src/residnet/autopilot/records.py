@@ -38,7 +38,7 @@ CardSchema = Literal["residnet.policy_card/1", "residnet.course_card/1"]
 """Formats of the model card of a controller."""
 
 
-class ControlMetricsFile(FileRecord):
+class ControlMetrics(Record):
     """Common keys of the metrics.json of tasks that compare controllers.
 
     Attributes:
@@ -147,7 +147,7 @@ class SimulatedSettings(Record):
     conditions: EvaluationConditions | None = None
 
 
-class AutopilotMetricsFile(ControlMetricsFile):
+class AutopilotMetricsFile(ControlMetrics, FileRecord):
     """metrics.json of the task `autopilot`: metrics of all controllers in all tests.
 
     Attributes:
@@ -356,7 +356,7 @@ class BuoyFeasibility(Record):
     possible: bool
 
 
-class CourseMetricsFile(ControlMetricsFile):
+class CourseMetricsFile(ControlMetrics, FileRecord):
     """metrics.json of the task `course`: metrics of all controllers on all courses.
 
     Attributes:
@@ -492,7 +492,7 @@ class RollComparison(Record):
     n_larger_heading: int
 
 
-class RollMetricsFile(ControlMetricsFile):
+class RollMetricsFile(ControlMetrics, FileRecord):
     """metrics.json of the task `roll`: metrics of all controllers in all seas.
 
     Attributes:

@@ -32,7 +32,7 @@ from residnet.baselines.mmg import MMGBaseline
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import UsageError
 from residnet.core.names import FORCE_CHANNELS
-from residnet.core.records import FileRecord, OpenRecord, Record, StoredFile
+from residnet.core.records import FileRecord, OpenRecord, Record
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.evaluation.records import Interval
@@ -782,7 +782,7 @@ class StandardErrorRow(OpenRecord):
     standard_error: float | None
 
 
-class CovarianceNotes(OpenRecord, StoredFile):
+class CovarianceNotes(OpenRecord):
     """The uncertainty of the parameters of a baseline in fit.json.
 
     Attributes:

@@ -53,8 +53,8 @@ def derive_run(
             raise UsageError(
                 f"model {name}: an ensemble has no derivatives; choose one of its members (--model)"
             )
-        notes = CovarianceNotes.read_optional(run.path, f"models/{name}/fit.json")
-        covariance, has_correlations = read_covariance(notes or CovarianceNotes(), module.baseline)
+        notes = CovarianceNotes.model_validate(run.read_fit_notes(name))
+        covariance, has_correlations = read_covariance(notes, module.baseline)
     return compute_derivatives(
         spec,
         module,
