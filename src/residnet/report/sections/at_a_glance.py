@@ -9,7 +9,7 @@ from typing import NamedTuple
 from residnet.core.format import format_count, format_interval, format_number, join_list
 from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.run_records import ExportsFile
-from residnet.evaluation.records import HorizonRow
+from residnet.evaluation.limits_records import HorizonRow
 from residnet.evaluation.verdict import (
     DO_NOT_USE,
     GOOD_LEVEL,
