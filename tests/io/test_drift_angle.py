@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.io import savemat
 
 import residnet
 from residnet.core.log import Log
@@ -152,7 +154,7 @@ def test_an_angle_that_is_no_drift_angle_is_left_out(tmp_path: Path) -> None:
 
 def test_measured_velocities_take_precedence(tmp_path: Path) -> None:
     columns = ["t", "u [m/s]", "v [m/s]", "beta [deg]", "V [m/s]", "rudder"]
-    names = match_channels(columns, DraftNotes(), with_drift_angle=True)
+    names = match_channels(columns, DraftNotes())
     assert names["u"] == "u [m/s]"
     assert names["v"] == "v [m/s]"
     assert "speed" not in names
@@ -187,9 +189,40 @@ def test_a_mapped_velocity_is_not_replaced(tmp_path: Path) -> None:
     assert log.units["v"] == "m/s"
 
 
+@pytest.mark.parametrize("kind", ["mat", "h5", "parquet", "json"])
+@pytest.mark.parametrize("seed", [31, 32])
+def test_recordings_have_the_same_channels_as_tables(kind: str, seed: int, tmp_path: Path) -> None:
+    trip = TRUTH[seed % 2]
+    random = np.random.default_rng(seed)
+    is_reversed = bool(random.integers(2))
+    angle = np.arctan2(-trip.v, trip.u) * (-1.0 if is_reversed else 1.0)
+    table = {"t": trip.t, "x": trip.x, "y": trip.y, "heading": np.degrees(trip.psi)}
+    table |= {str(random.choice(SPEED_NAMES[:3])): np.hypot(trip.u, trip.v)}
+    table |= {str(random.choice(DRIFT_NAMES[:3])): np.degrees(angle)}
+    table |= {"yaw_rate": np.degrees(trip.r), "rudder": np.degrees(trip.delta)}
+    file = tmp_path / f"run.{kind}"
+    arrays = {name: np.asarray(values) for name, values in table.items()}
+    if kind == "mat":
+        savemat(file, {"log": arrays})
+    elif kind == "h5":
+        with h5py.File(file, "w") as written:
+            for name, values in arrays.items():
+                written.create_dataset(name.replace("\u03b2", "beta"), data=values)
+    elif kind == "parquet":
+        pd.DataFrame(arrays).to_parquet(file)
+    else:
+        pd.DataFrame(arrays).to_json(file, orient="records")
+    (log,) = residnet.read_logs(file)
+    assert isinstance(log, Log)
+    assert not {"speed", "drift_angle"} & log.channels.keys()
+    for name in ("u", "v"):
+        expected = np.interp(log.t - log.t[0], trip.t - trip.t[0], trip[name])
+        assert np.nanmax(np.abs(log[name] - expected)) < 0.01, name
+
+
 def test_a_drift_angle_alone_is_noted() -> None:
     notes = DraftNotes()
-    names = match_channels(["t", "r", "beta [deg]", "rudder"], notes, with_drift_angle=True)
+    names = match_channels(["t", "r", "beta [deg]", "rudder"], notes)
     assert "drift_angle" not in names
     assert (
         CHANNELS_KEY,

@@ -136,7 +136,8 @@ def read_logs(
             else _read_with_reader(settings, files)
         )
     log_names = assign_log_names(logs)
-    return [logs[file].replace(name=log_names[file]) for file in files if file in logs]
+    ordered = sorted(logs, key=lambda file: files.index(file) if file in files else len(files))
+    return [logs[file].replace(name=log_names[file]) for file in ordered]
 
 
 def _read_with_reader(reader_settings: Any, files: Sequence[Path]) -> dict[Path, Log]:

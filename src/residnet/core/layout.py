@@ -167,8 +167,8 @@ class DegreesOfFreedom:
 
         A velocity is active if it is measured, or if it follows from other channels: r from the
         heading; u, v and r from position and heading; p from a varying roll angle. Heading, depth,
-        roll and pitch with u and v or a position give all six, if the depth follows from the
-        motion.
+        roll and a varying pitch with u and v or a position give all six, if the depth follows from
+        the motion.
 
         Args:
             channels: name -> values [T].
@@ -181,8 +181,9 @@ class DegreesOfFreedom:
         has_planar_motion = recorded >= {"u", "v"} or recorded >= {"x", "y"}
         if (
             recorded >= {"z", "psi"}
-            # a vessel that dives by heave alone does not pitch, and needs a measured w
-            and ("theta" in recorded or ("theta" in channels and "w" in channels))
+            # noise of an angle would excite equations of roll and pitch that the logs do not
+            # determine: a vessel that dives by heave alone is planar
+            and "theta" in recorded
             and "phi" in channels
             and has_planar_motion
             and _depth_follows_motion(channels)

@@ -60,6 +60,8 @@ MANOEUVRE_PATTERNS: dict[str, re.Pattern[str]] = {
     for kind, text in _VOCABULARY["manoeuvre_names"].items()
 }
 """Kind of manoeuvre -> pattern of the normalised names of its files."""
+TEST_NAME_PATTERN = re.compile(re.sub(r"\|\s+", "|", _VOCABULARY["test_names"].strip()))
+"""Words for a test in normalised titles, and names of columns with its number or name."""
 _DRIFT_ANGLE_PATTERN = re.compile(
     re.sub(r"\|\s+", "|", _VOCABULARY["drift_angle_names"].strip()), re.IGNORECASE
 )
@@ -440,6 +442,7 @@ _STATE_RULES = (
     _ChannelRule("r", "heading|turn rate"),
     _ChannelRule("r", "", "", "^r( mid)?$"),
     _ChannelRule("r", "angular", "", rf" [zr](?: {_RATE_UNITS})?$"),
+    _ChannelRule("r", "", "", rf"^(?:w|omega) ?z(?: {_RATE_UNITS})?$"),
     # an angular rate without an axis is that of the heading
     _ChannelRule("r", "angular rate", "x y pitch"),
     *_AXIS_RULES,
@@ -455,6 +458,8 @@ _STATE_RULES = (
             # of the centre of gravity, midship or the model, as model basins write it
             (axis, r"^[xy](?: ?0)?(?: ?(?:cg|cog)| (?:ms|midship|model))?(?: m)?$"),
             (axis, rf"^{_POSITION_SOURCES} [xy](?: m)?$"),
+            # symbol of a position vector, the sibling of v_x and w_x
+            (axis, r"^p [xy](?: m)?$"),
         )
     ),
     _ChannelRule("v", "sway", _EARTH_AXIS_CONCEPTS),

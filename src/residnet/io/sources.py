@@ -52,7 +52,10 @@ def read_split_logs(config: MeasuredLogs | SimulatedTrials) -> LogsBySplit:
             logs_by_split[split].append(log)
         return logs_by_split
     reader = config.reader.build()
-    paths = config.split.list_files()
+    listed_paths = config.split.list_files()
+    # a reader of one sheet reads a file once, whatever tests the other sheets have
+    path_to_read = {path: next(iter(reader.select_logs([path])), path) for path in listed_paths}
+    paths = list(dict.fromkeys(path_to_read.values()))
     names_by_path = assign_log_names(paths)
     logs_by_path: dict[Path, Log] = {}
     n_samples = 0
@@ -72,7 +75,8 @@ def read_split_logs(config: MeasuredLogs | SimulatedTrials) -> LogsBySplit:
             split: [
                 part_log
                 for log_part in log_parts
-                if (part_log := log_part.extract(logs_by_path[log_part.path])) is not None
+                if (part_log := log_part.extract(logs_by_path[path_to_read[log_part.path]]))
+                is not None
             ]
             for split, log_parts in config.split.resolve_parts().items()
         }
@@ -92,8 +96,11 @@ def list_input_files(config: MeasuredLogs | SimulatedTrials) -> list[Path]:
     if isinstance(config, SimulatedTrials):
         return []
     reader = config.reader.build()
-    return [
-        input_file
-        for path in dict.fromkeys(config.split.list_files())
-        for input_file in reader.list_member_files(path)
-    ]
+    # several tests have one file
+    return list(
+        dict.fromkeys(
+            input_file
+            for path in config.split.list_files()
+            for input_file in reader.list_member_files(path)
+        )
+    )

@@ -20,7 +20,7 @@ from residnet.core.config import Config, ConfigPath, Seconds, load_mapping, vali
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.core.names import STATE_NAMES, suggest_name
-from residnet.io.readers.base import list_files
+from residnet.io.readers.base import list_files, locate_file
 from residnet.preprocessing.motion import remove_pauses
 
 if TYPE_CHECKING:
@@ -612,13 +612,15 @@ def _make_log_name(
         base_name = path.stem
     else:
         base_name = path.name.replace(".", "_")
-    return "_".join(
-        [*(parent.name for parent in reversed(resolved_path.parents[:n_parent_names])), base_name]
-    )
+    parents = list(reversed(resolved_path.parents[:n_parent_names]))
+    parent_names = [parent.stem if parent.is_file() else parent.name for parent in parents]
+    return "_".join([*parent_names, base_name])
 
 
 def match_patterns(root: Path, patterns: Sequence[str], error_prefix: str) -> list[Path]:
     """Return the logs that match patterns, without duplicates, including all logs in folders.
+
+    A file with several tests is a log for each test.
 
     Args:
         root: folder of relative patterns.
@@ -628,16 +630,19 @@ def match_patterns(root: Path, patterns: Sequence[str], error_prefix: str) -> li
     Raises:
         ConfigError: if a pattern matches no log.
     """
+    from residnet.io.readers.several_tests import expand_files
+
     log_paths: dict[Path, None] = {}
     for pattern in patterns:
         # an existing path may contain characters with a meaning in patterns
         path = root / pattern
-        matched_paths = [path] if path.exists() else _glob(root, pattern, error_prefix)
-        matched_logs = [
+        is_log = path.exists() or locate_file(path) != path
+        matched_paths = [path] if is_log else _glob(root, pattern, error_prefix)
+        matched_logs = expand_files(
             log
             for matched_path in matched_paths
             for log in (find_logs(matched_path) if matched_path.is_dir() else [matched_path])
-        ]
+        )
         if not matched_logs:
             parent = path.parent
             hint = (

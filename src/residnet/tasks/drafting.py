@@ -36,6 +36,7 @@ from residnet.io.drafting.questions import (
     dump_commented_yaml,
 )
 from residnet.io.drafting.reading import read_drafted
+from residnet.io.readers.base import locate_file
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
     QUATERNION,
@@ -186,11 +187,13 @@ def _note_unused_channels(
         if name in measured_channels and name not in ROLL_LAYOUT.dynamic_states
     ]
     if depth_channels and not dof.is_six_dof:
-        draft_notes.add_note(
-            CHANNELS_KEY,
+        text = (
             f"{', '.join(depth_channels)}: not used: six degrees of freedom need depth, pitch and"
-            " roll angles, and u and v or a position, that move in all logs",
+            " roll angles, and u and v or a position, that move in all logs"
         )
+        if dof.is_planar and {"w", "z"} & {*depth_channels}:
+            text += "; the model is planar, heave and depth are left out and not predicted"
+        draft_notes.add_note(CHANNELS_KEY, text)
     if not has_wind and all({*WIND_INPUTS} <= {*log.channels} for log in draft_logs.logs.values()):
         draft_notes.add_note(
             CHANNELS_KEY, "the wind is not used: its loads need u, v, r and a measured heading"
@@ -645,7 +648,9 @@ def _split_logs(
         DataError: if no usable log is available for a split.
     """
     paths = {log.name: path for path, log in usable_logs.items()}
-    common_folder = Path(os.path.commonpath([path.resolve().parent for path in usable_logs]))
+    common_folder = Path(
+        os.path.commonpath([locate_file(path).resolve().parent for path in usable_logs])
+    )
     relative_root = os.path.relpath(common_folder, folder.resolve())
     # the path is absolute if the folder is far from the config
     root = (

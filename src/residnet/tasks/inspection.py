@@ -95,8 +95,8 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
                 results[file] = reader.read(file)
             except DataError as error:
                 results[file] = error
-    # companion files of another log are not logs
-    files = [file for file in files if file in results]
+    # companion files of another log are not logs; tests of other sheets are not read
+    files = sorted(results, key=lambda file: files.index(file) if file in files else len(files))
     names = assign_log_names(files)
     logs: list[Log] = []
     reports: list[InspectionReport] = []

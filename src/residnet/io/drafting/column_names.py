@@ -36,18 +36,17 @@ def match_channels(
     draft_notes: DraftNotes,
     *,
     has_heading: bool = True,
-    with_drift_angle: bool = False,
 ) -> dict[str, str]:
     """Match columns to channels by their names.
 
-    A speed without a direction is the surge velocity u if position and heading do not determine it.
+    A speed and the drift angle next to it are the channels `speed` and `drift_angle`, which readers
+    resolve to u and v. A speed without a direction is the surge velocity u if position and heading
+    do not determine it.
 
     Args:
         columns: names of the columns.
         draft_notes: receives guesses and notes.
         has_heading: whether another source may have the heading.
-        with_drift_angle: whether a speed and the drift angle next to it may be the channels
-            `speed` and `drift_angle`, which readers of tables resolve to u and v.
 
     Returns:
         Channel -> column.
@@ -62,7 +61,6 @@ def match_channels(
             [name for name in columns if name not in north_east.values()],
             other_notes,
             has_heading=has_heading,
-            with_drift_angle=with_drift_angle,
         )
         if not {"x", "y", "latitude", "longitude"} & set(other_channels):
             # next to a column E, N is no shaft speed
@@ -89,7 +87,7 @@ def match_channels(
         or "psi" in names
         or any("course" in parsed.concepts for parsed in parsed_names.values())
     )
-    if drift_angle is not None and with_drift_angle:
+    if drift_angle is not None:
         names |= _pair_speed_with_drift_angle(drift_angle, names, speeds, parsed_names, draft_notes)
     if "speed" in names:
         # u and v follow from speed and drift angle
@@ -98,13 +96,6 @@ def match_channels(
     elif "u" not in names and speeds and ("v" in names or not (has_position and has_heading)):
         names["u"] = speeds[0]
         text = f"'{speeds[0]}' is assumed the surge velocity, not the speed"
-        if drift_angle is not None and "v" not in names:
-            # readers of recordings have no channel of the drift angle
-            text = (
-                f"'{speeds[0]}' is read as the surge velocity, '{drift_angle}' is not read; write"
-                " columns u = V cos(beta) and v = -V sin(beta) for speed V and drift angle beta"
-                " (positive with the flow from port)"
-            )
         draft_notes.add_guess((*CHANNELS_KEY, "u"), text)
     ordered_channels = [
         *MOTION_AND_WIND_CHANNELS,

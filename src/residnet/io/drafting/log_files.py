@@ -7,16 +7,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from residnet.core.errors import UsageError
+from residnet.io.readers.base import locate_file
 from residnet.io.readers.detect import suggest_conversion
+from residnet.io.readers.several_tests import expand_files
 from residnet.io.split import find_logs
 
-_TABLE_SUFFIXES = (".csv", ".parquet")
+_TABLE_SUFFIXES = (".csv", ".tsv", ".parquet")
 
 
 def find_log_files(paths: Sequence[Path]) -> list[Path]:
     """Return all logs in files and folders without duplicates, in sorted order.
 
-    A folder may itself be a log, such as a ROS 2 bag. In a folder without bags, csv and Parquet
+    A file with several tests is a log for each test. A folder may itself be a log, such as a ROS 2
+    bag. In a folder without bags, csv and Parquet
     files, logs of other formats are used.
 
     Raises:
@@ -35,12 +38,12 @@ def find_log_files(paths: Sequence[Path]) -> list[Path]:
                     f"{path}: has no log of a known format{describe_other_files(path)}"
                 )
             files += preferred_logs
-        elif path.is_file():
+        elif locate_file(path).is_file():
             files.append(path)
         else:
             raise UsageError(f"{path}: no such file or folder")
     unique_files: dict[Path, Path] = {}
-    for file in files:
+    for file in expand_files(files):
         unique_files.setdefault(file.resolve(), file)
     return list(unique_files.values())
 

@@ -24,7 +24,7 @@ from residnet.io.drafting.motion_sources import MIN_MOTION_ROWS, MotionSources, 
 from residnet.io.drafting.questions import CHANNELS_KEY, READER_KEY, UNMAPPED_FIELDS, DraftNotes
 from residnet.io.drafting.vertical import draft_vertical_motion, project_on_horizontal
 from residnet.io.header_vocabulary import MOTION_CHANNELS, match_state_channel, parse_name
-from residnet.io.readers.quantities import QUATERNION
+from residnet.io.readers.quantities import QUATERNION, SPEED_CHANNELS
 from residnet.io.readers.recording import Recording
 
 
@@ -202,7 +202,7 @@ def _convert_entries(
     for name, entry in entries.items():
         topic, field = sources[entry.pop("column")]
         # a command of another topic applies until the next one
-        is_motion = name in (*MOTION_CHANNELS, *SIX_DOF_LAYOUT.state_names)
+        is_motion = name in (*MOTION_CHANNELS, *SIX_DOF_LAYOUT.state_names, *SPEED_CHANNELS)
         hold_setting = {} if topic == base_topic or is_motion else {"hold": True}
         settings["channels"][name] = {"topic": topic, "field": field, **entry, **hold_setting}
     return settings

@@ -25,8 +25,7 @@ from residnet.io.header_vocabulary import (
 from residnet.io.readers.clock_repair import repair_clock
 from residnet.io.readers.timestamps import (
     detect_date_order,
-    detect_unix_unit,
-    infer_time_unit,
+    guess_time_unit,
     is_date_column,
     parse_texts,
 )
@@ -193,7 +192,7 @@ def detect_clock(preview: TablePreview) -> TableClock:
     unit = parse_header_unit(clock_column, "s")
     guess = ""
     if unit is None:
-        unit, guess = _guess_time_unit(values)
+        unit, guess = guess_time_unit(values)
     if clock_column not in time_columns:
         guess = f"no column has a name of time; this one increases like a clock. {guess}".strip()
     seconds, interpolation = _repair_preview_clock(preview, values * to_si(unit), to_si(unit))
@@ -270,16 +269,3 @@ def _detect_date_clock(preview: TablePreview, date_columns: dict[str, pd.Series]
     return TableClock(
         settings, seconds, guess, (column, *date_only_columns[: not complete_columns])
     )
-
-
-def _guess_time_unit(values: np.ndarray) -> tuple[str, str]:
-    """Guess the unit of times [T] from their size and step; return the unit and the reason."""
-    finite_values = values[np.isfinite(values)]
-    step = float(np.median(np.diff(finite_values)))
-    median_size = float(np.median(np.abs(finite_values)))
-    if unix_unit := detect_unix_unit(finite_values):
-        return unix_unit, f"numbers of this size are Unix time in {unix_unit}"
-    if step < 1e-3 and (2e4 < median_size < 7e4 or 6.5e5 < median_size < 8e5):
-        return "day", "numbers of this size are the days of Excel or MATLAB"
-    unit = infer_time_unit(step)
-    return unit, f"the header has no unit; steps of {step:g} would be {unit}"

@@ -15,9 +15,10 @@ from residnet.core.names import truncate
 from residnet.core.units import is_unit
 from residnet.io.drafting.problems import UnreadableLogsError, raise_unreadable
 from residnet.io.drafting.questions import READER_KEY, DraftNotes
-from residnet.io.readers.base import require_file
+from residnet.io.readers.base import locate_file, require_file
 from residnet.io.readers.excel_tables import join_excel_sheets, list_sheet_names, read_excel_sheet
 from residnet.io.readers.json_tables import read_json_head
+from residnet.io.readers.motion_capture import list_mocap_bodies
 from residnet.io.readers.tables import TABLE_KINDS, read_parquet_head
 from residnet.io.readers.text_tables import HeaderlessTableError, read_table_head
 from residnet.preprocessing.channel_values import mask_fill_values
@@ -61,8 +62,9 @@ def preview_named_tables(
     """
     key = (*READER_KEY, "names")
     if not draft_notes.has_answer(key):
+        mocap_body = _ask_mocap_body(files[0], draft_notes)
         try:
-            return *preview_tables(files), ()
+            return *preview_tables(files, mocap_body=mocap_body), ()
         except HeaderlessTablesError as error:
             refusal = error
         headerless = refusal.first_error
@@ -84,8 +86,28 @@ def preview_named_tables(
     return *preview_tables(files, names), names
 
 
+def _ask_mocap_body(path: Path, draft_notes: DraftNotes) -> str | None:
+    """Ask for the vessel among several rigid bodies of a motion-capture system.
+
+    Returns:
+        The name of the body; None for files with one body, and for other tables.
+    """
+    file = locate_file(path)
+    if TABLE_KINDS.get(file.suffix.lower(), "csv") != "csv":
+        return None
+    bodies = list_mocap_bodies(file)
+    if len(bodies) < 2:
+        return None
+    names = truncate(", ".join(bodies), 80)
+    reason = f"the export has {len(bodies)} rigid bodies ({names}); {bodies[0]} moves most"
+    text = f"rigid body of the vessel in {path.name}"
+    return draft_notes.ask_question(
+        (*READER_KEY, "mocap_body"), text, bodies[0], reason, tuple(bodies[:20])
+    )
+
+
 def preview_tables(
-    files: Sequence[Path], names: Sequence[str] | None = None
+    files: Sequence[Path], names: Sequence[str] | None = None, mocap_body: str | None = None
 ) -> tuple[list[TablePreview], dict[Path, ResidnetError]]:
     """Load the first rows of tables, 20,000 rows of up to 48 tables and 50 of the others.
 
@@ -102,7 +124,8 @@ def preview_tables(
     errors: dict[Path, ResidnetError] = {}
     for number, path in enumerate(files):
         try:
-            previews.append(preview_table(path, 20_000 if number % stride == 0 else 50, names))
+            rows = 20_000 if number % stride == 0 else 50
+            previews.append(preview_table(path, rows, names, mocap_body))
         except DataError as error:
             errors[path] = error
     if not previews:
@@ -168,7 +191,10 @@ class TablePreview:
 
 
 def preview_table(
-    path: Path, rows: int = 20_000, names: Sequence[str] | None = None
+    path: Path,
+    rows: int = 20_000,
+    names: Sequence[str] | None = None,
+    mocap_body: str | None = None,
 ) -> TablePreview:
     """Load the first rows of a table.
 
@@ -176,6 +202,7 @@ def preview_table(
         path: file of the table.
         rows: largest number of rows to load.
         names: names of all columns of a text table without a line of names.
+        mocap_body: rigid body of an export of a motion-capture system; None reads all.
 
     Raises:
         DataError: if the table has no rows or cannot be read.
@@ -183,7 +210,7 @@ def preview_table(
     import pandas as pd
 
     require_file(path)
-    table_kind = TABLE_KINDS.get(path.suffix.lower(), "csv")
+    table_kind = TABLE_KINDS.get(locate_file(path).suffix.lower(), "csv")
     if table_kind in _HEAD_READERS:
         table = _HEAD_READERS[table_kind](path, rows)
         reader_settings = {"kind": table_kind}
@@ -191,7 +218,7 @@ def preview_table(
         table, reader_settings = (
             _preview_excel(path, rows)
             if table_kind == "excel"
-            else read_table_head(path, rows, names)
+            else read_table_head(path, rows, names, mocap_body)
         )
     columns = _append_units(table)
     other_sheets = table.attrs.get("other_sheets", ())

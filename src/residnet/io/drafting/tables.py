@@ -54,6 +54,7 @@ from residnet.io.drafting.vessel_rows import (
     select_vessel_rows,
 )
 from residnet.io.header_vocabulary import match_state_channel, parse_name
+from residnet.io.readers.base import locate_file
 from residnet.io.readers.clock_repair import find_unique_rows
 from residnet.io.readers.manoeuvre_kinds import match_manoeuvre_name
 from residnet.io.readers.quantities import QUATERNION
@@ -108,7 +109,6 @@ def draft_tables(
         main_preview.numeric_columns,
         draft_notes,
         has_heading=has_heading or has_sin_cos_heading or bool(attitudes),
-        with_drift_angle=True,
     )
     if select:
         drop_ais_turn_rate(column_by_channel, main_preview, draft_notes)
@@ -164,6 +164,7 @@ def draft_tables(
         }
     reader_config = _compose_reader_config(main_preview, clock, names, select, draft_notes)
     reader_config |= draft_manoeuvre_setting(files, draft_notes)
+    _note_tests_of_files(files, draft_notes)
     _note_unused_columns(main_preview, column_by_channel, clock, draft_notes, {*select})
     return {**reader_config, "channels": channels}, errors
 
@@ -189,12 +190,12 @@ def _compose_reader_config(
         key: list(value) if isinstance(value, tuple) else value
         for key, value in preview.reader_settings.items()
     }
-    if "motive_up" in settings:
+    if "mocap_up" in settings:
         text = (
-            f"export of OptiTrack Motive, by the motion {settings['motive_up']} points up and"
-            f" {settings['motive_bow']} of the rigid body points forward; x is taken as north"
+            f"export of motion capture, by the motion {settings['mocap_up']} points up and"
+            f" {settings['mocap_bow']} of the rigid body points forward; x is taken as north"
         )
-        draft_notes.add_guess((*READER_KEY, "motive_up"), text)
+        draft_notes.add_guess((*READER_KEY, "mocap_up"), text)
     time = dict(clock.settings)
     if "column" in time:
         time["column"] = preview.original_name(time["column"])
@@ -283,12 +284,20 @@ def _suggest_table_fix(
     )
 
 
+def _note_tests_of_files(files: Sequence[Path], draft_notes: DraftNotes) -> None:
+    """Note which files have several tests, each of which is a log."""
+    for file in dict.fromkeys(path.parent for path in files if locate_file(path) != path):
+        names = [path.name for path in files if path.parent == file]
+        text = f"{file.name} has {len(names)} tests, a log each: {truncate(', '.join(names), 100)}"
+        draft_notes.add_guess(READER_KEY, text)
+
+
 def draft_manoeuvre_setting(files: Sequence[Path], draft_notes: DraftNotes) -> dict[str, str]:
     """Return the setting `manoeuvre: folder` for files in folders by manoeuvre, else no setting.
 
     Folders of one file each are trips, unless their names are names of manoeuvres.
     """
-    folders = {path.resolve().parent for path in files}
+    folders = {locate_file(path).resolve().parent for path in files}
     has_manoeuvre_names = any(match_manoeuvre_name(folder.name) for folder in folders)
     if len(folders) < 2 or (len(folders) == len(files) and not has_manoeuvre_names):
         return {}

@@ -21,6 +21,7 @@ from residnet.io.header_vocabulary import (
     normalize_name,
     parse_name,
 )
+from residnet.io.readers.quantities import SPEED_CHANNELS
 from residnet.preprocessing.channel_values import is_ais_sentinel
 
 if TYPE_CHECKING:
@@ -110,7 +111,6 @@ def match_columns_of_one_vessel(
     draft_notes: DraftNotes,
     *,
     has_heading: bool,
-    with_drift_angle: bool = False,
 ) -> dict[str, str]:
     """Match columns to channels, using one vessel of tables with several.
 
@@ -123,7 +123,6 @@ def match_columns_of_one_vessel(
         numeric_columns: column -> values.
         draft_notes: receives guesses and notes.
         has_heading: whether another source may have the heading.
-        with_drift_angle: see `match_channels`.
 
     Returns:
         Channel -> column.
@@ -146,7 +145,11 @@ def match_columns_of_one_vessel(
         position_pair = next(
             (pair for pair in (("x", "y"), (*MAX_COORDINATES,)) if {*pair} <= channels.keys()), ()
         )
-        if not position_pair or not channels.keys() - {*MOTION_AND_WIND_CHANNELS, *MAX_COORDINATES}:
+        if not position_pair or not channels.keys() - {
+            *MOTION_AND_WIND_CHANNELS,
+            *MAX_COORDINATES,
+            *SPEED_CHANNELS,
+        }:
             continue
         for prefix, prefix_columns in same_suffix_groups.items():
             if any(
@@ -158,10 +161,6 @@ def match_columns_of_one_vessel(
                     f" vessels or sensors {prefix} is read; write the others to separate tables"
                 )
                 draft_notes.add_guess(CHANNELS_KEY, text)
-                matched = match_channels(
-                    [*prefix_columns], draft_notes, with_drift_angle=with_drift_angle
-                )
+                matched = match_channels([*prefix_columns], draft_notes)
                 return {channel: prefix_columns[suffix] for channel, suffix in matched.items()}
-    return match_channels(
-        columns, draft_notes, has_heading=has_heading, with_drift_angle=with_drift_angle
-    )
+    return match_channels(columns, draft_notes, has_heading=has_heading)

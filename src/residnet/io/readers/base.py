@@ -78,8 +78,14 @@ class ConfiguredReader(ReaderKind, LogReader):
         return self
 
 
+def locate_file(path: Path) -> Path:
+    """Return the file of a log: the path itself, or its parent for one test of a file."""
+    return path.parent if not path.exists() and path.parent.is_file() else path
+
+
 def require_file(path: Path) -> None:
-    """Raise `UsageError` unless `path` is a file; the message suggests similar names."""
+    """Raise `UsageError` unless `path` is a file or a test in it; the message suggests names."""
+    path = locate_file(path)
     if path.is_dir():
         raise UsageError(
             f"{path}: is a folder, a log file was expected; give one file or a pattern such as"
@@ -104,7 +110,7 @@ def describe_provenance(path: Path, rows_read: int, rows_dropped: int) -> dict[s
     """
     return {
         "source": str(path),
-        "sha256": hash_files([path]),
+        "sha256": hash_files([locate_file(path)]),
         "rows_read": rows_read,
         "rows_dropped": rows_dropped,
     }
@@ -161,8 +167,10 @@ def hash_files(files: Sequence[Path]) -> str:
 
 
 def list_files(path: Path) -> list[Path]:
-    """Return all files below a folder in sorted order; for a file, the file alone."""
-    return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+    """Return all files below a folder in sorted order; for a file or a test in it, the file."""
+    if path.is_dir():
+        return sorted(file for file in path.rglob("*") if file.is_file())
+    return [locate_file(path)]
 
 
 def sum_file_sizes(files: Iterable[Path]) -> int:

@@ -46,6 +46,8 @@ from residnet.io.readers.quantities import (
     normalize_quaternion,
     project_fixes,
     quaternion_yaw,
+    require_speed_units,
+    resolve_drift_angle,
 )
 from residnet.io.readers.recording import (
     ALL_FIELDS,
@@ -72,7 +74,8 @@ class RecordingConfig(ConfiguredReader, ABC):
     """Base class of the readers of recordings.
 
     Attributes:
-        channels: channel name (canonical or user-defined) -> field of a topic.
+        channels: channel name (canonical or user-defined) -> field of a topic. `speed` and
+            `drift_angle` become u and v as in tables.
         position: source of x and y.
         heading: source of psi.
         velocity: source of u and v (and r) if they are not mapped as channels.
@@ -108,6 +111,7 @@ class RecordingConfig(ConfiguredReader, ABC):
     def _validate_sources(self) -> RecordingConfig:
         for name, entry in self.channels.items():
             entry.require_valid_channel(name)
+        require_speed_units({name: entry.unit for name, entry in self.channels.items()})
         if isinstance(self.velocity, DerivedVelocity) and not isinstance(self.clock, UniformClock):
             raise ValueError(
                 "velocity: kind 'derived' needs a uniform clock; set clock: {kind: uniform, step:"
@@ -298,6 +302,7 @@ def build_log(recording: Recording, plan: ChannelPlan, clock: ClockConfig) -> Lo
         values = _differentiate_pose(pose_topics, derived_velocity, antenna, times, step) | values
     else:
         _transform_to_vessel_origin(values, plan.velocity, antenna)
+    values = resolve_drift_angle(values)
     units |= {name: CHANNEL_UNITS[name] for name in ("x", "y", "psi", "u", "v", "r")}
     units = {name: units[name] for name in values}
     t = times

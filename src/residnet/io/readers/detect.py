@@ -10,7 +10,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.registry import get_kind, list_external_classes
 from residnet.io.readers import ReaderConfig
-from residnet.io.readers.base import ReaderKind, require_file
+from residnet.io.readers.base import ReaderKind, locate_file, require_file
 from residnet.io.readers.compose import RecordingConfig
 from residnet.io.readers.formats.ardupilot import ArduPilotConfig
 from residnet.io.readers.formats.matlab_hdf5 import Hdf5Config, MatConfig
@@ -207,6 +207,7 @@ def detect_log_kind(path: Path) -> str:
     Raises:
         UsageError: if the format is unknown.
     """
+    path = locate_file(path)
     if Log.is_canonical_log(path):
         return "canonical"
     recording = detect_recording_format(path)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import suggest_name
 from residnet.core.units import is_unit
-from residnet.io.readers.base import optional_import, wrap_read_errors
+from residnet.io.readers.excel_cells import list_worksheets
+from residnet.io.readers.several_tests import find_test, read_excel_cells
 from residnet.io.readers.text_tables import find_header, make_names_unique
 
 if TYPE_CHECKING:
@@ -21,24 +23,14 @@ _HEADER_SEARCH_ROWS = 60
 """Rows of a sheet in which the header is searched."""
 _MIN_TABLE_COLUMNS = 3
 """Smallest number of columns of a table that occurs several times in a sheet."""
-_MAX_CACHED_WORKBOOKS = 1_000
-"""Largest number of files whose names of sheets are in the cache."""
-_MAX_CACHED_CELLS = 1_000_000
-"""Largest number of cells in the cache of sheets, about 40 MB."""
-
-_FileVersion = tuple[str, int, int, int]
-"""Path, inode, size in bytes and time of the last change in ns of a file."""
-# a draft reads each sheet three times: the preview, the guesses and the check of the channel map
-_cached_cells: OrderedDict[tuple[_FileVersion, str], pd.DataFrame] = OrderedDict()
-_cached_sheet_names: OrderedDict[_FileVersion, list[str]] = OrderedDict()
 
 
 def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.DataFrame:
     """Read a sheet and detect its row of column names.
 
     Args:
-        path: Excel file.
-        sheet: name of the sheet; None takes the first one.
+        path: Excel file, or one of its tests.
+        sheet: name of the sheet; None takes that of the test, or the first one.
         rows: largest number of rows to read; None reads all.
 
     Returns:
@@ -54,88 +46,46 @@ def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> 
     names = list_sheet_names(path)
     if sheet is not None and sheet not in names:
         raise UsageError(f"{path}: no sheet '{sheet}'{suggest_name(sheet, names)}")
-    cells = _read_cells(path, sheet if sheet is not None else names[0], rows)
+    cells, row_offset = read_excel_cells(path, sheet, rows)
     head_rows = [
         ["" if pd.isna(cell) else str(cell).strip() for cell in row]
         for row in cells.head(_HEADER_SEARCH_ROWS).itertuples(index=False)
     ]
     header_row, first_value_row = find_header(head_rows) or (0, 1)
+    table = cells.iloc[first_value_row:]
+    # a recorder that is switched on again writes names and units again
+    head_texts = {tuple(row) for row in head_rows[header_row:first_value_row] if any(row)}
+    is_repeated = [
+        isinstance(row[0], str)
+        and tuple("" if pd.isna(cell) else str(cell).strip() for cell in row) in head_texts
+        for row in table.itertuples(index=False)
+    ]
     # the names in the first rows made all columns object columns
-    table = cells.iloc[first_value_row:].infer_objects()
+    table = table[~np.array(is_repeated, dtype=bool)].infer_objects()
     unit_rows = head_rows[header_row + 1 : first_value_row]
     names = head_rows[header_row] if head_rows else []
     if header_row > 0 and _is_unit_row(names):
         unit_rows = head_rows[header_row:first_value_row]
         names = _join_grouped_names(head_rows[:header_row])
-    _refuse_several_tables(path, table, names, first_value_row)
+    _refuse_tables_side_by_side(path, names)
     table.columns = pd.Index(make_names_unique(names))
     table = _convert_decimal_commas(table.dropna(how="all"))
     table.attrs |= {
-        "n_lines_above": first_value_row,
+        "n_lines_above": first_value_row + row_offset,
         "unit_rows": unit_rows,
     }
     return table
 
 
-def _read_cells(path: Path, sheet: str, rows: int | None) -> pd.DataFrame:
-    """Return the cells of a sheet, from the cache if the file has not changed since.
-
-    Args:
-        path: Excel file.
-        sheet: name of the sheet.
-        rows: largest number of rows to read; None reads all.
-    """
-    import pandas as pd
-
-    with wrap_read_errors(path, "an Excel file"):
-        key = (_get_file_version(path), sheet)
-        if key in _cached_cells:
-            _cached_cells.move_to_end(key)
-            return _cached_cells[key].head(rows) if rows is not None else _cached_cells[key]
-        cells: pd.DataFrame = pd.read_excel(
-            path, sheet_name=sheet, nrows=rows, engine="openpyxl", header=None
-        )
-    is_complete = rows is None or len(cells) < rows
-    if is_complete and cells.size <= _MAX_CACHED_CELLS:
-        _cached_cells[key] = cells
-        while sum(sheet_cells.size for sheet_cells in _cached_cells.values()) > _MAX_CACHED_CELLS:
-            _cached_cells.popitem(last=False)
-    return cells
-
-
-def _get_file_version(path: Path) -> _FileVersion:
-    """Return what identifies the content of a file."""
-    status = path.stat()
-    return (str(path.absolute()), status.st_ino, status.st_size, status.st_mtime_ns)
-
-
-def _refuse_several_tables(
-    path: Path, table: pd.DataFrame, names: Sequence[str], first_value_row: int
-) -> None:
-    """Refuse a sheet with several tables of the same columns, such as a table for each test.
-
-    Args:
-        path: Excel file.
-        table: cells below the column names.
-        names: column names.
-        first_value_row: number of rows above the values.
+def _refuse_tables_side_by_side(path: Path, names: Sequence[str]) -> None:
+    """Refuse a sheet whose column names occur again further right, and that is not divided.
 
     Raises:
-        DataError: if the column names occur again in a later row, or further right.
+        DataError: if the names are those of several tables.
     """
     filled = [name for name in names if name]
     if len(filled) < _MIN_TABLE_COLUMNS:
         return
-    instruction = "copy each table to a separate file, and give the folder of the files"
-    first_name = names.index(filled[0])
-    is_repeated = table.iloc[:, first_name].map(lambda cell: str(cell).strip() == filled[0])
-    for position in is_repeated.to_numpy().nonzero()[0]:
-        cells = [str(cell).strip() for cell in table.iloc[position]]
-        if all(name in ("", cell) for name, cell in zip(names, cells, strict=True)):
-            raise DataError(
-                f"{path}: row {first_value_row + position + 1} has the column names again"
-                f" ('{filled[0]}', '{filled[1]}', ...), a sheet has one log; {instruction}"
-            )
     half = len(filled) // 2
     if half >= _MIN_TABLE_COLUMNS and filled[0] in filled[1:]:
         width = filled.index(filled[0], 1)
@@ -144,7 +94,8 @@ def _refuse_several_tables(
         ):
             raise DataError(
                 f"{path}: has {len(filled) // width} tables side by side, each with '{filled[0]}',"
-                f" '{filled[1]}', ..., a sheet has one log; {instruction}"
+                f" '{filled[1]}', ..., a sheet has one log; copy each table to a separate file, and"
+                " give the folder of the files"
             )
 
 
@@ -271,21 +222,11 @@ def join_excel_sheets(path: Path, tables: Mapping[str, pd.DataFrame]) -> pd.Data
 
 
 def list_sheet_names(path: Path) -> list[str]:
-    """Return the names of the sheets of an Excel file, in order.
+    """Return the names of the sheets of an Excel file, or that of one of its tests, in order.
 
     Raises:
         UsageError: if openpyxl is not installed.
         DataError: if the file cannot be read.
     """
-    with optional_import("excel", "openpyxl", "an Excel sheet"):
-        import openpyxl
-    with wrap_read_errors(path, "an Excel file"):
-        version = _get_file_version(path)
-        if version not in _cached_sheet_names:
-            # a workbook that is not closed keeps the file open
-            workbook = openpyxl.load_workbook(path, read_only=True)
-            _cached_sheet_names[version] = [str(sheet.title) for sheet in workbook.worksheets]
-            workbook.close()
-        if len(_cached_sheet_names) > _MAX_CACHED_WORKBOOKS:
-            _cached_sheet_names.popitem(last=False)
-        return list(_cached_sheet_names[version])
+    test = find_test(path)
+    return [test.sheet] if test is not None else list_worksheets(path)

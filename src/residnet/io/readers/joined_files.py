@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -128,6 +129,11 @@ class JoinedConfig(ConfiguredReader):
         trip_files = {main_word: path}
         for part_name in secondary_words:
             candidate = path.with_name(f"{prefix}{part_name}{suffix}")
+            if not candidate.is_file():
+                # the part of another recorder may have another extension
+                pattern = f"{glob.escape(candidate.stem)}.*"
+                candidates = sorted(path.parent.glob(pattern))
+                candidate = candidates[0] if len(candidates) == 1 else candidate
             if not candidate.is_file():
                 raise DataError(
                     f"{path}: {candidate.name} is missing in its folder; leave the trip out"
@@ -491,7 +497,7 @@ def group_trip_files(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Pa
         return {}
     trips = {
         group_words[0]: {
-            path.with_name(path.name.replace(group_words[0], "\0")): path for path in group
+            path.with_name(path.stem.replace(group_words[0], "\0")): path for path in group
         }
         for group_words, group in zip(distinctive_words, file_groups, strict=True)
     }

@@ -8,6 +8,7 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.io.header_vocabulary import MANOEUVRE_PATTERNS, normalize_name
+from residnet.io.readers.base import locate_file
 
 UNKNOWN = "unknown"
 """Kind of a log that neither its name nor its motion determines."""
@@ -35,7 +36,7 @@ def resolve_manoeuvre(setting: str | None, path: Path, log: Log) -> str:
         log: the log in SI.
     """
     if setting == "folder":
-        return path.resolve().parent.name
+        return locate_file(path).resolve().parent.name
     if setting == "auto":
         return match_manoeuvre_name(path.stem) or infer_manoeuvre(log) or UNKNOWN
     return setting or UNKNOWN

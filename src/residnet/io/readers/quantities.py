@@ -39,6 +39,44 @@ PLANAR_QUATERNION = ("qz", "qw")
 """Channels with the parts of a quaternion about the vertical axis, whose other parts are zero."""
 SPEED_CHANNELS = {"speed": "m/s", "drift_angle": "rad"}
 """Channels, with their SI units, from which tables without u and v derive these velocities."""
+
+
+def resolve_drift_angle(channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Replace speed and drift angle by surge and sway velocity, unless one of these is mapped.
+
+    A positive drift angle is that of a flow from port, v = -U sin(beta) (SNAME, Technical and
+    Research Bulletin 1-5, 1952).
+
+    Args:
+        channels: name -> values [T] in SI.
+    """
+    if not channels.keys() >= {*SPEED_CHANNELS} or {"u", "v"} & channels.keys():
+        return dict(channels)
+    speed = channels["speed"]
+    drift_angle = channels["drift_angle"]
+    velocities = {"u": speed * np.cos(drift_angle), "v": -speed * np.sin(drift_angle)}
+    others = {name: values for name, values in channels.items() if name not in SPEED_CHANNELS}
+    return {**others, **velocities}
+
+
+def require_speed_units(units: Mapping[str, str]) -> None:
+    """Check the units of speed and drift angle if both are mapped.
+
+    Args:
+        units: channel -> unit of its column or field.
+
+    Raises:
+        ValueError: if a unit has the wrong dimension.
+    """
+    if not units.keys() >= {*SPEED_CHANNELS}:
+        return
+    for name, unit in SPEED_CHANNELS.items():
+        try:
+            conversion_factor(units[name], unit)
+        except ValueError as error:
+            raise ValueError(f"channel {name}: {error}") from error
+
+
 COSINE_SUFFIX = "_cos"
 SINE_SUFFIX = "_sin"
 """Suffixes of channels with the cosine and the sine of an angle."""

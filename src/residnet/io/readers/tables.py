@@ -27,6 +27,7 @@ from residnet.io.readers.base import (
     ConfiguredReader,
     ProgressCallback,
     describe_provenance,
+    locate_file,
     reading_progress,
     require_file,
     require_increasing,
@@ -40,10 +41,10 @@ from residnet.io.readers.json_tables import JsonObjectReader
 from residnet.io.readers.manoeuvre_kinds import resolve_manoeuvre
 from residnet.io.readers.motion_capture import (
     BowAxis,
-    MotiveAxes,
+    MocapAxes,
     VerticalAxis,
     list_bow_axes,
-    read_motive,
+    read_mocap,
 )
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
@@ -51,7 +52,6 @@ from residnet.io.readers.quantities import (
     PLANAR_QUATERNION,
     QUATERNION,
     SINE_SUFFIX,
-    SPEED_CHANNELS,
     ChannelMap,
     complete_quaternion,
     conversion_factor,
@@ -59,6 +59,8 @@ from residnet.io.readers.quantities import (
     project_fixes,
     quaternion_tilt,
     quaternion_yaw,
+    require_speed_units,
+    resolve_drift_angle,
 )
 from residnet.io.readers.text_tables import (
     coerce_numeric,
@@ -196,12 +198,7 @@ class TableConfig(ConfiguredReader, ABC):
     def _validate_channels(cls, channels: dict[str, ChannelMap]) -> dict[str, ChannelMap]:
         for name, entry in channels.items():
             entry.require_valid_channel(name)
-        if channels.keys() >= {*SPEED_CHANNELS}:
-            for name, unit in SPEED_CHANNELS.items():
-                try:
-                    conversion_factor(channels[name].unit, unit)
-                except ValueError as error:
-                    raise ValueError(f"channel {name}: {error}") from error
+        require_speed_units({name: entry.unit for name, entry in channels.items()})
         quaternion_names = [name for name in QUATERNION if name in channels]
         if quaternion_names and (*quaternion_names,) not in (QUATERNION, PLANAR_QUATERNION):
             missing_names = ", ".join(name for name in QUATERNION if name not in channels)
@@ -269,7 +266,7 @@ class TableConfig(ConfiguredReader, ABC):
         _add_angles_of_components(channels)
         if "u" in channels and channel_maps["u"].frame == "ned":
             channels["u"], channels["v"] = rotate(channels["u"], channels["v"], -channels["psi"])
-        channels = _resolve_drift_angle(channels)
+        channels = resolve_drift_angle(channels)
         derived_units = {"x": "m", "y": "m", "u": "m/s", "v": "m/s"}
         units = {
             n: channel_maps[n].si_unit_of(n) if n in channel_maps else derived_units.get(n, "rad")
@@ -298,7 +295,7 @@ class TableConfig(ConfiguredReader, ABC):
         hemisphere_columns = [
             entry.hemisphere for entry in channel_maps.values() if entry.hemisphere
         ]
-        with reading_progress(path.name, path.stat().st_size, 1.0) as advance:
+        with reading_progress(path.name, locate_file(path).stat().st_size, 1.0) as advance:
             table = self.load(path, [*columns, *hemisphere_columns, *self.select], advance)
         # pandas would copy the attrs of a table to each of its columns
         attributes = table.attrs
@@ -588,11 +585,12 @@ class CsvConfig(TableConfig):
         decimal: decimal sign, `.` or `,`.
         encoding: encoding of the text, for example `cp1252` for files of older Windows programs;
             null detects it.
-        motive_up: axis that points up in an export of OptiTrack Motive with rigid bodies, `y` or
-            `z`; null for other tables. Positions are `north [m]` and `east [m]`, with x to the
-            north, and `height [m]`, or `depth [m]` of a vessel that dives; the quaternion is `q_x`
-            to `q_w`.
-        motive_bow: axis of the rigid body that points forward.
+        mocap_up: axis that points up in an export of OptiTrack Motive, Qualisys (6D) or Vicon with
+            rigid bodies, `y` or `z`; null for other tables. Positions are `north [m]` and
+            `east [m]`, with x to the north, and `height [m]`, or `depth [m]` of a vessel that
+            dives; the quaternion is `q_x` to `q_w`.
+        mocap_bow: axis of the rigid body that points forward.
+        mocap_body: name of the rigid body to read; null reads all, the name before each column.
     """
 
     kind: Literal["csv"] = "csv"
@@ -600,8 +598,9 @@ class CsvConfig(TableConfig):
     delimiter: str = Field(default=",", min_length=1, max_length=1)
     decimal: Literal[".", ","] = "."
     encoding: str | None = None
-    motive_up: VerticalAxis | None = None
-    motive_bow: BowAxis = "x"
+    mocap_up: VerticalAxis | None = None
+    mocap_bow: BowAxis = "x"
+    mocap_body: str | None = None
     row_format: ClassVar[str] = "line {1}"
 
     @field_validator("encoding")
@@ -618,18 +617,19 @@ class CsvConfig(TableConfig):
             ) from error
 
     @model_validator(mode="after")
-    def _validate_motive_axes(self) -> CsvConfig:
-        if self.motive_up is not None and self.motive_bow not in list_bow_axes(self.motive_up):
-            axes = ", ".join(list_bow_axes(self.motive_up))
+    def _validate_mocap_axes(self) -> CsvConfig:
+        if self.mocap_up is not None and self.mocap_bow not in list_bow_axes(self.mocap_up):
+            axes = ", ".join(list_bow_axes(self.mocap_up))
             raise ValueError(
-                f"motive_bow: '{self.motive_bow}' is vertical with motive_up: {self.motive_up};"
+                f"mocap_bow: '{self.mocap_bow}' is vertical with mocap_up: {self.mocap_up};"
                 f" expected one of {axes}"
             )
         return self
 
     def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
-        if self.motive_up is not None:
-            table = read_motive(path, MotiveAxes(self.motive_up, self.motive_bow))
+        if self.mocap_up is not None:
+            axes = MocapAxes(self.mocap_up, self.mocap_bow)
+            table = read_mocap(path, axes, self.mocap_body)
             selected = table.iloc[:, find_column_positions(path, list(table.columns), columns)]
             selected.attrs = dict(table.attrs)
             return selected
@@ -646,13 +646,20 @@ class ExcelConfig(TableConfig):
     have a decimal comma.
 
     Attributes:
-        sheet: name of the sheet; null takes the first one. Several names are the sheets of one
-            recording, whose first columns are the time: their rows are merged in order of time.
+        sheet: name of the sheet; null takes the first one, and reads each test of a file with
+            several tests as a log. Several names are the sheets of one recording, whose first
+            columns are the time: their rows are merged in order of time.
     """
 
     kind: Literal["excel"] = "excel"
     sheet: str | tuple[str, ...] | None = None
     row_format: ClassVar[str] = "row {1}"
+
+    def select_logs(self, paths: Sequence[Path]) -> list[Path]:
+        """Return the files in place of their tests if the config names the sheet to read."""
+        if self.sheet is None:
+            return list(paths)
+        return list(dict.fromkeys(locate_file(path) for path in paths))
 
     def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
         table = (
@@ -764,21 +771,6 @@ def _add_angles_of_components(channels: dict[str, np.ndarray]) -> None:
             channels[name] = unwrap_angle(np.arctan2(sine, cosine))
 
 
-def _resolve_drift_angle(channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Replace speed and drift angle by surge and sway velocity, unless one of these is mapped.
-
-    A positive drift angle is that of a flow from port, v = -U sin(beta) (SNAME, Technical and
-    Research Bulletin 1-5, 1952).
-    """
-    if not channels.keys() >= {*SPEED_CHANNELS} or {"u", "v"} & channels.keys():
-        return dict(channels)
-    speed = channels["speed"]
-    drift_angle = channels["drift_angle"]
-    velocities = {"u": speed * np.cos(drift_angle), "v": -speed * np.sin(drift_angle)}
-    others = {name: values for name, values in channels.items() if name not in SPEED_CHANNELS}
-    return {**others, **velocities}
-
-
 def _to_local_plane(
     path: Path, channels: dict[str, np.ndarray], channel_maps: Mapping[str, ChannelMap]
 ) -> tuple[dict[str, np.ndarray], list[Remark]]:
@@ -859,6 +851,7 @@ def read_column_names(path: Path) -> tuple[str, ...]:
 
     It is the column names of a Parquet file, the first line of a text, and empty for other formats.
     """
+    path = locate_file(path)
     table_kind = TABLE_KINDS.get(path.suffix.lower(), "csv")
     if table_kind == "parquet":
         return tuple(_read_parquet_names(path))
@@ -866,9 +859,10 @@ def read_column_names(path: Path) -> tuple[str, ...]:
         return ()
     with path.open("rb") as stream:
         line = stream.readline(1 << 16).decode(errors="replace").strip()
-    if line.startswith("Format Version,"):
-        # the first line of an export of Motive has the name of the take
-        return ("Format Version",)
+    for start in ("Format Version", "NO_OF_FRAMES"):
+        if line.startswith(start):
+            # the first line of an export of motion capture has the take or its length
+            return (start,)
     # the numbers of tables without a line of names differ from file to file
     n_numbers = count_numbers(line)
     return (f"{n_numbers} columns of numbers" if n_numbers > 1 else line,)

@@ -20,11 +20,13 @@ from residnet.io.header_vocabulary import (
     parse_name,
 )
 from residnet.io.readers.base import ProgressCallback
+from residnet.io.readers.cell_values import UNIT, is_value, parse_trailing_unit
 from residnet.io.readers.motion_capture import (
-    detect_motive_axes,
-    parse_motive_header,
-    read_motive,
+    detect_mocap_axes,
+    parse_mocap_header,
+    read_mocap,
 )
+from residnet.io.readers.several_tests import open_test_as_utf8
 from residnet.io.readers.table_lines import (
     WHITESPACE_DELIMITER,
     Header,
@@ -35,7 +37,7 @@ from residnet.io.readers.table_lines import (
     split_line,
     split_lines,
 )
-from residnet.io.readers.text_encoding import HEAD_BYTES, open_as_utf8
+from residnet.io.readers.text_encoding import HEAD_BYTES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,16 +51,7 @@ _MAX_UNIT_LINES = 3
 # chunks of this size stay in the processor's cache while they are parsed
 _CHUNK_ROWS = 20_000
 _COMMENT_PREFIX = re.compile(r"\s*(?:#|%|//)\s+")
-_NUMBER = re.compile(
-    r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf)", re.IGNORECASE
-)
-_TIME = re.compile(r"\d{1,4}\s*[-./:年時h]\s*\d")
-_UNIT = r"(?:[^\W\d_]|[°%µ])\S*"
-_FRACTION = rf"\s*-?\d+{{}}\d+(?:[eE][-+]?\d+)?\s*(?:{_UNIT})?"
-_WITH_UNIT = re.compile(rf"(?P<number>[-+]?[\d.,'’ \u00a0\u202f]*\d)\s*(?P<unit>{_UNIT})")
-"""A number followed by its unit, as in `1450 rpm`."""
-_HEMISPHERES = frozenset("NSEW")
-"""Letters that behind a number mean a hemisphere rather than newtons or seconds."""
+_FRACTION = rf"\s*-?\d+{{}}\d+(?:[eE][-+]?\d+)?\s*(?:{UNIT})?"
 _EXTRA_COLUMN = "beyond the last column"
 
 
@@ -153,7 +146,7 @@ def read_csv(
     """
     import pandas as pd
 
-    with open_as_utf8(path, encoding) as file:
+    with open_test_as_utf8(path, encoding) as (file, row_offset):
         try:
             header = (
                 _find_header_with_columns(path, delimiter, file, columns)
@@ -207,7 +200,7 @@ def read_csv(
     table = table.iloc[: -1 if is_truncated else None]
     units = [parsed_columns[position][1] for position in column_positions]
     table.attrs |= {
-        "n_lines_above": header.n_lines_above - 1,
+        "n_lines_above": header.n_lines_above - 1 + row_offset,
         "is_truncated": is_truncated,
         "n_blank_lines": n_blank_lines,
         "units": units,
@@ -317,7 +310,7 @@ def _strip_unit(cells: pd.Series) -> tuple[str, pd.Series]:
         The unit and the cells without it, or an empty string and the unchanged cells.
     """
     filled_cells = cells.dropna()
-    unit_text = _parse_trailing_unit(str(filled_cells.iloc[0]).strip()) if len(filled_cells) else ""
+    unit_text = parse_trailing_unit(str(filled_cells.iloc[0]).strip()) if len(filled_cells) else ""
     if not unit_text:
         return "", cells
     stripped_cells = filled_cells.astype("string").str.strip()
@@ -327,16 +320,11 @@ def _strip_unit(cells: pd.Series) -> tuple[str, pd.Series]:
     return canonical_unit(unit_text), unitless_texts.reindex(cells.index)
 
 
-def _parse_trailing_unit(cell: str) -> str:
-    """Return the text of the unit behind a number, or an empty string."""
-    match = _WITH_UNIT.fullmatch(cell)
-    if match is None or match["unit"] in _HEMISPHERES or not is_unit(match["unit"]):
-        return ""
-    return match["unit"]
-
-
 def read_table_head(
-    path: Path, rows: int, column_names: Sequence[str] | None = None
+    path: Path,
+    rows: int,
+    column_names: Sequence[str] | None = None,
+    mocap_body: str | None = None,
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Read the first rows of a text table and detect its format.
 
@@ -344,6 +332,7 @@ def read_table_head(
         path: file of the table.
         rows: largest number of rows to read.
         column_names: names of all columns of a table without a line of names.
+        mocap_body: rigid body of an export of a motion-capture system; None reads all.
 
     Returns:
         The rows, with the cells of the lines between names and values in `attrs["unit_rows"]`, and
@@ -355,7 +344,7 @@ def read_table_head(
     """
     import pandas as pd
 
-    with open_as_utf8(path) as file:
+    with open_test_as_utf8(path) as (file, _):
         with file.open("rb") as stream:
             head = stream.read(HEAD_BYTES)
         lines = head.decode("utf-8-sig", errors="replace").splitlines()
@@ -370,10 +359,11 @@ def read_table_head(
                 " (`ros2 bag record`), or convert it to csv, in Python pandas.json_normalize("
                 "list(yaml.safe_load_all(open(file)))).to_csv('log.csv', index=False)"
             )
-        if column_names is None and parse_motive_header(path, lines) is not None:
-            axes = detect_motive_axes(file, rows)
-            motive_settings = {"motive_up": axes.up, "motive_bow": axes.bow}
-            return read_motive(file, axes, rows), {"kind": "csv", **motive_settings}
+        if column_names is None and parse_mocap_header(path, lines) is not None:
+            axes = detect_mocap_axes(file, rows, mocap_body)
+            settings: dict[str, Any] = {"kind": "csv", "mocap_up": axes.up, "mocap_bow": axes.bow}
+            settings |= {} if mocap_body is None else {"mocap_body": mocap_body}
+            return read_mocap(file, axes, mocap_body, rows), settings
         if column_names is None:
             delimiter, cells, (header_row, n_lines_above) = _detect_delimiter(path, lines)
             if header_row + 1 < n_lines_above:
@@ -493,12 +483,12 @@ def _find_values(lines: Sequence[str]) -> tuple[str, list[list[str]], int] | Non
         # the last delimiter may end the line
         later_rows = [row[:-1] if row and not row[-1] else row for row in later_rows]
         n_columns = len(later_rows[0]) if later_rows else 0
-        is_regular = [len(row) == n_columns and all(map(_is_value, row)) for row in later_rows]
+        is_regular = [len(row) == n_columns and all(map(is_value, row)) for row in later_rows]
         if n_columns < 2 or 2 * sum(is_regular) <= len(is_regular):
             continue
         rows = [row[:-1] if len(row) == n_columns + 1 and not row[-1] else row for row in rows]
         for i, row in enumerate(rows):
-            if len(row) == n_columns and all(map(_is_value, row)):
+            if len(row) == n_columns and all(map(is_value, row)):
                 return delimiter, rows, i
     return None
 
@@ -535,7 +525,7 @@ def _propose_names(lines: Sequence[str], n_columns: int) -> list[str]:
     for line in reversed(lines):
         words = [word for word in re.split(r"[\s,;|]+", line) if re.search(r"\w", word)]
         names = words[-n_columns:]
-        if len(names) < n_columns or len({*names}) < n_columns or any(map(_is_value, names)):
+        if len(names) < n_columns or len({*names}) < n_columns or any(map(is_value, names)):
             continue
         parsed_names = [parse_name(name) for name in names]
         n_known = sum(
@@ -565,17 +555,12 @@ def _locate_values(path: Path, delimiter: str, file: Path, names: Sequence[str])
         for i, line in enumerate(islice(stream, _HEADER_SEARCH_LINES)):
             row = split_line(line.rstrip("\r\n"), delimiter)
             row = row[:-1] if len(row) == len(names) + 1 and not row[-1] else row
-            if len(row) == len(names) and 2 * sum(map(_is_value, row)) > len(row):
+            if len(row) == len(names) and 2 * sum(map(is_value, row)) > len(row):
                 return Header(tuple(names), i)
     raise DataError(
         f"{path}: no line has {len(names)} numbers, one for each of the `names`; check `names` and"
         " `delimiter`"
     )
-
-
-def _is_value(cell: str) -> bool:
-    """Return whether a cell is a number, with or without a unit, a date or a time of day."""
-    return bool(_NUMBER.fullmatch(cell) or _TIME.match(cell) or _parse_trailing_unit(cell))
 
 
 def _iter_numbered_rows(stream: TextIO, delimiter: str) -> Iterator[tuple[int, list[str]]]:
@@ -591,7 +576,7 @@ def _iter_numbered_rows(stream: TextIO, delimiter: str) -> Iterator[tuple[int, l
 def count_numbers(line: str) -> int:
     """Return the number of cells of a line of numbers; 0 if a cell is no number."""
     cells = [cell for cell in re.split(r"[\s,;|]+", line) if cell]
-    return len(cells) if all(map(_is_value, cells)) else 0
+    return len(cells) if all(map(is_value, cells)) else 0
 
 
 def _find_header_with_columns(
@@ -655,7 +640,7 @@ def _count_unit_lines(rows: Sequence[Sequence[str]], column_positions: Iterable[
     count = 0
     for row in rows[:_MAX_UNIT_LINES]:
         cells = [row[i] for i in column_positions if i < len(row)]
-        if not any(cells) or any(map(_is_value, cells)):
+        if not any(cells) or any(map(is_value, cells)):
             break
         count += 1
     return count
@@ -671,7 +656,7 @@ def find_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
         The indices of both rows; None if no row above the values can be a header.
     """
     n_filled = [sum(map(bool, row)) for row in rows]
-    n_values = [sum(map(_is_value, row)) for row in rows]
+    n_values = [sum(map(is_value, row)) for row in rows]
     # the second half of the rows belongs to the table, whatever precedes it
     later_counts = sorted(n_filled[len(n_filled) // 2 :])
     typical_count = later_counts[len(later_counts) // 2] if rows else 0
@@ -685,7 +670,7 @@ def find_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
         # below a title of several cells are names, below a header are values
         following_rows = rows[first_value_row : first_value_row + 3]
         if following_rows and not any(
-            sum(map(_is_value, cells)) >= 0.3 * typical_count for cells in following_rows
+            sum(map(is_value, cells)) >= 0.3 * typical_count for cells in following_rows
         ):
             continue
         # skip a row that groups columns: it repeats names, and the row below it does not
@@ -702,7 +687,7 @@ def find_header(rows: Sequence[Sequence[str]]) -> tuple[int, int] | None:
             names = rows[first_value_row + nested_header[0]]
             if (
                 names != rows[header_row]
-                and not any(map(_is_value, names))
+                and not any(map(is_value, names))
                 and not _has_repeated_cells(names)
             ):
                 return first_value_row + nested_header[0], first_value_row + nested_header[1]

@@ -113,6 +113,24 @@ def infer_time_unit(step: float) -> str:
     return next((unit for unit, limit in step_limits if step <= limit), "ns")
 
 
+def guess_time_unit(values: np.ndarray) -> tuple[str, str]:
+    """Guess the unit of times [T] from their size and step; return the unit and the reason."""
+    finite_values = values[np.isfinite(values)]
+    step = float(np.median(np.diff(finite_values)))
+    median_size = float(np.median(np.abs(finite_values)))
+    if unix_unit := detect_unix_unit(finite_values):
+        return unix_unit, f"numbers of this size are Unix time in {unix_unit}"
+    if step < 1e-3 and (2e4 < median_size < 7e4 or is_datenum(finite_values)):
+        return "day", "numbers of this size are the days of Excel or MATLAB"
+    unit = infer_time_unit(step)
+    return unit, f"the header has no unit; steps of {step:g} would be {unit}"
+
+
+def is_datenum(values: np.ndarray) -> bool:
+    """Return whether numbers [T] are days since year 0, as MATLAB counts them, of our time."""
+    return 6.5e5 < float(np.median(np.abs(values))) < 8e5
+
+
 _ROWS_PER_CHUNK = 250_000
 """Rows that are parsed at a time: the intermediate columns of 3 million rows take 1 GB."""
 

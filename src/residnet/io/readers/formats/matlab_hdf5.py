@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -26,7 +27,13 @@ from residnet.io.readers.recording import (
     TimeStamps,
     build_recording,
 )
-from residnet.io.readers.timestamps import parse_numbers, parse_texts
+from residnet.io.readers.timestamps import (
+    detect_unix_unit,
+    guess_time_unit,
+    is_datenum,
+    parse_numbers,
+    parse_texts,
+)
 
 if TYPE_CHECKING:
     import h5py
@@ -56,7 +63,7 @@ class TreeTime(Config):
     Attributes:
         column: name of the vector; null searches common names (t, time, timestamp, ...).
         unit: unit of the vector, or `datenum` for MATLAB's days since year 0; null detects Unix
-            time in s, ms, us or ns by its size and takes smaller numbers as s.
+            time, days and the unit of other numbers by their size and step.
     """
 
     column: str | None = Field(default=None, min_length=1)
@@ -77,14 +84,24 @@ class TreeTime(Config):
         """
         if values.dtype.kind not in "biuf":
             return parse_texts(values)
-        if self.unit != "datenum":
-            return parse_numbers(values, None if self.unit is None else to_si(self.unit))
+        unit = self.unit
+        remarks: tuple[Remark, ...] = ()
+        if unit is None and np.isfinite(values).all() and not detect_unix_unit(values):
+            unit, reason = guess_time_unit(values)
+            if unit != "s":
+                remarks = (make_remark("note", "time_unit", f"time: {reason}"),)
+            unit = "datenum" if unit == "day" and is_datenum(values) else unit
+        if unit != "datenum":
+            stamps = parse_numbers(values, None if unit in (None, "s") else to_si(unit))
+            return dataclasses.replace(stamps, remarks=(*stamps.remarks, *remarks))
         days = np.floor(values)
         # integer and fraction separately: ns since 1970 exceed the 53 bits of a float
         whole_days_ns = (days - _DATENUM_1970) * _SECONDS_PER_DAY * 1e9
         fraction_ns = (values - days) * _SECONDS_PER_DAY * 1e9
         return TimeStamps(
-            whole_days_ns.astype(np.int64) + np.rint(fraction_ns).astype(np.int64), True
+            whole_days_ns.astype(np.int64) + np.rint(fraction_ns).astype(np.int64),
+            True,
+            remarks=remarks,
         )
 
 

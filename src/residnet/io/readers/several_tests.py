@@ -1,0 +1,253 @@
+"""Files with several tests, each of which is a log with a path below that of its file.
+
+The path of a test is `book.xlsx/Test_3_Zigzag_10_10`. Commands and configs find the tests of a
+file by `expand_files`; the readers of tables read them like files.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from residnet.core.errors import ResidnetError, UsageError
+from residnet.core.names import suggest_name
+from residnet.io.header_vocabulary import MANOEUVRE_PATTERNS, normalize_name
+from residnet.io.readers.base import locate_file
+from residnet.io.readers.cell_values import is_value
+from residnet.io.readers.excel_cells import list_worksheets, read_cells
+from residnet.io.readers.table_lines import WHITESPACE_DELIMITER, split_line
+from residnet.io.readers.table_sections import (
+    RowKind,
+    Rows,
+    Section,
+    classify_cells,
+    find_sections,
+    select_similar,
+)
+from residnet.io.readers.text_encoding import open_as_utf8
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_TEXT_ENDINGS = (".csv", ".tsv", ".txt", ".dat")
+_MAX_TEXT_BYTES = 64_000_000
+"""Size of the largest text in which several tests are searched; longer ones are one log."""
+_SAMPLED_LINES = 300
+"""Lines by which the separator of cells is chosen."""
+_NUMBERS_AT_START = re.compile(r"\s*[\"']?[-+]?\.?\d")
+_WORD = re.compile(r"[^\W\d_]{3}")
+
+
+class PlacedTest(NamedTuple):
+    """Place of one test in a file.
+
+    Attributes:
+        name: name of the test, without characters that have a meaning in paths.
+        sheet: name of its sheet; empty for a text.
+        section: its rows and columns.
+        delimiter: separator of cells; empty for a sheet.
+    """
+
+    name: str
+    sheet: str
+    section: Section
+    delimiter: str
+
+    @property
+    def row_offset(self) -> int:
+        """Number to add to a row of the extracted test to get its row in the file."""
+        return self.section.start - len(self.section.head_rows)
+
+
+def expand_files(paths: Iterable[Path]) -> list[Path]:
+    """Return paths with the tests of each file that has several in its place."""
+    return [test for path in paths for test in (list_tests(path) or [path])]
+
+
+def list_tests(path: Path) -> list[Path]:
+    """Return the paths of the tests of a file; empty if it has one test or cannot be read."""
+    if path.suffix.lower() not in (*_TEXT_ENDINGS, ".xlsx") or not path.is_file():
+        return []
+    try:
+        return [path / test.name for test in _find_tests_of(path)]
+    except (ResidnetError, OSError):
+        # the reader of the file says what is wrong
+        return []
+
+
+def find_test(path: Path) -> PlacedTest | None:
+    """Return the place of a test in its file; None for a path of a file.
+
+    Raises:
+        UsageError: if the file has no test of this name.
+    """
+    file = locate_file(path)
+    if file == path:
+        return None
+    tests = {test.name: test for test in _find_tests_of(file)}
+    if path.name not in tests:
+        raise UsageError(f"{path}: no test of this name{suggest_name(path.name, tests)}")
+    return tests[path.name]
+
+
+@contextmanager
+def open_test_as_utf8(path: Path, encoding: str | None = None) -> Iterator[tuple[Path, int]]:
+    """Provide the text of a file, or of one of its tests, in UTF-8.
+
+    Args:
+        path: path of a file or a test.
+        encoding: see `open_as_utf8`.
+
+    Yields:
+        The file with the text, and the number to add to its rows to get those of the file.
+
+    Raises:
+        UsageError: if the test does not exist.
+        DataError: if the file is no text in this encoding.
+    """
+    test = find_test(path)
+    with open_as_utf8(locate_file(path), encoding) as file:
+        if test is None:
+            yield file, 0
+            return
+        section = test.section
+        with file.open(encoding="utf-8-sig") as stream:
+            lines = stream.read().splitlines()
+        indices = [*section.head_rows, *range(section.start, section.stop)]
+        if section.columns is None:
+            text_lines = [lines[i] for i in indices]
+        else:
+            columns = slice(*section.columns)
+            text_lines = [
+                test.delimiter.join(split_line(lines[i], test.delimiter)[columns]) for i in indices
+            ]
+        with tempfile.TemporaryDirectory() as folder:
+            copy = Path(folder) / f"{path.name}{locate_file(path).suffix}"
+            copy.write_text("\n".join([*text_lines, ""]), encoding="utf-8")
+            yield copy, test.row_offset
+
+
+def read_excel_cells(path: Path, sheet: str | None, rows: int | None) -> tuple[pd.DataFrame, int]:
+    """Return the cells of a sheet, or of one test of an Excel file.
+
+    Args:
+        path: path of a file or a test.
+        sheet: name of the sheet; None takes that of the test, or the first one.
+        rows: largest number of rows to read; None reads all.
+
+    Returns:
+        The cells, and the number to add to their rows to get those of the sheet.
+    """
+    test = find_test(path)
+    if test is None:
+        return read_cells(path, list_worksheets(path)[0] if sheet is None else sheet, rows), 0
+    section = test.section
+    cells = read_cells(locate_file(path), test.sheet, None)
+    row_indices = [*section.head_rows, *range(section.start, section.stop)][:rows]
+    columns = slice(None) if section.columns is None else slice(*section.columns)
+    selected = cells.iloc[row_indices, columns].reset_index(drop=True)
+    return selected, test.row_offset
+
+
+def _find_tests_of(file: Path) -> tuple[PlacedTest, ...]:
+    stat = file.stat()
+    return _find_tests_of_version(file, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=256)
+def _find_tests_of_version(file: Path, modified_ns: int, size: int) -> tuple[PlacedTest, ...]:
+    """Find the tests of a file; `modified_ns` and `size` distinguish its versions."""
+    if file.suffix.lower() == ".xlsx":
+        places = [
+            ("" if len(sections) > 1 else sheet, sheet, section, "")
+            for sheet in list_worksheets(file)
+            for sections in [find_sections(_rows_of_cells(read_cells(file, sheet, None)))]
+            for section in sections
+        ]
+    elif size <= _MAX_TEXT_BYTES:
+        with open_as_utf8(file) as text_file, text_file.open(encoding="utf-8-sig") as stream:
+            lines = stream.read().splitlines()
+        delimiter = _choose_delimiter(lines)
+        sections = find_sections(_rows_of_lines(lines, delimiter)) if delimiter else []
+        places = [("", "", section, delimiter) for section in sections]
+    else:
+        return ()
+    similar = select_similar([section for _, _, section, _ in places])
+    names: list[str] = []
+    tests = []
+    for number, k in enumerate(similar, 1):
+        sheet_title, sheet, section, delimiter = places[k]
+        name = _name_test(sheet_title, section.title, number)
+        name = name if name not in names else f"{name}_{number}"
+        names.append(name)
+        tests.append(PlacedTest(name, sheet, section, delimiter))
+    return tuple(tests)
+
+
+def _name_test(sheet: str, title: str, number: int) -> str:
+    """Return the name of a test from its sheet and title, or from its number.
+
+    The sheet names the test, and the title adds the manoeuvre that it lacks.
+    """
+    kinds = [
+        kind
+        for kind, pattern in MANOEUVRE_PATTERNS.items()
+        if pattern.search(normalize_name(title)) and not pattern.search(normalize_name(sheet))
+    ]
+    title = re.sub(r"^(?:type|test type)\W+", "", title, flags=re.IGNORECASE)
+    title = title.removeprefix(sheet).strip(" :,;-")
+    text = f"{sheet} {title if kinds else ''}" if sheet else title
+    # names of paths have neither separators nor points, which would begin an extension
+    return re.sub(r"[^\w+-]+", "_", text).strip("_") or f"test_{number}"
+
+
+def _rows_of_cells(cells: pd.DataFrame) -> Rows:
+    """Return the rows of a sheet as texts."""
+    table = [
+        ["" if cell is None or cell != cell else str(cell).strip() for cell in row]
+        for row in cells.itertuples(index=False)
+    ]
+    kinds = [classify_cells(row) for row in table]
+    return Rows(len(table), table.__getitem__, kinds.__getitem__)
+
+
+def _rows_of_lines(lines: Sequence[str], delimiter: str) -> Rows:
+    """Return the rows of a text, which are split into cells when they are needed."""
+
+    def classify(i: int) -> RowKind:
+        line = lines[i]
+        # most lines are numbers, which their beginning shows
+        if _NUMBERS_AT_START.match(line) and delimiter in line and not _WORD.search(line):
+            return "values"
+        return "text" if line.lstrip()[:1] in ("#", "%") else classify_cells(split(i))
+
+    def split(i: int) -> Sequence[str]:
+        line = lines[i]
+        if '"' in line or delimiter == WHITESPACE_DELIMITER:
+            return split_line(line, delimiter)
+        return [cell.strip() for cell in line.split(delimiter)]
+
+    return Rows(len(lines), split, classify)
+
+
+def _choose_delimiter(lines: Sequence[str]) -> str:
+    """Return the separator with most rows of values; empty if there are no such rows."""
+    sample = [line for line in lines if line.strip()][:_SAMPLED_LINES]
+
+    def count_values(delimiter: str) -> int:
+        return sum(
+            len(cells) > 1 and 2 * sum(map(is_value, cells)) > len(cells)
+            for cells in (split_line(line, delimiter) for line in sample)
+        )
+
+    counts = {delimiter: count_values(delimiter) for delimiter in (";", "\t", "|", ",")}
+    best = max(counts, key=lambda delimiter: counts[delimiter])
+    if not counts[best]:
+        best = WHITESPACE_DELIMITER
+        return best if count_values(best) else ""
+    return best
