@@ -16,7 +16,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_json
 from residnet.core.format import DASH, format_interval, format_number
 from residnet.core.names import suggest_name, to_si
-from residnet.io.readers.text_tables import open_as_utf8
+from residnet.io.readers.text_encoding import open_as_utf8
 from residnet.physics.actuators.identify import (
     IntervalEstimate,
     StepResponse,
