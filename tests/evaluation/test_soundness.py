@@ -135,7 +135,7 @@ def test_damping_of_the_wrong_sign_and_running_away(change: Terms, said: str) ->
     assert found[DAMPING].ok is False
     assert said in found[DAMPING].fault
     assert found[DAMPING].text.startswith("unsound: its damping")
-    assert "runs away within" in found[BOUNDEDNESS].fault
+    assert "diverges within" in found[BOUNDEDNESS].fault
     assert "recorded inputs (n " in found[BOUNDEDNESS].fault
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -362,3 +363,23 @@ def test_a_browser_draws_every_panel_of_a_fit_and_the_controls_work(run: Path) -
         whole = pytest.approx(1.0, abs=0.01)
         done = dict.fromkeys(("focused", "hidden", "chosen"), True)
         assert found.used == {**done, "zoomed": near, "reset": whole}
+
+
+@pytest.mark.parametrize("amplitude", [0.04, 3.2, 0.9])
+def test_tick_labels_of_low_panels_do_not_overlap(amplitude: float) -> None:
+    time = np.linspace(0.0, 60.0, 100)
+    curve = (time, 0.855 + amplitude * np.sin(time / 9.0))
+    panels = [Panel("", "u", height=62), Panel("t [s]", "v", height=62)]
+    figure = Figure(
+        "low", "Low", "", {"a": GlyphStyle("a", BLUE)}, panels, [Case("", [{"a": curve}] * 2)]
+    )
+    canvas = render_matplotlib(figure, width=3.0)
+    for axes in canvas.axes:
+        lower, upper = axes.get_ylim()
+        extents = sorted(
+            (label.get_window_extent().y0, label.get_window_extent().y1)
+            for tick, label in zip(axes.get_yticks(), axes.get_yticklabels(), strict=True)
+            if lower <= tick <= upper
+        )
+        assert len(extents) >= 2
+        assert all(below[1] < above[0] for below, above in pairwise(extents))

@@ -736,13 +736,13 @@ def check_boundedness(
         return _to_sanity_finding(spec, BOUNDEDNESS, True, text, "")
     if first_diverged < n_recorded:
         fault = (
-            f"it runs away within {float(divergence_time[first_diverged]):.0f} s from a recorded"
+            f"it diverges within {float(divergence_time[first_diverged]):.0f} s from a recorded"
             f" state with recorded"
             f" inputs ({inputs})"
         )
         return _to_sanity_finding(spec, BOUNDEDNESS, False, limit_text.strip("()"), fault)
     text = (
-        f"runs away within {float(divergence_time[first_diverged]):.0f} s with {inputs} held"
+        f"diverges within {float(divergence_time[first_diverged]):.0f} s with {inputs} held"
         f" from rest {limit_text}"
     )
     return _to_sanity_finding(spec, BOUNDEDNESS, False, text, "")

@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -150,9 +151,40 @@ def render_matplotlib(
         canvas.set_figheight(canvas.get_figheight() + extra_height)
         draw = canvas.canvas.draw if is_rasterized else canvas.draw_without_rendering
         draw()
-        if _wrap_axis_labels(canvas):
+        is_changed = _wrap_axis_labels(canvas)
+        if _remove_overlapping_ticks(canvas) or is_changed:
             draw()
     return canvas
+
+
+def _remove_overlapping_ticks(canvas: Canvas) -> bool:
+    """Remove every second tick of vertical axes whose tick labels overlap; return if any does.
+
+    The automatic ticks of a low panel are at least two intervals apart, for which the height of
+    their labels may be too large. Ticks with given names are not changed.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    is_changed = False
+    for axes in canvas.axes:
+        if not isinstance(axes.yaxis.get_major_locator(), MaxNLocator):
+            continue
+        lower, upper = sorted(axes.get_ylim())
+        labels = axes.yaxis.get_ticklabels()
+        ticks = [
+            (float(tick), label.get_window_extent())
+            for tick, label in zip(axes.yaxis.get_majorticklocs(), labels, strict=False)
+            if lower <= tick <= upper and label.get_text()
+        ]
+        extents = sorted((extent.y0, extent.y1) for _, extent in ticks)
+        # a browser may have a slightly larger font
+        has_overlap = any(
+            above[0] - below[1] < 0.2 * (below[1] - below[0]) for below, above in pairwise(extents)
+        )
+        if has_overlap and len(ticks) > 2:
+            axes.set_yticks([tick for tick, _ in ticks[::2]])
+            is_changed = True
+    return is_changed
 
 
 def _wrap_axis_labels(canvas: Canvas) -> bool:
