@@ -119,13 +119,13 @@ def test_a_vessel_that_behaves_passes(vessel: tuple[ModelSpec, HybridDynamics]) 
     coasting = {name: row for name, row in RUDDER.items() if name in "uvr"}
     found = findings(*made(coasting, (), low=(0.0, -0.4, -0.2), high=(2.0, 0.4, 0.2)))
     assert found[BOUNDEDNESS].ok
-    assert "1 from rest" in found[BOUNDEDNESS].text
+    assert "1 from zero speed" in found[BOUNDEDNESS].text
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"u": (0.02, 0, 0)}, "d(u_dot)/du +0.02 1/s, positive at 100% of it"),
+        ({"u": (0.02, 0, 0)}, "d(u_dot)/du +0.02 1/s, positive at 100 %"),
         ({"r": (0, -0.2, 0.1)}, "d(r_dot)/dr +0.1 1/s"),
         ({"v": (0, 0.1, 0.05)}, "d(v_dot)/dv +0.1 1/s"),
     ],
