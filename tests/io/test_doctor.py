@@ -223,7 +223,10 @@ def test_estimate_position_causes_measures_lags_in_seconds(lag: float) -> None:
     [
         ("dinghy", (0.0, 0.0)),
         ("catamaran", (0.0, 0.0)),
+        ("dinghy", (0.0, 0.8)),
+        ("catamaran", (0.0, 0.8)),
         ("dinghy", (0.65, 0.65)),
+        ("catamaran", (0.65, 0.65)),
         ("dinghy", (1.2, 0.3)),
         ("catamaran", (1.2, 0.3)),
     ],
@@ -248,8 +251,24 @@ def test_estimate_position_causes_separates_clocks(boat: str, delays: tuple[floa
         common = sizes.get("lag_xy", 0.0)
         surge_delay = sizes.get("lag", 0.0) + sizes.get("lag_u", 0.0) - common
         estimates.append((surge_delay, sizes.get("lag_psi", 0.0) - common))
-    median = np.median(estimates, axis=0)
-    assert median == pytest.approx(delays, abs=0.02, rel=0.1)
+        assert not any(name.startswith("gain") for name in causes)
+    assert np.array(estimates) == pytest.approx(np.tile(delays, (4, 1)), abs=0.03, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("values", "place"),
+    [
+        (np.where(T < 100.0, LOG["v"], LOG["v"][999]), "from t = 1"),
+        (0.4 * np.sin(0.17 * T), "heading (correlation"),
+    ],
+)
+def test_a_sway_velocity_that_does_not_follow_is_no_wrong_heading(
+    values: np.ndarray, place: str
+) -> None:
+    report = inspect_log(changed(v=values))
+    (finding,) = report.find_by_code("sway_unrelated")
+    assert place in finding.text
+    assert not any("course" in line for line in report.to_lines())
 
 
 def test_check_relative_wind_accepts_a_true_wind() -> None:

@@ -142,6 +142,24 @@ def test_the_symbol_u_is_the_speed_or_the_surge_velocity_by_the_track(tmp_path: 
     assert "'u [m/s]' next to the drift angle 'beta [deg]' is assumed the speed" in text
 
 
+@pytest.mark.parametrize(
+    ("is_other_motion", "text"),
+    [(True, "does not follow position and heading"), (False, "does not move")],
+)
+def test_a_drift_angle_of_another_time_or_at_zero_is_left_out(
+    is_other_motion: bool, text: str, tmp_path: Path
+) -> None:
+    trip = TRUTH[0]
+    beta = np.degrees(np.arctan2(-trip.v, trip.u)).to_numpy()
+    beta = 12.0 * np.sin(0.9 * trip.t) if is_other_motion else 0.0 * beta
+    table = {"t": trip.t, "x [m]": trip.x, "y [m]": trip.y, "psi [deg]": np.degrees(trip.psi)}
+    table |= {"V": np.hypot(trip.u, trip.v), "beta": beta, "rudder": trip.delta}
+    channels, notes = draft(table, tmp_path / "trip.csv")
+    assert not {"speed", "drift_angle", "u", "v"} & channels.keys()
+    assert f"'beta' {text}" in notes
+    assert "'V' and 'beta' are left out: u and v follow from position and heading" in notes
+
+
 def test_an_angle_that_is_no_drift_angle_is_left_out(tmp_path: Path) -> None:
     trip = TRUTH[0]
     table = {"t": trip.t, "x [m]": trip.x, "y [m]": trip.y, "psi [deg]": np.degrees(trip.psi)}

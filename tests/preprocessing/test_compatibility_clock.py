@@ -11,12 +11,12 @@ from residnet.preprocessing.compatibility.clock import estimate_clock_from_rate
 
 
 def simulate_turns(
-    rng: np.random.Generator, duration: float
+    rng: np.random.Generator, duration: float, period: float = 4.0, rate: float = 0.15
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times at 20 Hz, heading in rad and yaw rate in rad/s of irregular turns."""
     t = np.arange(0.0, duration, 0.05)
-    knots = np.arange(-10.0, duration + 10.0, 4.0)
-    yaw_rate = np.interp(t, knots, rng.normal(0.0, 0.15, knots.size))
+    knots = np.arange(-3.0 * period, duration + 3.0 * period, period)
+    yaw_rate = np.interp(t, knots, rng.normal(0.0, rate, knots.size))
     heading = np.append(0.0, np.cumsum(0.025 * (yaw_rate[1:] + yaw_rate[:-1])))
     return t, heading, yaw_rate
 
@@ -46,6 +46,19 @@ def test_offset_up_to_an_hour_with_bias_drift_and_dropouts(seed: int) -> None:
     assert estimate.margin > 8.0
     errors = estimate.convert_times(board_times) - rate_times
     assert float(np.sqrt(np.mean(errors**2))) < 0.08
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_offset_of_slow_turns_within_the_noise_of_the_derivative(seed: int) -> None:
+    rng = np.random.default_rng(300 + seed)
+    t, heading, yaw_rate = simulate_turns(rng, 240.0, period=20.0, rate=0.025)
+    noisy_heading = heading[::4] + rng.normal(0.0, 0.01, t[::4].size)
+    noisy_rate = yaw_rate[::2] + rng.normal(0.0, 0.01, t[::2].size)
+    estimate = estimate_clock_from_rate(t[::4], noisy_heading, t[::2] - 1234.5, noisy_rate)
+    assert estimate is not None
+    assert estimate.margin > 8.0
+    assert abs(estimate.correlation) > 0.7
+    assert abs(estimate.seconds - 1234.5) < min(4.0 * estimate.standard_error, 1.0)
 
 
 def test_offset_has_a_calibrated_standard_error() -> None:

@@ -202,6 +202,5 @@ def _test_current(ranking: list[RankedHypothesis], log: Log) -> CurrentTest:
         p_value=p_value,
         is_significant=p_value < _MAX_CURRENT_P_VALUE
         and size > max(3.5 * standard_error, _MIN_CURRENT_SHARE * speed)
-        and north.is_determined
-        and east.is_determined,
+        and all(component.is_determined or component.is_significant for component in (north, east)),
     )

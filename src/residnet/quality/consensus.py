@@ -512,14 +512,21 @@ class Fleet:
             for i in of
         }
 
-    def estimate_local_mse(self, inliers: Sequence[int], i: int) -> np.ndarray:
-        """Return the mean squared residual [n] of the inliers in the motions of another log.
+    def estimate_local_squares(
+        self, inliers: Sequence[int], data: BlockData, excluding: int | None
+    ) -> np.ndarray:
+        """Return the squared residuals [K, n] of the inliers in the motions of another log.
 
         Each block of the log is paired with the nearest block of the inliers, whose residual is
         that of a model without its log. Near replicates measure the lack of fit where the log is
         (Daniel and Wood 1980), which the median over all manoeuvres does not.
+
+        Args:
+            inliers: indices of the inliers.
+            data: scaled data of the other log.
+            excluding: index of the other log; None if it is none of the fleet.
         """
-        references = [j for j in inliers if j != i]
+        references = [j for j in inliers if j != excluding]
         references = references[:: -(-len(references) // MAX_REFERENCES)]
         fits = self.fit_leave_one_out(inliers, references)
         squares = [
@@ -528,7 +535,7 @@ class Fleet:
             for j in references
         ]
         tree = scipy.spatial.cKDTree(np.concatenate([self.data[j].X for j in references]))
-        return np.asarray(np.concatenate(squares)[tree.query(self.data[i].X)[1]].mean(0))
+        return np.asarray(np.concatenate(squares)[tree.query(data.X)[1]])
 
     @cached_property
     def feature_groups(self) -> list[np.ndarray]:
@@ -683,7 +690,8 @@ class Consensus:
         """
         if len(self.inliers) <= MAX_SPARSE_LOGS:
             return self.is_outlier(i)
-        min_variance = {i: self.fleet.estimate_local_mse(self.inliers, i)}
+        squares = self.fleet.estimate_local_squares(self.inliers, self.fleet.data[i], i)
+        min_variance = {i: squares.mean(0)}
         return self.fleet.score_logs(self.inliers, [i], min_variance)[i].severity > 1.0
 
     def compute_influence(self, i: int) -> float:
@@ -702,15 +710,23 @@ class Consensus:
 
     def find_unexplained_idle(self, i: int) -> list[tuple[int, int]]:
         """Return the unexplained idle stretches of one of the logs, first and last samples."""
-        fleet = self.fleet
-        if i not in fleet.usable or len(self.inliers) < 2 or not fleet.actuators:
+        if i not in self.fleet.usable or len(self.inliers) < 2 or not self.fleet.actuators:
             return []
         if i not in self.idle:
             # all of an outlier is unexplained, so there only inputs at exactly zero count
             at_zero = i not in self.inliers
-            self.idle[i] = self.find_idle_stretches(
-                fleet.logs[i], fleet.data[i], i, at_zero=at_zero
-            )
+
+            def find_under(consensus: Consensus) -> list[tuple[int, int]]:
+                fleet = consensus.fleet
+                return consensus.find_idle_stretches(
+                    fleet.logs[i], fleet.data[i], i, at_zero=at_zero
+                )
+
+            stretches = find_under(self)
+            # where the features lack terms of the vessel, the model with these terms decides
+            if stretches and self.adequate is not self:
+                stretches = find_under(self.adequate) if self.adequate else []
+            self.idle[i] = stretches
         return self.idle[i]
 
     def find_idle_stretches(
@@ -737,12 +753,23 @@ class Consensus:
         is_long = stops - starts >= data.length
         if not is_long.any():
             return []
-        z = self.fit_inliers(excluding).standardize_residuals(data)
+        fit = self.fit_inliers(excluding)
+        z = fit.standardize_residuals(data)
         idle = []
+        # a steady turn or a stop is unlike the median motion: its lack of fit is that of like ones
+        has_replicates = len(self.inliers) > MAX_SPARSE_LOGS
+        local_squares = (
+            self.fleet.estimate_local_squares(self.inliers, data, excluding)
+            if has_replicates
+            else np.zeros_like(z)
+        )
+        usual_squares = fit.compute_predictive_std(data) ** 2
         for start, stop in zip(starts[is_long].tolist(), stops[is_long].tolist(), strict=True):
             inside = (data.start >= start) & (data.start + data.length <= stop)
             if inside.sum() > 1:
-                unexplained = np.sqrt(np.mean(z[inside] ** 2, axis=0)) > MIN_UNEXPLAINED_Z
+                variance_ratio = local_squares[inside].mean(0) / usual_squares[inside].mean(0)
+                mean_square = np.mean(z[inside] ** 2, axis=0) / np.maximum(variance_ratio, 1.0)
+                unexplained = np.sqrt(mean_square) > MIN_UNEXPLAINED_Z
                 material = np.sqrt(np.mean(data.Y[inside] ** 2, axis=0)) > MIN_MATERIAL_ERROR
                 if (unexplained & material).any():
                     idle.append((start, stop))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from residnet.core.names import POSE_NAMES, VELOCITY_NAMES
+from residnet.core.stretches import find_runs
 from residnet.preprocessing.channel_values import (
     NEGLIGIBLE_MOTION_SHARE,
     SIGMA_OF_MAD,
@@ -351,10 +352,63 @@ def _report_jumps(
 def check_position_causes(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report the causes of differences between position and velocities in correct frames."""
     frame_agreement = log.cached(compare_frames)
-    if frame_agreement is not None and frame_agreement.is_consistent:
-        yield from make_cause_findings(
-            log.cached(estimate_position_causes), POSITION_LIMITS, log, make_finding
+    if frame_agreement is None or not frame_agreement.is_consistent:
+        return
+    causes = log.cached(estimate_position_causes)
+    if "gain_v" in causes and causes["gain_v"].is_gross and (text := describe_unrelated_sway(log)):
+        yield make_finding(
+            text,
+            code="sway_unrelated",
+            level="will mislead",
+            fix="mask v there, or leave it (or the drift angle) out: x, y and psi give it",
         )
+        causes = {name: cause for name, cause in causes.items() if not name.endswith("_v")}
+    yield from make_cause_findings(causes, POSITION_LIMITS, log, make_finding)
+
+
+_N_SWAY_SECTIONS = 12
+"""Sections of a log in which v is compared with the sway velocity from the position."""
+_MIN_SWAY_CORRELATION = 0.5
+"""Smallest correlation of v with this sway velocity if it has a wrong sign or unit only."""
+_MAX_SWAY_RESIDUAL_SHARE = 0.5
+"""Largest unexplained share of the variance in a section in which v follows the position."""
+
+
+def describe_unrelated_sway(log: LogStatistics) -> str:
+    """Describe where v does not follow position and heading; empty if another cause explains that.
+
+    No gain explains a sensor that is frozen for some time, or a column of another clock. A heading
+    that is the course leaves no sway velocity in the position.
+    """
+    rates = log.cached(compute_averaged_rates)
+    difference = rates.ground_velocity - rates.body_velocity["as declared"]
+    v = rates.averaged_velocities["v"]
+    sway = v + (np.exp(-1j * log["psi"]) * difference).imag
+    rows = np.flatnonzero(np.isfinite(sway) & np.isfinite(v))
+    if rows.size < MIN_SAMPLES or float(np.std(sway[rows])) < float(np.std(v[rows])) / 3.0:
+        return ""
+    sections = np.array_split(rows, _N_SWAY_SECTIONS)
+    is_following = np.array(
+        [
+            float(np.var((sway - v)[section]))
+            < _MAX_SWAY_RESIDUAL_SHARE * float(np.var(sway[section]))
+            for section in sections
+        ]
+    )
+    correlation = float(np.corrcoef(sway[rows], v[rows])[0, 1]) if v[rows].any() else 0.0
+    if not is_following.any() and abs(correlation) > _MIN_SWAY_CORRELATION:
+        return ""
+    place = ""
+    starts, stops = find_runs(~is_following)
+    # times of a subsample of a long log are not those of the log
+    if starts.size == 1 and is_following.any() and not log.near_seam(1).any():
+        start = log.t[sections[starts[0]][0]]
+        stop = log.t[sections[stops[0] - 1][-1]]
+        place = f" from t = {start:.0f} to {stop:.0f} s"
+    return (
+        f"v does not follow position and heading{place} (correlation over the log"
+        f" {correlation:.2f}): a frozen sensor, or another clock?"
+    )
 
 
 _YAW_MOTION = (*POSE_NAMES, "r")

@@ -17,8 +17,9 @@ filter. Terms of second and third order are selected beside a lag as nuisances.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -50,6 +51,43 @@ _LAG_OF_CURVATURE = {
     for name in ("lag", "lag_u", "lag_v", "lag_psi", "lag_xy")
 }
 """Terms of second and third order -> lag without which they are not selected."""
+_YAW_CLOCKS = {"lag": ("r",)}
+_POSITION_CLOCKS = {
+    "lag_psi": ("psi",),
+    "lag": ("u", "v"),
+    "lag_xy": ("psi", "u", "v"),
+    "lag_u": ("u",),
+    "lag_v": ("v",),
+}
+"""Lag -> channels that are shifted in time."""
+_MAX_CLOCK_SAMPLES = 8000
+"""Largest number of samples of a search of delays, which bounds its computing time."""
+_MAX_CLOCKS = 2
+"""Largest number of clocks besides that of the reference."""
+_N_CONTINUED_HYPOTHESES = 2
+"""Number of hypotheses with one clock that are continued by another one."""
+_MAX_SHIFT_CORRECTIONS = 3
+"""Largest number of corrections of the shifts of a hypothesis."""
+_CAUSES_UNLIKE_DELAYS = ("gain_u", "heading", "lever_arm", "current", "bias", "ramp")
+"""Causes that a regression does not select in place of a delay."""
+_MIN_CLOCK_ADVANTAGE = 20.0
+"""Smallest difference of the BIC by which the data distinguish two hypotheses."""
+_MAX_SHIFT = 3.0
+"""Largest delay in s that is tried."""
+_SHIFT_STEP = 0.3
+"""Step in s between delays that are tried."""
+_MISFIT_BLOCK = 0.2
+"""Length in s of the blocks of samples in which shifts are compared."""
+_MAX_ROUNDING_SHARE = 1e-3
+"""Unexplained share of the squared differences below which no delay is searched."""
+_MIN_COMMON_SHARE = 0.7
+"""Smallest number of increments of a hypothesis over the largest one."""
+_MIN_SQUARED_SCALE = 0.01
+"""Smallest variance of residuals over that of the noise: smaller ones are rounding."""
+_SCALE_ITERATIONS = 5
+"""Iterations for the scale of a Student distribution."""
+_STUDENT_DOF = 5.0
+"""Degrees of freedom of the Student distribution of the residuals."""
 _MAX_CAUSES = 4
 """Largest number of causes; chosen by hand, because further ones are collinear."""
 # smallest reduction of the sum of squares by a cause in noise variances
@@ -69,6 +107,10 @@ _MIN_TRUE_SHARE = 1e-3
 """Smallest share of measured values that is true, in the conversion of a coefficient to a gain."""
 _COLLINEARITY_TOLERANCE = 1e-9
 """Squared residual of a unit column regressed on others, below which it is collinear."""
+
+
+Channels = Mapping[str, np.ndarray]
+"""Name of a channel, as measured or smoothed -> values [T]."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +136,120 @@ class KinematicCause:
         return self.is_significant and not 0.6 < 1.0 + float(self.estimates[0]) < 1.6
 
 
+@dataclass(frozen=True)
+class _IncrementModel:
+    """Increments of a pose, and the effects of possible causes on them.
+
+    Attributes:
+        measured_pose: measured pose [T], real or complex; NaN if missing.
+        integrated_increments: integrals of the velocities [T - 1], NaN if missing.
+        dt: time steps [T - 1] in s.
+        pose_noise: standard deviation of the noise of the pose.
+        rate_noise: standard deviation of the noise of the velocity [T - 1].
+        columns: effect of each cause of unit size on the increments, arrays [T - 1].
+    """
+
+    measured_pose: np.ndarray
+    integrated_increments: np.ndarray
+    dt: np.ndarray
+    pose_noise: float
+    rate_noise: np.ndarray
+    columns: dict[str, list[np.ndarray]]
+
+    def compute_block_misfit(self, n_samples: int) -> float:
+        """Return the mean squared residual over blocks of samples, with all causes of the model.
+
+        Residuals beyond three standard deviations count as three.
+        """
+        table = [np.diff(self.measured_pose) - self.integrated_increments]
+        table += [
+            column
+            for name, columns in self.columns.items()
+            # the gain of both velocities is the sum of theirs
+            if not (name == "gain" and "gain_v" in self.columns)
+            for column in columns
+        ]
+        n_blocks = self.dt.size // n_samples
+        blocks = np.array(table)[:, : n_blocks * n_samples]
+        blocks = blocks.reshape(len(table), n_blocks, n_samples).sum(axis=2).T
+        blocks = blocks[np.isfinite(blocks).all(axis=1)]
+        if len(blocks) < 2 * len(table):
+            return math.inf
+        if np.iscomplexobj(blocks):
+            blocks = np.concatenate((blocks.real, blocks.imag))
+        norms = np.maximum(np.linalg.norm(blocks, axis=0), 1e-300)
+        basis = np.linalg.qr(blocks[:, 1:] / norms[1:])[0]
+        residuals = blocks[:, 0] - basis @ (basis.T @ blocks[:, 0])
+        scale = SIGMA_OF_MAD * float(np.median(np.abs(residuals)))
+        return float(np.mean(np.minimum(residuals**2, (3.0 * scale) ** 2)))
+
+
+class _Explanation(NamedTuple):
+    """Selected causes of the increments of a pose.
+
+    Attributes:
+        causes: cause -> estimate, in the order of selection.
+        squares: squared whitened residuals [K] of the increments; NaN where they are not used.
+        dimension: number of components of an increment.
+        response_square: mean squared norm of the whitened increments before the regression.
+        min_deviation: lower bound on the standard deviation of the increments in the whitening.
+        n_parameters: number of columns of the regression.
+    """
+
+    causes: dict[str, KinematicCause]
+    squares: np.ndarray
+    dimension: int
+    response_square: float
+    min_deviation: float
+    n_parameters: int
+
+    @property
+    def has_gross_gain(self) -> bool:
+        """Whether a velocity has a wrong sign or unit, which is less probable than a delay."""
+        return any(name.startswith("gain") and c.is_gross for name, c in self.causes.items())
+
+
+def _compute_bics(explanations: Sequence[_Explanation]) -> np.ndarray:
+    """Return the BIC of explanations of the same increments over those that all of them use.
+
+    A wrong sign or unit counts as much as a clear difference, because it is less probable than a
+    delay. An explanation that uses few increments has an infinite BIC.
+    """
+    bics = np.full(len(explanations), math.inf)
+    n_used = [int(np.isfinite(explanation.squares).sum()) for explanation in explanations]
+    is_compared = np.array(n_used) > _MIN_COMMON_SHARE * max(n_used, default=0)
+    compared = [explanations[k] for k in np.flatnonzero(is_compared).tolist()]
+    if not compared:
+        return bics
+    is_common = np.isfinite([explanation.squares for explanation in compared]).all(axis=0)
+    n_common = max(int(is_common.sum()), 1)
+    # residuals far below the noise, or the differences that are explained, are rounding
+    min_square = max(_MIN_SQUARED_SCALE, _MAX_ROUNDING_SHARE * compared[0].response_square)
+    bics[is_compared] = [
+        n_common * _fit_student_deviance(e.squares[is_common], e.dimension, min_square)
+        + e.n_parameters * math.log(n_common)
+        + _MIN_CLOCK_ADVANTAGE * e.has_gross_gain
+        for e in compared
+    ]
+    return bics
+
+
+def _fit_student_deviance(squares: np.ndarray, dimension: int, min_square: float) -> float:
+    """Return the mean deviance of residuals with a Student distribution of the likeliest scale.
+
+    Args:
+        squares: squared norms [N] of the residuals.
+        dimension: number of components of each residual.
+        min_square: smallest squared scale.
+    """
+    squared_scale = max(float(np.median(squares)) / dimension, min_square)
+    for _ in range(_SCALE_ITERATIONS):
+        weights = (_STUDENT_DOF + dimension) / (_STUDENT_DOF + squares / squared_scale)
+        squared_scale = max(float(np.mean(weights * squares)) / dimension, min_square)
+    tails = np.log1p(squares / (_STUDENT_DOF * squared_scale))
+    return dimension * math.log(squared_scale) + (_STUDENT_DOF + dimension) * float(tails.mean())
+
+
 # smallest standard deviation of the heading for an estimate of the gain of r, in standard
 # deviations
 # of its noise, of which smoothing leaves .4
@@ -106,11 +262,17 @@ def estimate_yaw_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     Causes: `gain` (r is 1 + value times too large), `lag` (delay of r against psi in s), `bias` (of
     r in rad/s) and `ramp` (growth of the bias from start to end in rad/s).
     """
-    psi = log["psi"]
-    r = log["r"]
+    return _compare_clocks(log, _model_heading, ("r",), _YAW_CLOCKS)
+
+
+def _model_heading(
+    log: LogStatistics, channels: Channels, *, with_lags: bool = True
+) -> _IncrementModel:
+    """Return the model of the increments of psi by the integral of r and its errors."""
+    r = channels["r"]
     t = log.t
     dt = np.diff(t)
-    smoothed_rate = log.cached(_smooth_leaving_out_centre, "r")
+    smoothed_rate = channels["r smoothed"]
     normalized_time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
     columns = {"bias": [-dt], "ramp": [-dt, -dt * normalized_time]}
     # with a constant heading, gain and bias of r are collinear
@@ -118,15 +280,13 @@ def estimate_yaw_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     if _is_significant(log, "r") and heading_std > _MIN_HEADING_SIGNAL_TO_NOISE * log.noise_std(
         "psi"
     ):
-        columns = {
-            "gain": [-_integrate_steps(dt, smoothed_rate)],
-            "lag": [np.diff(smoothed_rate)],
-            "curvature": _differentiate_twice(smoothed_rate, t),
-            **columns,
-        }
+        columns = {"gain": [-_integrate_steps(dt, smoothed_rate)], **columns}
+        if with_lags:
+            columns["lag"] = [np.diff(smoothed_rate)]
+            columns["curvature"] = _differentiate_twice(smoothed_rate, t)
     rate_noise = np.full(dt.size, log.noise_std("r"))
-    return _explain_increments(
-        psi, _integrate_steps(dt, r), dt, log.noise_std("psi"), rate_noise, columns
+    return _IncrementModel(
+        log["psi"], _integrate_steps(dt, r), dt, log.noise_std("psi"), rate_noise, columns
     )
 
 
@@ -139,44 +299,30 @@ def estimate_position_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     the receiver forward and to starboard in m), `current` (north and east in m/s, if u, v are
     relative to the water), `bias` (of u, v in m/s).
     """
+    return _compare_clocks(log, _model_positions, ("u", "v", "psi"), _POSITION_CLOCKS)
+
+
+def _model_positions(
+    log: LogStatistics, channels: Channels, *, with_lags: bool = True
+) -> _IncrementModel:
+    """Return the model of the increments of x, y by the integrals of R(psi) [u, v] and errors."""
     dt = np.diff(log.t)
-    psi = log["psi"]
+    psi = channels["psi"]
     # horizontal vectors are complex numbers: north + 1j east, or forward + 1j starboard
     heading_rotation = np.exp(1j * psi)
-    mid_rotation = np.exp(0.5j * (psi[1:] + psi[:-1]))
-    u = log.cached(_smooth_leaving_out_centre, "u")
-    v = log.cached(_smooth_leaving_out_centre, "v")
+    u = channels["u smoothed"]
+    v = channels["v smoothed"]
     surge_increments = _integrate_steps(dt, heading_rotation * u)
     sway_increments = _integrate_steps(dt, 1j * heading_rotation * v)
-    lag_u = mid_rotation * np.diff(u)
-    lag_v = 1j * mid_rotation * np.diff(v)
-    earth_velocity = heading_rotation * (u + 1j * v)
-    lag_psi = (
-        0.5j
-        * np.diff(log.cached(_smooth_leaving_out_centre, "psi"))
-        * (earth_velocity[1:] + earth_velocity[:-1])
-    )
-    curvature_u = [mid_rotation * increments for increments in _differentiate_twice(u, log.t)]
-    curvature_v = [1j * mid_rotation * increments for increments in _differentiate_twice(v, log.t)]
-    mid_velocity = 0.5 * (u[1:] + u[:-1] + 1j * (v[1:] + v[:-1]))
-    columns = {
+    columns: dict[str, list[np.ndarray]] = {
         "gain_u": [-surge_increments],
         "gain_v": [-sway_increments],
         "gain": [-(surge_increments + sway_increments)],
         "heading": [-1j * (surge_increments + sway_increments)],
-        "lag_u": [lag_u],
-        "lag_v": [lag_v],
-        "lag": [lag_u + lag_v],
-        "lag_psi": [lag_psi],
-        "lag_xy": [-(lag_u + lag_v + lag_psi)],
-        "curvature_u": curvature_u,
-        "curvature_v": curvature_v,
-        "curvature": [a + b for a, b in zip(curvature_u, curvature_v, strict=True)],
-        "curvature_psi": [
-            mid_velocity * increments
-            for increments in _differentiate_twice(heading_rotation, log.t)
-        ],
-        "curvature_xy": _differentiate_twice(earth_velocity, log.t),
+    }
+    if with_lags:
+        columns |= _differentiate_by_lags(log.t, channels)
+    columns |= {
         "lever_arm": [np.diff(heading_rotation), 1j * np.diff(heading_rotation)],
         "current": [dt + 0j, 1j * dt],
         "bias": [
@@ -191,19 +337,227 @@ def estimate_position_causes(log: LogStatistics) -> dict[str, KinematicCause]:
         for name, cause_columns in columns.items()
         if not any(name in _UNIDENTIFIABLE_CAUSES[channel] for channel in noise_only_channels)
     }
-    speed = np.hypot(np.nan_to_num(log["u"]), np.nan_to_num(log["v"]))
+    speed = np.hypot(np.nan_to_num(channels["u"]), np.nan_to_num(channels["v"]))
     heading_noise_velocity = log.noise_std("psi") * 0.5 * (speed[1:] + speed[:-1])
     rate_noise = np.hypot(max(log.noise_std("u"), log.noise_std("v")), heading_noise_velocity)
-    integrated_increments = _integrate_steps(dt, heading_rotation * (log["u"] + 1j * log["v"]))
+    velocity = heading_rotation * (channels["u"] + 1j * channels["v"])
     position = log["x"] + 1j * log["y"]
-    return _explain_increments(
+    return _IncrementModel(
         position,
-        integrated_increments,
+        _integrate_steps(dt, velocity),
         dt,
         max(log.noise_std("x"), log.noise_std("y")),
         rate_noise,
         columns,
     )
+
+
+def _differentiate_by_lags(t: np.ndarray, channels: Channels) -> dict[str, list[np.ndarray]]:
+    """Return the effects of lags on the increments of the position, and those of second order."""
+    psi = channels["psi"]
+    u = channels["u smoothed"]
+    v = channels["v smoothed"]
+    heading_rotation = np.exp(1j * psi)
+    mid_rotation = np.exp(0.5j * (psi[1:] + psi[:-1]))
+    lag_u = mid_rotation * np.diff(u)
+    lag_v = 1j * mid_rotation * np.diff(v)
+    earth_velocity = heading_rotation * (u + 1j * v)
+    lag_psi = 0.5j * np.diff(channels["psi smoothed"]) * (earth_velocity[1:] + earth_velocity[:-1])
+    curvature_u = [mid_rotation * increments for increments in _differentiate_twice(u, t)]
+    curvature_v = [1j * mid_rotation * increments for increments in _differentiate_twice(v, t)]
+    mid_velocity = 0.5 * (u[1:] + u[:-1] + 1j * (v[1:] + v[:-1]))
+    return {
+        "lag_u": [lag_u],
+        "lag_v": [lag_v],
+        "lag": [lag_u + lag_v],
+        "lag_psi": [lag_psi],
+        "lag_xy": [-(lag_u + lag_v + lag_psi)],
+        "curvature_u": curvature_u,
+        "curvature_v": curvature_v,
+        "curvature": [a + b for a, b in zip(curvature_u, curvature_v, strict=True)],
+        "curvature_psi": [
+            mid_velocity * increments for increments in _differentiate_twice(heading_rotation, t)
+        ],
+        "curvature_xy": _differentiate_twice(earth_velocity, t),
+    }
+
+
+def _select_channels(log: LogStatistics, *names: str) -> dict[str, np.ndarray]:
+    """Return channels [T] of a log as measured and smoothed."""
+    smoothed = {f"{n} smoothed": log.cached(_smooth_leaving_out_centre, n) for n in names}
+    return {**{name: log[name] for name in names}, **smoothed}
+
+
+@dataclass(frozen=True)
+class _ClockHypothesis:
+    """An explanation with some clocks shifted.
+
+    Attributes:
+        explanation: causes of the increments that remain.
+        channels: shifted channels.
+        shifts: lag -> number of samples by which its channels are taken later.
+    """
+
+    explanation: _Explanation
+    channels: Channels
+    shifts: dict[str, int] = field(default_factory=dict)
+
+
+def _compare_clocks(
+    log: LogStatistics,
+    make_model: Callable[..., _IncrementModel],
+    names: Sequence[str],
+    clocks: Mapping[str, tuple[str, ...]],
+) -> dict[str, KinematicCause]:
+    """Estimate the causes with the delays of up to two clocks, as far as these are more likely.
+
+    A lag in the regression is the first term of a series. Where a delay is longer than the motion
+    takes to change, the series diverges, and other causes explain more than this term. Therefore
+    each clock is also tried with its channels shifted by its most likely delay, and the BIC
+    compares these hypotheses with the regression alone.
+
+    Args:
+        log: statistics of the log.
+        make_model: function that returns the model of the increments with shifted channels.
+        names: channels that may be shifted.
+        clocks: lag -> channels with its clock.
+    """
+    channels = _select_channels(log, *names)
+    regression = _explain_increments(make_model(log, channels))
+    # a delay is not mistaken for a scale of surge, a constant angle or a constant velocity
+    is_unlike = all(name in _CAUSES_UNLIKE_DELAYS for name in regression.causes)
+    residual_square = float(np.nan_to_num(regression.squares).mean()) if regression.causes else 0.0
+    if is_unlike or residual_square <= _MAX_ROUNDING_SHARE * regression.response_square:
+        return regression.causes
+    shifts = _search_shifts(log.excerpt_middle(_MAX_CLOCK_SAMPLES), make_model, names, clocks)
+    if not shifts:
+        return regression.causes
+    for clock, n_samples in shifts.items():
+        channels = _shift_channels(log, channels, clocks[clock], n_samples)
+    delays = {clock: _clock_sign(clock) * n * log.sampling_interval for clock, n in shifts.items()}
+    explanation = _explain_increments(make_model(log, channels), [*shifts])
+    return {
+        name: replace(cause, estimates=cause.estimates + delays.get(name, 0.0))
+        for name, cause in explanation.causes.items()
+    }
+
+
+def _search_shifts(
+    log: LogStatistics,
+    make_model: Callable[..., _IncrementModel],
+    names: Sequence[str],
+    clocks: Mapping[str, tuple[str, ...]],
+) -> dict[str, int]:
+    """Return lag -> number of samples for the clocks of the likeliest hypothesis; see above."""
+    channels = _select_channels(log, *names)
+    model = make_model(log, channels)
+    candidates = [name for name in clocks if name in model.columns]
+    hypotheses = [_ClockHypothesis(_explain_increments(model), channels)]
+    continued = hypotheses
+    for _ in range(_MAX_CLOCKS):
+        trials = [
+            trial
+            for hypothesis in continued
+            for name in candidates
+            if name not in hypothesis.shifts
+            and (trial := _shift_clock(log, make_model, hypothesis, name, clocks)) is not None
+        ]
+        order = np.argsort(_compute_bics([trial.explanation for trial in trials])).tolist()
+        continued = [trials[k] for k in order[:_N_CONTINUED_HYPOTHESES]]
+        hypotheses = [*hypotheses, *trials]
+    bics = _compute_bics([hypothesis.explanation for hypothesis in hypotheses])
+    # among hypotheses that the data do not distinguish the simplest one counts
+    likely = np.flatnonzero(bics < bics.min() + _MIN_CLOCK_ADVANTAGE)
+    best = min(
+        (hypotheses[k] for k in likely.tolist()),
+        key=lambda hypothesis: hypothesis.explanation.n_parameters,
+        default=hypotheses[0],
+    )
+    return best.shifts
+
+
+def _shift_clock(
+    log: LogStatistics,
+    make_model: Callable[..., _IncrementModel],
+    hypothesis: _ClockHypothesis,
+    name: str,
+    clocks: Mapping[str, tuple[str, ...]],
+) -> _ClockHypothesis | None:
+    """Return a hypothesis with the most likely delay of one more clock; None without a delay."""
+    n_samples = _find_most_likely_shift(log, make_model, hypothesis.channels, clocks[name])
+    min_deviation = hypothesis.explanation.min_deviation
+    if n_samples == 0:
+        return None
+    channels = _shift_channels(log, hypothesis.channels, clocks[name], n_samples)
+    shifts = {**hypothesis.shifts, name: n_samples}
+    explanation = _explain_increments(make_model(log, channels), [*shifts], min_deviation)
+    trial = _ClockHypothesis(explanation, channels, shifts)
+    # Gauss-Newton: the remaining lags are those of all clocks together
+    for _ in range(_MAX_SHIFT_CORRECTIONS):
+        corrections = {
+            clock: round(_clock_sign(clock) * float(cause.estimates[0]) / log.sampling_interval)
+            for clock, cause in trial.explanation.causes.items()
+            if clock in trial.shifts
+        }
+        if not any(corrections.values()):
+            break
+        channels = dict(trial.channels)
+        for clock, correction in corrections.items():
+            channels = _shift_channels(log, channels, clocks[clock], correction)
+        shifts = {clock: n + corrections.get(clock, 0) for clock, n in trial.shifts.items()}
+        explanation = _explain_increments(make_model(log, channels), [*shifts], min_deviation)
+        bics = _compute_bics([trial.explanation, explanation])
+        if bics[1] >= bics[0]:
+            break
+        trial = _ClockHypothesis(explanation, channels, shifts)
+    return trial
+
+
+def _clock_sign(name: str) -> float:
+    """Return -1 for the clock of the position, for which all other channels are shifted."""
+    return -1.0 if name == "lag_xy" else 1.0
+
+
+def _shift_channels(
+    log: LogStatistics, channels: Channels, names: Sequence[str], n_samples: int
+) -> dict[str, np.ndarray]:
+    """Return the channels with some of them taken a number of samples later; NaN beyond ends."""
+    is_outside = log.near_seam(abs(n_samples))
+    index = np.arange(len(log)) + n_samples
+    is_outside |= (index < 0) | (index >= len(log))
+    index = np.clip(index, 0, len(log) - 1)
+    shifted = dict(channels)
+    for name in names:
+        for key in (name, f"{name} smoothed"):
+            shifted[key] = np.where(is_outside, np.nan, channels[key][index])
+    return shifted
+
+
+def _find_most_likely_shift(
+    log: LogStatistics,
+    make_model: Callable[..., _IncrementModel],
+    channels: Channels,
+    names: Sequence[str],
+) -> int:
+    """Return the shift in samples under which all causes but lags explain the increments best."""
+    stride = max(round(_SHIFT_STEP / log.sampling_interval), 1)
+    n_steps = max(int(_MAX_SHIFT / (stride * log.sampling_interval)), 1)
+    block = max(round(_MISFIT_BLOCK / log.sampling_interval), 1)
+
+    def compute_misfit(n_samples: int) -> float:
+        shifted = _shift_channels(log, channels, names, n_samples)
+        return make_model(log, shifted, with_lags=False).compute_block_misfit(block)
+
+    shifts = stride * np.arange(-n_steps, n_steps + 1)
+    misfits = np.array([compute_misfit(n_samples) for n_samples in shifts.tolist()])
+    k = int(np.argmin(misfits))
+    if k in (0, misfits.size - 1):
+        return 0
+    # vertex of the parabola through the three lowest points
+    slope = 0.5 * (misfits[k + 1] - misfits[k - 1])
+    curvature = misfits[k + 1] - 2.0 * misfits[k] + misfits[k - 1]
+    vertex = float(shifts[k] - stride * slope / max(curvature, 1e-300))
+    return round(vertex)
 
 
 # channel -> causes that are not identifiable if it holds noise only, because of the shared noise
@@ -253,26 +607,19 @@ def _smooth_leaving_out_centre(log: LogStatistics, name: str) -> np.ndarray:
 
 
 def _explain_increments(
-    measured_pose: np.ndarray,
-    integrated_increments: np.ndarray,
-    dt: np.ndarray,
-    pose_noise: float,
-    rate_noise: np.ndarray,
-    columns: Mapping[str, list[np.ndarray]],
-) -> dict[str, KinematicCause]:
+    model: _IncrementModel, required: Sequence[str] = (), min_deviation: float = 0.0
+) -> _Explanation:
     """Select and estimate the causes that explain the increments of a pose.
 
     Args:
-        measured_pose: measured pose [T], real or complex; NaN if missing.
-        integrated_increments: integrals of the velocities [T - 1], NaN if missing.
-        dt: time steps [T - 1] in s.
-        pose_noise: standard deviation of the noise of the pose.
-        rate_noise: standard deviation of the noise of the velocity [T - 1].
-        columns: effect of each cause of unit size on the increments, arrays [T - 1].
-
-    Returns:
-        Cause -> estimate, in the order of selection.
+        model: increments and the effects of causes.
+        required: causes that are selected first.
+        min_deviation: smallest standard deviation of the increments in the whitening, which is the
+            same for all hypotheses that are compared.
     """
+    measured_pose = model.measured_pose
+    dt = model.dt
+    columns = model.columns
     measured_indices = np.flatnonzero(np.isfinite(measured_pose))
 
     def sum_between_poses(steps: np.ndarray) -> np.ndarray:
@@ -288,11 +635,11 @@ def _explain_increments(
         return np.where(np.diff(n_missing, axis=0) > 0, np.nan, np.diff(cumulative_sums, axis=0))
 
     if measured_indices.size < MIN_SAMPLES:
-        return {}
+        return _Explanation({}, np.zeros(0), 1, 0.0, 0.0, 0)
     unexplained_increments = np.diff(measured_pose[measured_indices])
-    unexplained_increments = unexplained_increments - sum_between_poses(integrated_increments)
+    unexplained_increments = unexplained_increments - sum_between_poses(model.integrated_increments)
     durations = sum_between_poses(dt)
-    variance = (dt * rate_noise) ** 2
+    variance = (dt * model.rate_noise) ** 2
     cause_columns = sum_between_poses(
         np.stack(
             [column for columns_of_cause in columns.values() for column in columns_of_cause],
@@ -302,21 +649,22 @@ def _explain_increments(
     is_usable = (
         np.isfinite(unexplained_increments)
         & np.isfinite(cause_columns).all(axis=1)
-        & np.isfinite(sum_between_poses(rate_noise))
+        & np.isfinite(sum_between_poses(model.rate_noise))
     )
     retained_indices = np.flatnonzero(is_usable & (durations <= 3.0 * nan_median(durations)))
     if retained_indices.size < MIN_SAMPLES:
-        return {}
+        return _Explanation({}, np.zeros(0), 1, 0.0, 0.0, 0)
     total_variance = sum_between_poses(variance)[retained_indices]
     shared_variance = variance[np.minimum(measured_indices[retained_indices], variance.size - 1)]
     shared_variance = np.where(
         np.isfinite(shared_variance), np.minimum(shared_variance, total_variance), total_variance
     )
-    min_deviation = 1e-3 * nan_median(np.abs(unexplained_increments[retained_indices])) + 1e-12
+    typical_increment = nan_median(np.abs(unexplained_increments[retained_indices]))
+    min_deviation = max(min_deviation, 1e-3 * typical_increment + 1e-12)
     # successive increments share one noisy pose (negative covariance) and half a noisy velocity
     # (positive covariance); the sum is limited to non-positive values, because a positive one would
     # make the whitening amplify the highest frequencies
-    end_variance = np.maximum(pose_noise**2 - 0.25 * shared_variance, 0.0)
+    end_variance = np.maximum(model.pose_noise**2 - 0.25 * shared_variance, 0.0)
     is_adjacent = np.append(retained_indices[1:] == retained_indices[:-1] + 1, False)
     # with noise of the pose only, the covariance is almost singular: the diagonal is increased
     covariance_band = np.stack(
@@ -349,22 +697,39 @@ def _explain_increments(
     )
     is_inlier = abs_residuals <= 8.0 * SIGMA_OF_MAD * max(nan_median(abs_residuals), 1e-300)
     names = np.array([name for name, columns_of_cause in columns.items() for _ in columns_of_cause])
-    return _orthogonal_matching_pursuit(
-        np.where(is_inlier, y, 0.0), np.where(is_inlier[:, None], cause_columns, 0.0), names
+    causes, coefficients = _orthogonal_matching_pursuit(
+        np.where(is_inlier, y, 0.0),
+        np.where(is_inlier[:, None], cause_columns, 0.0),
+        names,
+        required,
     )
+    squares = np.full(measured_indices.size - 1, np.nan)
+    residuals = y - cause_columns @ coefficients
+    squares_by_component = (residuals**2).reshape(retained_indices.size, -1)
+    squares[retained_indices] = squares_by_component.sum(axis=1)
+    n_parameters = int(np.count_nonzero(coefficients))
+    dimension = squares_by_component.shape[1]
+    response_square = dimension * float(np.mean(y**2))
+    return _Explanation(causes, squares, dimension, response_square, min_deviation, n_parameters)
 
 
 def _orthogonal_matching_pursuit(
-    response: np.ndarray, regressors: np.ndarray, names: np.ndarray
-) -> dict[str, KinematicCause]:
+    response: np.ndarray, regressors: np.ndarray, names: np.ndarray, required: Sequence[str]
+) -> tuple[dict[str, KinematicCause], np.ndarray]:
     """Select groups of columns by orthogonal matching pursuit, then remove redundant groups.
 
     Args:
         response: whitened response [N].
         regressors: whitened columns [N, k].
         names: cause of each column [k].
+        required: causes that are selected first and not removed.
+
+    Returns:
+        Cause -> estimate, in the order of selection, and the coefficients [k] of all columns.
     """
     column_norms = np.linalg.norm(regressors, axis=0)
+    coefficients = np.zeros(names.size)
+    indices = np.flatnonzero(column_norms > 0.0)
     regressors = regressors[:, column_norms > 0.0] / column_norms[column_norms > 0.0]
     names = names[column_norms > 0.0]
     column_norms = column_norms[column_norms > 0.0]
@@ -386,7 +751,7 @@ def _orthogonal_matching_pursuit(
         return energy - float(product[column_indices] @ coefficients)
 
     if not columns_by_cause:
-        return {}
+        return {}, coefficients
     variance = max(
         compute_residual_energy(columns_by_cause) / response.size, 1e-12 * energy / response.size
     )
@@ -394,8 +759,8 @@ def _orthogonal_matching_pursuit(
         cause_name: _MIN_IMPROVEMENT * variance * (1.0 + 0.2 * is_selected.size)
         for cause_name, is_selected in columns_by_cause.items()
     }
-    selected_causes = list[str]()
-    residual_energy = energy
+    selected_causes = [name for name in required if name in columns_by_cause]
+    residual_energy = compute_residual_energy(selected_causes) if selected_causes else energy
     while len([name for name in selected_causes if name not in _LAG_OF_CURVATURE]) < _MAX_CAUSES:
         residual_energy_by_cause = {
             name: compute_residual_energy([*selected_causes, name])
@@ -420,8 +785,8 @@ def _orthogonal_matching_pursuit(
         selected_causes = [*selected_causes, best_cause]
         residual_energy = residual_energy_by_cause[best_cause]
     # backward elimination of causes that later ones made redundant; a lag stays with its curvature
-    lags_with_curvature = {_LAG_OF_CURVATURE.get(name) for name in selected_causes}
-    for name in [name for name in selected_causes[:-1] if name not in lags_with_curvature]:
+    permanent = {*required, *(_LAG_OF_CURVATURE.get(name) for name in selected_causes)}
+    for name in [name for name in selected_causes[:-1] if name not in permanent]:
         reduced_causes = [cause for cause in selected_causes if cause != name]
         selected_causes = (
             reduced_causes
@@ -430,7 +795,7 @@ def _orthogonal_matching_pursuit(
             else selected_causes
         )
     if not selected_causes:
-        return {}
+        return {}, coefficients
     is_selected = np.isin(names, selected_causes)
     columns = regressors[:, is_selected]
     names = names[is_selected]
@@ -446,6 +811,7 @@ def _orthogonal_matching_pursuit(
         np.sqrt(np.maximum(sandwich_variance, np.diag(white_noise_covariance))) / column_norms
     )
     estimates = least_squares_fit.coefficients / column_norms
+    coefficients[indices[is_selected]] = estimates
     # columns of gains are integrals of the measured values, which are 1 + gain times too large
     is_gain = np.array([name.startswith("gain") for name in names.tolist()])
     true_share = np.where(is_gain, 1.0 - estimates, 1.0)
@@ -453,11 +819,12 @@ def _orthogonal_matching_pursuit(
     # the ratio to the standard error stays that of the regression
     standard_errors = standard_errors / np.abs(true_share)
     estimates = estimates / true_share
-    return {
+    causes = {
         name: KinematicCause(estimates[names == name], standard_errors[names == name])
         for name in selected_causes
         if name not in _LAG_OF_CURVATURE
     }
+    return causes, coefficients
 
 
 @dataclass(frozen=True)

@@ -84,9 +84,10 @@ class InstrumentErrorRow(Record):
         unit: SI unit.
         value: estimate.
         standard_error: standard error of the estimate.
-        is_determined: whether sensors determine it; otherwise the smoothness of the motion does.
-        is_significant: whether it is determined and differs from zero by 3.5 standard errors; a
-            clock also by half a sample.
+        is_determined: whether sensors determine it; otherwise the smoothness of the motion does,
+            and the standard error makes no interval.
+        is_significant: whether it differs from zero by 3.5 standard errors and more than smoothness
+            explains; a clock also by half a sample.
     """
 
     name: str

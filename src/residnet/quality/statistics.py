@@ -174,6 +174,19 @@ class LogStatistics:
         excerpt = self._from_rows(rows)
         return rows, excerpt if self._invalid is None else excerpt.mask_samples(self._invalid[rows])
 
+    def excerpt_middle(self, n_samples: int) -> LogStatistics:
+        """Return the statistics of a stretch in the middle; of a short log, itself.
+
+        Args:
+            n_samples: largest number of samples.
+        """
+        if len(self) <= n_samples:
+            return self
+        start = (len(self) - n_samples) // 2
+        rows = np.arange(start, start + n_samples)
+        excerpt = LogStatistics(self.log.select_rows(rows), self.inputs, self._seams)
+        return excerpt if self._invalid is None else excerpt.mask_samples(self._invalid[rows])
+
     def _from_rows(self, rows: np.ndarray) -> LogStatistics:
         """Return the statistics of some rows, with the gaps between stretches shortened."""
         if rows.size == len(self):

@@ -125,8 +125,21 @@ def _interpret_drift_angle(
             )
             draft_notes.add_note(CHANNELS_KEY, text)
             return None
+        problem = ""
+        if choice.slope.is_constant:
+            problem = "does not move, but position and heading show sway"
+        elif choice.slope.is_unrelated:
+            problem = (
+                "does not follow position and heading (slope of the sway velocity"
+                f" {choice.slope.value:.2f} instead of 1): a frozen sensor, or another clock?"
+            )
+        if problem:
+            text = f"'{angle_column}' {problem}; '{speed_column}' and '{angle_column}' are left out"
+            text += ": u and v follow from position and heading"
+            draft_notes.add_note(CHANNELS_KEY, text)
+            return None
         unit = choice.unit
-        sign = choice.sign
+        sign = choice.slope.sign
         is_speed = choice.is_speed
         unit_reason = f"the header has no unit; position and heading are most consistent in {unit}"
         can_be_surge &= choice.is_ambiguous

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, cast
@@ -13,6 +14,7 @@ import numpy as np
 from residnet.core.errors import DataError
 from residnet.core.frames import rotate
 from residnet.core.units import to_si
+from residnet.preprocessing.channel_values import NEGLIGIBLE_MOTION_SHARE
 from residnet.preprocessing.compatibility.hypotheses import (
     MIN_MARGIN,
     Hypothesis,
@@ -39,6 +41,8 @@ _NODE_STEP = 0.5
 """Smallest step between nodes in s."""
 _N_WINDOWS = 12
 """Windows of a log over which velocities are integrated."""
+_MAX_UNRELATED_SLOPE = 0.5
+"""Slope between two records of the sway velocity below which they are not of the same motion."""
 _MIN_HEADING_OFFSET = np.radians(2.0)
 """Heading offset in rad below which none is reported."""
 _MAX_HEADING_OFFSET = np.radians(40.0)
@@ -66,12 +70,41 @@ _PAIR_MEANINGS = (BODY_AXES, EARTH_AXES, EXCHANGED_EARTH_AXES, SPEED_AS_V)
 _SINGLE_MEANINGS = {"u": (BODY_AXES,), "v": (BODY_AXES, SPEED_AS_V)}
 
 
+class SwaySlope(NamedTuple):
+    """Regression of the sway velocity from positions on that from a speed and a drift angle.
+
+    Attributes:
+        value: slope; 1 for a drift angle that is positive with the flow from port.
+        standard_error: standard error by the residuals of windows of all logs.
+        size_ratio: standard deviation of the regressor over that of the response.
+    """
+
+    value: float
+    standard_error: float
+    size_ratio: float
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether the drift angle gives no sway while the vessel sways."""
+        return self.size_ratio < NEGLIGIBLE_MOTION_SHARE
+
+    @property
+    def is_unrelated(self) -> bool:
+        """Whether the slope is certainly far from that of either direction."""
+        return abs(self.value) + 2.0 * self.standard_error < _MAX_UNRELATED_SLOPE
+
+    @property
+    def sign(self) -> int:
+        """-1 if the slope is significantly negative, otherwise 1."""
+        return -1 if self.value < -2.0 * self.standard_error else 1
+
+
 class DriftAngleChoice(NamedTuple):
     """Interpretation of a speed and a drift angle that suits the motion best.
 
     Attributes:
         unit: unit of the drift angle.
-        sign: 1 if the drift angle is positive with the flow from port, -1 otherwise.
+        slope: regression of the sway velocity from positions on that from both columns.
         is_speed: whether the other column is the speed; otherwise it is the surge velocity.
         unexplained_share: unexplained share of u and v from both columns.
         other_share: unexplained share of the best interpretation with the other meaning of the
@@ -79,7 +112,7 @@ class DriftAngleChoice(NamedTuple):
     """
 
     unit: str
-    sign: int
+    slope: SwaySlope
     is_speed: bool
     unexplained_share: float
     other_share: float
@@ -241,12 +274,32 @@ def choose_drift_angle(
             )
             candidates.append(dataclasses.replace(log, columns={"u": u, "v": v}))
         share = _compute_unexplained_share(candidates, ("u", "v"), BODY_AXES.components)
-        factors = _fit_factors(candidates, ("u", "v"), BODY_AXES.components)
-        sign = -1 if factors["v"] < 0.0 else 1
-        choices.append(DriftAngleChoice(unit, sign, is_speed, share, np.inf))
+        slope = _regress_sway(candidates)
+        choices.append(DriftAngleChoice(unit, slope, is_speed, share, np.inf))
     best = min(choices, key=lambda choice: choice.unexplained_share)
     others = [choice.unexplained_share for choice in choices if choice.is_speed != best.is_speed]
     return best._replace(other_share=min(others, default=np.inf))
+
+
+def _regress_sway(logs: Sequence[MeasuredVelocities]) -> SwaySlope:
+    """Regress the sway velocity from positions on the column v, with a mean for each log."""
+    regressors = []
+    responses = []
+    for log in logs:
+        column, reference = _select_pairs(log, "v", "sway")
+        windows = np.arange(column.size) * _N_WINDOWS // max(column.size, 1)
+        for window in range(_N_WINDOWS if column.size else 0):
+            regressors.append((column - column.mean())[windows == window])
+            responses.append((reference - reference.mean())[windows == window])
+    energies = [sum(float(part @ part) for part in parts) for parts in (regressors, responses)]
+    products = [float(x @ y) for x, y in zip(regressors, responses, strict=True)]
+    slope = sum(products) / max(energies[0], 1e-300)
+    # residuals of successive samples are correlated, those of windows hardly
+    scores = [
+        product - slope * float(x @ x) for product, x in zip(products, regressors, strict=True)
+    ]
+    error = math.sqrt(sum(score**2 for score in scores)) / max(energies[0], 1e-300)
+    return SwaySlope(slope, error, math.sqrt(energies[0] / max(energies[1], 1e-300)))
 
 
 def _fit_factors(

@@ -7,10 +7,12 @@ bias and scale of the gyro as parameters. Nothing is assumed about the vessel.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
+from residnet.preprocessing.channel_values import estimate_noise_std
 from residnet.preprocessing.derivatives import fit_local_polynomials
 
 _GRID_STEP = 0.1
@@ -19,8 +21,8 @@ _MAX_GRID_SAMPLES = 200_000
 """Largest number of grid samples of a recording."""
 _MIN_OVERLAP = 0.4
 """Smallest overlap, as a share of the shorter recording."""
-_HEADING_WINDOW_SECONDS = 1.0
-"""Window in s of the local parabolas that differentiate the heading."""
+_WINDOWS_SECONDS = (1.0, 3.0, 9.0)
+"""Windows in s of the parabolas that differentiate the heading, for fast and slow turns."""
 _EXCLUDED_SECONDS = 1.0
 """Distance in s from the optimum within which an offset is no alternative."""
 _MAX_ITERATIONS = 30
@@ -48,8 +50,9 @@ class ClockEstimate(NamedTuple):
         drift: share by which the clock of the yaw rate runs slow; 0 if it was not estimated.
         middle: time in the middle of the overlap in s, on the clock of the heading.
         correlation: correlation of the yaw rate with the derivative of the heading.
-        margin: logarithm of the likelihood ratio to the best offset that differs by more than one
-            second. Each 2 s of the overlap count as one independent sample of the yaw rate.
+        margin: logarithm of the likelihood ratio to the best offset farther away than one second
+            and than the window in which the heading is differentiated.
+            Each 2 s of the overlap, or each window, count as one independent sample.
     """
 
     seconds: float
@@ -86,14 +89,24 @@ def estimate_clock_from_rate(
     heading = heading[has_heading]
     rate_times = rate_times[has_rate]
     yaw_rate = yaw_rate[has_rate]
-    coarse_estimate = _correlate_rates(heading_times, heading, rate_times, yaw_rate)
-    return coarse_estimate and _refine_offset(
-        coarse_estimate, heading_times, heading, rate_times, yaw_rate
-    )
+    records = heading_times, heading, rate_times, yaw_rate
+    estimates = {
+        window: estimate
+        for window in _WINDOWS_SECONDS
+        if (estimate := _correlate_rates(*records, window)) is not None
+    }
+    if not estimates:
+        return None
+    window = max(estimates, key=lambda window: estimates[window].margin)
+    return _refine_offset(estimates[window], *records, window)
 
 
 def _correlate_rates(
-    heading_times: np.ndarray, heading: np.ndarray, rate_times: np.ndarray, yaw_rate: np.ndarray
+    heading_times: np.ndarray,
+    heading: np.ndarray,
+    rate_times: np.ndarray,
+    yaw_rate: np.ndarray,
+    window_seconds: float,
 ) -> ClockEstimate | None:
     """Maximise the normalised cross-correlation over all offsets with sufficient overlap."""
     durations = (heading_times[-1] - heading_times[0], rate_times[-1] - rate_times[0])
@@ -103,12 +116,12 @@ def _correlate_rates(
         np.arange(heading_times[0], heading_times[-1], step),
         np.arange(rate_times[0], rate_times[-1], step),
     )
-    window = max(5, 2 * round(0.5 * _HEADING_WINDOW_SECONDS / step) + 1)
+    window = max(5, 2 * round(0.5 * window_seconds / step) + 1)
     if min(grids[0].size, grids[1].size) < 3 * window:
         return None
     resampled_heading = np.interp(grids[0], heading_times, heading)[:, None]
     reference = fit_local_polynomials(resampled_heading, window, 2, step)[1][:, 0]
-    signal = np.interp(grids[1], rate_times, yaw_rate)
+    signal = _smooth_rate(np.interp(grids[1], rate_times, yaw_rate), window)
     reference = reference - reference.mean()
     signal = signal - signal.mean()
     size = 1 << (reference.size + signal.size - 1).bit_length()
@@ -137,15 +150,28 @@ def _correlate_rates(
     correlation = np.clip(correlation, -0.9999, 0.9999)
     has_overlap = counts >= _MIN_OVERLAP * min(reference.size, signal.size)
     # log-likelihood ratio of a regression with this correlation, which grows with the overlap
-    independent_share = min(step / 2.0, 1.0)
+    independent_share = min(step / max(2.0, window_seconds), 1.0)
     scores = -0.5 * independent_share * counts * np.log(1.0 - correlation**2) * has_overlap
     best_index = int(np.argmax(scores))
     lags = np.arange(size)
     lags = np.where(lags < reference.size, lags, lags - size)
-    is_distant = np.abs(lags - lags[best_index]) * step > _EXCLUDED_SECONDS
+    is_distant = np.abs(lags - lags[best_index]) * step > max(_EXCLUDED_SECONDS, window_seconds)
     margin = float(scores[best_index] - scores[is_distant].max(initial=0.0))
     seconds = float(grids[0][0] + lags[best_index] * step - grids[1][0])
-    return ClockEstimate(seconds, step, 0.0, 0.0, float(correlation[best_index]), margin)
+    standard_error = max(step, 0.1 * window_seconds)
+    return ClockEstimate(seconds, standard_error, 0.0, 0.0, float(correlation[best_index]), margin)
+
+
+def _smooth_rate(yaw_rate: np.ndarray, window: int) -> np.ndarray:
+    """Return the yaw rate [K] as the derivatives of local parabolas through its integral.
+
+    These are means with parabolic weights over a window of samples.
+    """
+    window = min(2 * (window // 2) + 1, 2 * ((yaw_rate.size - 1) // 2) + 1)
+    weights = 1.0 - np.linspace(-1.0, 1.0, window + 2)[1:-1] ** 2
+    mean = yaw_rate.mean()
+    smoothed = np.convolve(yaw_rate - mean, weights / weights.sum(), mode="same")
+    return np.asarray(mean + smoothed)
 
 
 def _refine_offset(
@@ -154,6 +180,7 @@ def _refine_offset(
     heading: np.ndarray,
     rate_times: np.ndarray,
     yaw_rate: np.ndarray,
+    window_seconds: float,
 ) -> ClockEstimate:
     """Refine an offset by regressing the heading on the shifted integral of the yaw rate.
 
@@ -163,9 +190,10 @@ def _refine_offset(
         heading: heading [T] in rad.
         rate_times: times of the yaw rate [K] in s on the clock of the gyro.
         yaw_rate: yaw rate [K].
+        window_seconds: window in s in which the yaw rate is smoothed for derivatives by the offset.
 
     Returns:
-        The refined estimate; the coarse one if the regression does not converge near it.
+        The refined estimate; the coarse_estimate one if the regression does not converge near it.
     """
     half_steps = 0.5 * np.diff(rate_times)
     integral = np.append(0.0, np.cumsum(half_steps * (yaw_rate[1:] + yaw_rate[:-1])))
@@ -181,48 +209,78 @@ def _refine_offset(
     max_interval = 3.5 * float(np.median(intervals)) + 1e-9
     in_overlap &= intervals[next_sample - 1] < max_interval
     t = heading_times[in_overlap]
-    nuisance = _make_nuisance_columns(
+    nuisance, n_knots = _make_nuisance_columns(
         t, (float(start), float(stop)), rate_times + coarse_estimate.seconds, max_interval
     )
     response = heading[in_overlap]
     if t.size < 30:
         return coarse_estimate
     seconds = coarse_estimate.seconds
+    # noise in the derivative by the offset would count as information on it
+    smoothed_rate = _smooth_rate(yaw_rate, round(window_seconds / float(np.median(intervals))))
     has_drift = bool(stop - start > _MIN_DRIFT_SECONDS)
     drift = 0.0
     weights = np.ones(t.size)
     columns = np.zeros((t.size, 0))
     residual = response
+    integral_at_heading = np.interp(t - seconds, rate_times, integral)
+    gain = float(np.linalg.lstsq(np.column_stack((integral_at_heading, nuisance)), response)[0][0])
+    residual_std = 0.0
+    walk_std = 1.0
+    rate_noise = estimate_noise_std(yaw_rate)
+    knot_interval = float(stop - start) / (n_knots - 1)
+    # prior of the random walk: without it, the walk absorbs turns that are slower than its knots
+    n_other = nuisance.shape[1] - n_knots
+    prior = np.pad(np.diff(np.eye(n_knots), axis=0), ((0, 0), (3, n_other)))
     for _ in range(_MAX_ITERATIONS):
-        gyro_times = t - seconds - drift * (t - middle)
-        rate = np.interp(gyro_times, rate_times, yaw_rate)
-        columns = np.column_stack((np.interp(gyro_times, rate_times, integral), nuisance))
-        slope = -rate * np.linalg.lstsq(columns, response, rcond=None)[0][0]
+        shifted = t - seconds - drift * (t - middle)
+        rate = np.interp(shifted, rate_times, smoothed_rate)
+        columns = np.column_stack((np.interp(shifted, rate_times, integral), nuisance))
+        slope = -gain * rate
         columns = np.column_stack((slope, slope * (t - middle) * has_drift, columns))
-        root_weights = np.sqrt(weights)[:, None]
-        scales = np.abs(columns).max(axis=0)
-        scales[scales == 0.0] = 1.0
-        solution = np.linalg.lstsq(
-            columns / scales * root_weights, response * root_weights[:, 0], rcond=1e-12
-        )[0]
-        residual = response - columns / scales @ solution
-        solution = solution / scales
+        solution = _solve_weighted(columns, response, weights, prior * residual_std / walk_std)
+        residual = response - columns @ solution
         residual_std = max(float(np.median(np.abs(residual))) / 0.6745, 1e-9)
         weights = (_STUDENT_DOF + 1.0) / (_STUDENT_DOF + (residual / residual_std) ** 2)
         seconds += float(np.clip(solution[0], -0.3, 0.3))
         drift += float(np.clip(solution[1], -1e-4, 1e-4)) if has_drift else 0.0
+        gain = float(solution[2])
+        # white noise of the gyro makes the smallest walk; a drifting bias adds to it
+        steps = prior @ solution
+        noise_walk = gain * rate_noise * math.sqrt(knot_interval * float(np.median(intervals)))
+        walk_std = max(abs(noise_walk), float(np.sqrt(np.mean(steps**2))), 1e-9)
         if abs(solution[0]) < 1e-4:
             break
     if abs(seconds - coarse_estimate.seconds) > 5.0 * max(coarse_estimate.standard_error, 0.2):
         return coarse_estimate
-    standard_error = _compute_standard_error(columns, residual, weights)
+    prior *= residual_std / walk_std
+    standard_error = _compute_standard_error(columns, residual, weights, prior)
     return coarse_estimate._replace(
         seconds=seconds, standard_error=standard_error, drift=drift, middle=middle
     )
 
 
+def _solve_weighted(
+    columns: np.ndarray, response: np.ndarray, weights: np.ndarray, prior: np.ndarray
+) -> np.ndarray:
+    """Return the coefficients [k] of a weighted regression.
+
+    Args:
+        columns: design matrix [N, k].
+        response: response [N].
+        weights: weights [N].
+        prior: rows [K, k] that are zero a priori, in units of the residuals.
+    """
+    root_weights = np.sqrt(weights)
+    scales = np.abs(columns).max(axis=0)
+    scales[scales == 0.0] = 1.0
+    rows = np.vstack((columns * root_weights[:, None], prior))
+    right_side = np.append(response * root_weights, np.zeros(len(prior)))
+    return np.asarray(np.linalg.lstsq(rows / scales, right_side, rcond=1e-12)[0] / scales)
+
+
 def _compute_standard_error(
-    columns: np.ndarray, residual: np.ndarray, weights: np.ndarray
+    columns: np.ndarray, residual: np.ndarray, weights: np.ndarray, prior: np.ndarray
 ) -> float:
     """Return the standard error of the first coefficient of a weighted regression.
 
@@ -230,11 +288,13 @@ def _compute_standard_error(
         columns: design matrix [N, k].
         residual: residuals [N].
         weights: weights [N].
+        prior: rows [K, k] that are zero a priori, in units of the residuals.
     """
     scales = np.abs(columns).max(axis=0)
     scales[scales == 0.0] = 1.0
     scaled = columns / scales
-    bread = np.linalg.pinv(scaled.T @ (scaled * weights[:, None]))
+    information = scaled.T @ (scaled * weights[:, None])
+    bread = np.linalg.pinv(information + (prior / scales).T @ (prior / scales))
     scores = scaled * (weights * residual)[:, None]
     sections = (np.arange(residual.size) * _N_SECTIONS) // residual.size
     section_scores = np.stack([scores[sections == k].sum(axis=0) for k in range(_N_SECTIONS)])
@@ -252,17 +312,23 @@ def _compute_standard_error(
 
 
 def _make_nuisance_columns(
-    t: np.ndarray, overlap: tuple[float, float], rate_times: np.ndarray, max_interval: float
-) -> np.ndarray:
-    """Return columns [N, k] for the difference between a heading and the integral of a yaw rate.
+    t: np.ndarray,
+    overlap: tuple[float, float],
+    rate_times: np.ndarray,
+    max_interval: float,
+) -> tuple[np.ndarray, int]:
+    """Make columns [N, k] for the difference between a heading and the integral of a yaw rate.
 
     Args:
         t: times of the heading [N] in s.
         overlap: start and stop of both recordings in s.
         rate_times: times of the yaw rate in s on the same clock.
         max_interval: longest interval of the yaw rate that is no gap, in s.
+
+    Returns:
+        The columns, and the number of knots of the random walk, which are the first ones.
     """
-    # the integral of the gyro's noise is a random walk: a piecewise linear function absorbs it
+    # the integral of the gyro's noise is a random walk, here piecewise linear; its bias is a trend
     start, stop = overlap
     n_knots = int(np.clip((stop - start) / _KNOT_SECONDS, 2, _MAX_KNOTS))
     knots = np.linspace(start, stop, n_knots)
@@ -271,4 +337,5 @@ def _make_nuisance_columns(
     intervals = np.diff(rate_times)
     longest_gaps = np.argsort(intervals)[-_MAX_GAPS:]
     gap_times = rate_times[longest_gaps[intervals[longest_gaps] >= max_interval]]
-    return np.column_stack((walk, (t[:, None] > gap_times).astype(np.float64)))
+    trend = t - 0.5 * (start + stop)
+    return np.column_stack((walk, trend, (t[:, None] > gap_times).astype(np.float64))), n_knots

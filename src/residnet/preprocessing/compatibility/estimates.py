@@ -63,17 +63,24 @@ class ErrorEstimate:
     def is_determined(self) -> bool:
         """Whether sensors determine the error; otherwise the smoothness of the motion does.
 
-        An error that is significant beyond the effect of smoothness is determined, too.
+        The effect of smoothness is a bias of unknown size, for which there is no interval.
         """
-        is_distinct = abs(self.value) > _MIN_T_STATISTIC * self.standard_error
-        has_information = self.standard_error < 0.5 * self.prior_std
-        return has_information and (self.is_independent_of_smoothness or is_distinct)
+        return self._has_information and self.is_independent_of_smoothness
 
     @property
     def is_significant(self) -> bool:
-        """Whether the error is determined and differs from zero by 3.5 standard errors."""
+        """Whether the error differs from zero by 3.5 standard errors and the effect of smoothness.
+
+        An error can be significant although no sensor determines its size.
+        """
         total = float(np.hypot(self.statistical_error, self.change))
-        return self.is_determined and abs(self.value) > _MIN_T_STATISTIC * total
+        limit = _MIN_T_STATISTIC * max(self.standard_error, total)
+        return self._has_information and abs(self.value) > limit
+
+    @property
+    def _has_information(self) -> bool:
+        """Whether the data narrow the prior to half."""
+        return self.standard_error < 0.5 * self.prior_std
 
 
 @dataclass(frozen=True)

@@ -157,8 +157,13 @@ def compatibility_tables(rows: Sequence[CompatibilityRow]) -> list[Block]:
             ),
             (
                 "median standard error",
-                lambda members: median_text(
-                    members[0].unit, (error.standard_error for error in members)
+                lambda members: (
+                    median_text(
+                        members[0].unit,
+                        [error.standard_error for error in members if error.is_determined],
+                    )
+                    if source(members) == "sensors"
+                    else DASH
                 ),
             ),
             ("determined by", source),
@@ -166,7 +171,7 @@ def compatibility_tables(rows: Sequence[CompatibilityRow]) -> list[Block]:
         ],
         caption="Errors of the instruments, estimated from the kinematics alone. A clock is the"
         " time to add to that of the sensor. An error that only the smoothness of the motion"
-        " determines is no finding.",
+        " determines has no interval.",
     )
 
     def current_text(row: CompatibilityRow) -> str:
