@@ -38,7 +38,7 @@ from residnet.preprocessing.prepare import PreparedLog
 from residnet.preprocessing.samples import make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.training import refit as module
-from residnet.training.left_out import estimate_leave_one_out
+from residnet.training.left_out import PriorMeans, estimate_leave_one_out
 from residnet.training.refit import Problem, refit, sensitivities
 from residnet.training.refit_config import RefitConfig
 
@@ -350,3 +350,43 @@ def test_one_step_goes_where_a_refit_without_the_logs_goes() -> None:
         apart += float(((theta - wanted) / scale).square().sum())
         moved += float(((whole - wanted) / scale).square().sum())
     assert apart < 0.25 * moved
+
+
+def test_one_step_takes_the_fold_out_of_a_strong_prior_too() -> None:
+    """The least-squares solution of all logs holds a refit near the logs that are left out."""
+    logs = trials(noise=0.05)[:4]
+    config = RefitConfig(horizon=4.0, every=4.0, iterations=6, prior=1.0)
+    model = model_of(LINEAR)
+    known = make_samples(logs, model.signals)
+    store = WindowStore.from_logs(logs, torch.float64)
+    fold = torch.tensor([i % 2 for i in range(len(logs))])
+    kept_logs = [[log for i, log in enumerate(logs) if i % 2 != k] for k in range(2)]
+
+    def solve(kept: Sequence[PreparedLog]) -> Tensor:
+        other = model_of(LINEAR)
+        samples = make_samples(kept, other.signals)
+        RegressorsConfig(terms=tuple(LINEAR)).fit_preferred(other.baseline, samples)
+        assert isinstance(other.baseline, ParametricBaseline)
+        return other.baseline.get_free().detach().clone()
+
+    prior_means = PriorMeans(solve(logs), torch.stack([solve(kept) for kept in kept_logs]))
+    assert isinstance(model.baseline, ParametricBaseline)
+    model.baseline.set_free(prior_means.of_all_logs)
+    refit(model, known, store, config, SCALES)
+    refitted = model.baseline.get_free().detach().clone()
+    arguments = (model, known, store, config, SCALES, fold)
+    with_fold = estimate_leave_one_out(*arguments)
+    without_fold = estimate_leave_one_out(*arguments, prior_means=prior_means)
+    distances = np.zeros(2)
+    for k, kept in enumerate(kept_logs):
+        other = copy.deepcopy(model)
+        assert isinstance(other.baseline, ParametricBaseline)
+        other.baseline.set_free(prior_means.without_folds[k])
+        samples = make_samples(kept, model.signals)
+        refit(other, samples, WindowStore.from_logs(kept, torch.float64), config, SCALES)
+        wanted = other.baseline.get_free().detach()
+        scale = refitted.abs() + 0.1
+        for j, thetas in enumerate((with_fold, without_fold)):
+            theta = thetas[k].flatten()[model.baseline.free_indices()]
+            distances[j] += float(((theta - wanted) / scale).square().sum())
+    assert distances[1] < 0.25 * distances[0]

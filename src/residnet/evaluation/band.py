@@ -222,7 +222,8 @@ class Band:
         step: time step in s.
         steps: horizons of the tables in time steps [G], ascending.
         half_width: half widths of a run of typical intensity [G, c], SI and rad.
-        unconditional_width: half widths that ignore the intensity [G, c].
+        unconditional_width: half widths that ignore the intensity [G, c]; they also hold for
+            commands of another kind, see `residnet.identification.command_variance`.
         simultaneous_factor: factors [c] on the half widths so that they cover whole runs.
         constant_width: half widths [c] that are constant over the horizon, for comparison.
         score_unit: root mean square constant-velocity errors [c], the unit of interval scores.

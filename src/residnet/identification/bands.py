@@ -35,6 +35,10 @@ from residnet.evaluation.bands import (
 from residnet.evaluation.freerun import Candidate, run_free_runs
 from residnet.evaluation.protocol import Window
 from residnet.heads.base import ClosedFormHead
+from residnet.identification.command_variance import (
+    draw_command_flights,
+    widen_for_other_commands,
+)
 from residnet.identification.domain import estimate_density
 from residnet.identification.fitter import (
     FittedModel,
@@ -51,7 +55,7 @@ from residnet.preprocessing.prepare import PreparedLog
 from residnet.preprocessing.samples import make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import Solution
-from residnet.training.left_out import estimate_leave_one_out
+from residnet.training.left_out import PriorMeans, estimate_leave_one_out
 from residnet.training.refit import require_parametric_baseline
 
 
@@ -145,18 +149,34 @@ class LeaveFoldOutModels:
                     model.baseline, config.fit_solutions(model.baseline, fold_samples), fitted_model
                 )
             return fold_models
+        prior_weight = float(fitted_model.notes["prior"])
         parameters_by_fold = estimate_leave_one_out(
             full_model,
             self.training_samples,
             WindowStore.from_logs(self.identified.training_logs, torch.float64),
-            refit_config.with_prior(float(fitted_model.notes["prior"])),
+            refit_config.with_prior(prior_weight),
             torch.from_numpy(settings.evaluation.scales.to_array()),
             self.fold_of_log,
             fitted_model.notes["refit"]["at_rest"],
+            self._solve_prior_means(fitted_model) if prior_weight >= _MIN_PRIOR_WEIGHT else None,
         )
         for model, theta in zip(fold_models, parameters_by_fold, strict=True):
             require_parametric_baseline(model).theta.data.copy_(theta)
         return fold_models
+
+    def _solve_prior_means(self, fitted_model: FittedModel) -> PriorMeans:
+        """Return the least-squares solutions of a baseline with and without each fold."""
+        solutions = []
+        for k in (None, *range(self.n_folds)):
+            model = copy.deepcopy(fitted_model.model).to(torch.float64)
+            samples = self.training_samples if k is None else self._samples_without_fold(k)
+            _load_matching_solution(
+                model.baseline,
+                fitted_model.spec.baseline.fit_solutions(model.baseline, samples),
+                fitted_model,
+            )
+            solutions.append(require_parametric_baseline(model).get_free().detach().clone())
+        return PriorMeans(solutions[0], torch.stack(solutions[1:]))
 
     def _fit_head_without_fold(
         self, fitted_model: FittedModel, baseline: HybridDynamics, fold: int
@@ -191,6 +211,8 @@ def _load_matching_solution(
     module.load_state_dict(next(matching_solutions, solutions[0]).state, strict=False)
 
 
+_MIN_PRIOR_WEIGHT = 0.1
+"""Weight of the least-squares prior of a refit from which it is solved again without each fold."""
 _MIN_KINDS = 3
 """Kinds of manoeuvres from which widths depend on the distance to the training data. Of two kinds,
 models without one of them know a single kind and extrapolate more than the model itself: on six
@@ -401,7 +423,18 @@ class _ProtocolCalibration:
                 band = bands_by_model[reference_name]
                 cautions = (_REFERENCE_BAND_CAUTION.format(reference_name), *band.cautions)
                 bands_by_model[name] = replace(band, cautions=cautions)
-        return {name: bands_by_model[name] for name in self.fitted_models if name in bands_by_model}
+        logs = self.fitted_models.training_logs
+        flights = draw_command_flights(
+            self._make_windows(logs), logs, self.fitted_models.settings.signals
+        )
+        widened_bands = widen_for_other_commands(
+            bands_by_model,
+            self.fitted_models.models,
+            flights,
+            self.dt,
+            self.fitted_models.velocity_limits,
+        )
+        return {name: widened_bands[name] for name in self.fitted_models if name in widened_bands}
 
     def _borrow_band(
         self,

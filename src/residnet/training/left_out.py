@@ -68,6 +68,18 @@ def estimate_refit_covariance(
     return RefitUncertainty(covariance, float(cost.square() - config.robust**2))
 
 
+class PriorMeans(NamedTuple):
+    """Least-squares solutions that are the prior means of refits, free parameters.
+
+    Attributes:
+        of_all_logs: solution of all logs [P].
+        without_folds: solutions without each fold of logs [K, P].
+    """
+
+    of_all_logs: Tensor
+    without_folds: Tensor
+
+
 _MAX_HALVINGS = 4
 """Maximum number of trials per step; each halves the step."""
 
@@ -80,10 +92,12 @@ def estimate_leave_one_out(
     scales: Tensor,
     fold: Tensor,
     fixed: Sequence[int] = (),
+    prior_means: PriorMeans | None = None,
 ) -> list[Tensor]:
     """Estimate the parameters of refits that each leave out one fold of logs.
 
-    Each is one Gauss-Newton step from the refitted parameters (infinitesimal jackknife).
+    Each is one Gauss-Newton step from the refitted parameters (infinitesimal jackknife). The prior
+    of the refit is the least-squares solution; that of all logs contains the fold that is left out.
 
     Args:
         model: a baseline without a head, after its refit; it is not changed.
@@ -93,6 +107,8 @@ def estimate_leave_one_out(
         scales: scales of the velocities in SI units [n].
         fold: index of the fold of each log [L], from 0 on.
         fixed: indices of the free parameters that the refit has fixed at zero.
+        prior_means: least-squares solutions with and without the folds; None to leave the prior
+            unchanged, which suffices if it has a small weight.
 
     Returns:
         theta of each fold. It equals the refitted theta if the fold has no window, or if no
@@ -130,36 +146,63 @@ def estimate_leave_one_out(
         if n_windows[k] == 0 or n_remaining == 0:
             thetas.append(refitted_theta.clone())
             continue
+        per_nat = problem.cost_per_nat(cost)
         hessian = (
-            problem.precision
-            + problem.symmetry
-            + torch.diag(problem.cost_per_nat(cost) * problem.belief_precision)
+            problem.precision + problem.symmetry + torch.diag(per_nat * problem.belief_precision)
         )
         for j, (hessian_of_fold, _) in enumerate(equations_by_fold):
             if j != k:
                 hessian = hessian + n_windows[j] / n_remaining * hessian_of_fold
         gradient_change = n_windows[k] / n_remaining * (equations_by_fold[k][1] - total_gradient)
+        remaining_windows = _select_windows(problem, fold_of_window != k)
+        objective_scale = None
+        if prior_means is not None:
+            shift = prior_means.without_folds[k] - prior_means.of_all_logs
+            gradient_change = gradient_change + problem.precision @ shift
+            remaining_windows = replace(remaining_windows, prior_mean=prior_means.without_folds[k])
+            objective_scale = per_nat
+        # a fixed parameter keeps its diagonal entry, so that the Hessian is invertible
+        is_free = ~problem.fixed
+        hessian = hessian * (is_free[:, None] & is_free | torch.eye(len(is_free)).bool())
         step = torch.linalg.lstsq(
-            hessian, gradient_change.unsqueeze(1), driver="gelsd"
+            hessian, (gradient_change * is_free).unsqueeze(1), driver="gelsd"
         ).solution.squeeze(1)
         step[problem.fixed] = 0.0
-        remaining_windows = _select_windows(problem, fold_of_window != k)
-        baseline.set_free(_largest_improving_step(model, remaining_windows, parameters, step))
+        baseline.set_free(
+            _largest_improving_step(model, remaining_windows, parameters, step, objective_scale)
+        )
         thetas.append(baseline.theta.detach().clone())
         baseline.set_free(parameters)
     return thetas
 
 
 def _largest_improving_step(
-    model: HybridDynamics, problem: Problem, parameters: Tensor, step: Tensor
+    model: HybridDynamics,
+    remaining_windows: Problem,
+    parameters: Tensor,
+    step: Tensor,
+    per_nat: Tensor | None,
 ) -> Tensor:
-    """Return the parameters after the largest fraction of the step that lowers the cost."""
+    """Return the parameters after the largest fraction of the step that lowers the cost.
+
+    Args:
+        model: the model with its refitted parameters.
+        remaining: windows of the other logs, and the prior without the fold.
+        parameters: refitted free parameters [P].
+        step: the step [P].
+        per_nat: change of the cost per nat, if the cost includes the priors; None if not.
+    """
     baseline = require_parametric_baseline(model)
-    initial_cost, _ = simulate(model, problem)
+
+    def evaluate(theta: Tensor) -> Tensor:
+        baseline.set_free(theta)
+        cost, _ = simulate(model, remaining_windows)
+        return cost if per_nat is None else cost + remaining_windows.prior_cost(theta, per_nat)
+
+    initial_cost = evaluate(parameters)
     for halving in range(_MAX_HALVINGS):
         trial = parameters + 0.5**halving * step
-        baseline.set_free(trial)
-        trial_cost, _ = simulate(model, problem)
+        trial_cost = evaluate(trial)
         baseline.set_free(parameters)
         if torch.isfinite(trial_cost) and trial_cost <= initial_cost:
             return trial
