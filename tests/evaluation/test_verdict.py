@@ -381,6 +381,7 @@ def test_the_verdict_names_references_other_horizons_and_the_free_runs() -> None
     assert said[3] == "Other horizons: 0.50 m and 2.0 deg after 10 s (good)."
     assert said[4] == (
         "The errors are means of 12 free runs (T30) of 4 logs at mean speeds of 1.5 to 2.5 m/s."
+        " The intervals hold for commands of the kind in these logs."
     )
     # no number has an exponent
     limits = under(horizons=[horizon(100, errors(1234.0, 113.0))])

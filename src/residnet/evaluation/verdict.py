@@ -583,7 +583,8 @@ def describe_references(evidence: VerdictEvidence, main: ProtocolHorizon) -> lis
         else "",
         f"Other horizons: {'; '.join(other_horizons)}." if other_horizons else "",
         f"The errors are means of {format_count(row.windows, 'free run')} ({main.protocol}) of"
-        f" {format_count(row.logs, 'log')}{speeds}{spread}.",
+        f" {format_count(row.logs, 'log')}{speeds}{spread}. The intervals hold for commands of the"
+        " kind in these logs.",
     ]
 
 
