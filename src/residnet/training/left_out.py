@@ -187,7 +187,7 @@ def _largest_improving_step(
 
     Args:
         model: the model with its refitted parameters.
-        remaining: windows of the other logs, and the prior without the fold.
+        remaining_windows: windows of the other logs, and the prior without the fold.
         parameters: refitted free parameters [P].
         step: the step [P].
         per_nat: change of the cost per nat, if the cost includes the priors; None if not.
