@@ -480,11 +480,8 @@ def group_trip_files(paths: Mapping[Path, tuple[str, ...]]) -> dict[str, list[Pa
     if not 2 <= len(file_groups) <= 6:
         return {}
     file_words = [
-        # `gnss` in gnss1, `6d` in run1_6d
-        [
-            {*re.findall(r"[^\W\d_]+", path.stem), *re.findall(r"[^\W_]+", path.stem)}
-            for path in group
-        ]
+        # `gnss` of gnss1, `6d` of run1_6d
+        [{*re.findall(r"(?<![^\W_])\d[^\W\d_]+|[^\W\d_]+", path.stem)} for path in group]
         for group in file_groups
     ]
     # words that occur in all file names of a group, the longest first
