@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
+from scipy.special import chdtrc
 
 SIGN_LEVEL = 0.05
 """Significance level of the test for a wrong sign."""
@@ -182,7 +183,7 @@ def assess_pair_symmetry(
 
     def compute_p_value(tested_ratio: float) -> float:
         difference = max(compute_deviance(tested_ratio)[0] - smallest_deviance, 0.0)
-        return float(scipy.stats.chi2.sf(difference / dispersion, 1))
+        return float(chdtrc(1, difference / dispersion))
 
     surge_signs = (1.0, 1.0)
     if "u" in state_names:
