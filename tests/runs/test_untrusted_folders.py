@@ -29,11 +29,10 @@ from tiny_tasks import boat, flown, measured
 import residnet
 from residnet.cli import main
 from residnet.core.errors import ResidnetError, UsageError
-from residnet.core.run_loader import accept_run, name_damaged_key
+from residnet.core.run_loader import accept_run, name_damaged_key, read_json_value
 from residnet.engine.c_code import find_compiler
 from residnet.export import vessel
 from residnet.report import page, still
-from residnet.report.run_reader import RunFiles
 from residnet.runs import folder as run_folder
 from residnet.runs.folder import RunFolder
 from residnet.tasks import registry
@@ -284,7 +283,8 @@ def _read_task(run: Path) -> None:
     folder = RunFolder.open(run)
     with name_damaged_key(run):
         registry.open_finished_task(run, registry.get_task_class(folder).supported_commands[0])
-        RunFiles(run).read_json("metrics.json")
+        if (run / "metrics.json").is_file():
+            read_json_value(run / "metrics.json", run)
 
 
 def _export(run: Path) -> None:
