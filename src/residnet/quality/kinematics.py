@@ -277,9 +277,9 @@ def _model_heading(
     columns = {"bias": [-dt], "ramp": [-dt, -dt * normalized_time]}
     # with a constant heading, gain and bias of r are collinear
     heading_std = nan_std(log.cached(_smooth_leaving_out_centre, "psi"))
-    if _is_significant(log, "r") and heading_std > _MIN_HEADING_SIGNAL_TO_NOISE * log.noise_std(
-        "psi"
-    ):
+    if log.cached(
+        _is_significant, "r"
+    ) and heading_std > _MIN_HEADING_SIGNAL_TO_NOISE * log.noise_std("psi"):
         columns = {"gain": [-_integrate_steps(dt, smoothed_rate)], **columns}
         if with_lags:
             columns["lag"] = [np.diff(smoothed_rate)]
@@ -330,8 +330,8 @@ def _model_positions(
             -1j * _integrate_steps(dt, heading_rotation),
         ],
     }
-    noise_only_channels = {name for name in ("u", "v") if not _is_significant(log, name)}
-    noise_only_channels |= {"psi"} if "r" in log and not _is_significant(log, "r") else set()
+    noise_only_channels = {name for name in ("u", "v") if not log.cached(_is_significant, name)}
+    noise_only_channels |= {"psi"} if "r" in log and not log.cached(_is_significant, "r") else set()
     columns = {
         name: cause_columns
         for name, cause_columns in columns.items()
