@@ -577,14 +577,14 @@ def describe_references(evidence: VerdictEvidence, main: ProtocolHorizon) -> lis
         if row.logs_of_spread > row.logs
         else ""
     )
+    has_intervals = any(any(errors.intervals.values()) for errors in row.models.values())
+    interval_level = " (95 % prediction intervals)" if has_intervals else ""
+    scope = " The intervals hold for commands of the kind in these logs." if has_intervals else ""
     return [
-        f"Reference models (95 % prediction intervals): {'; '.join(references)}."
-        if references
-        else "",
+        f"Reference models{interval_level}: {'; '.join(references)}." if references else "",
         f"Other horizons: {'; '.join(other_horizons)}." if other_horizons else "",
         f"The errors are means of {format_count(row.windows, 'free run')} ({main.protocol}) of"
-        f" {format_count(row.logs, 'log')}{speeds}{spread}. The intervals hold for commands of the"
-        " kind in these logs.",
+        f" {format_count(row.logs, 'log')}{speeds}{spread}.{scope}",
     ]
 
 
