@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,12 @@ import pytest
 import yaml
 
 import residnet
+from residnet.api import data as api_data
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
 from residnet.io.drafting.questions import READER_KEY, Key
+from residnet.io.drafting.reading import DraftResult, read_mixed_formats
+from residnet.tasks import inspection
 from residnet.tasks.drafting import write_new_config
 from residnet.tasks.inspection import inspect_logs
 from residnet.tasks.registry import load_task, open_finished_task
@@ -72,7 +76,26 @@ def answers_of(case: dict[str, Any]) -> dict[Key, str]:
     return {(*READER_KEY, *key.split(".")): text for key, text in case.get("answers", {}).items()}
 
 
-@pytest.mark.usefixtures("omit_currents")
+@pytest.fixture
+def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read files for the second reader, `residnet.read_logs`, as `inspect` has read them.
+
+    Both make the same call of the same function, which takes a third of the time of a layout.
+    """
+    results = dict[tuple[Path, ...], list[DraftResult]]()
+
+    def read(paths: Sequence[Path], answers: Mapping[Key, str] | None = None) -> list[DraftResult]:
+        assert not answers
+        key = tuple(paths)
+        if key not in results:
+            results[key] = read_mixed_formats(paths)
+        return results[key]
+
+    for module in (inspection, api_data):
+        monkeypatch.setattr(module, "read_mixed_formats", read)
+
+
+@pytest.mark.usefixtures("omit_currents", "read_once")
 @pytest.mark.parametrize("name", FOLDERS)
 def test_a_layout_is_read_and_told_for_what_it_is(name: str, tmp_path: Path) -> None:
     case, folder = case_in(name, tmp_path)

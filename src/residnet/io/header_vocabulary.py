@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from residnet.core.errors import UsageError
 from residnet.core.names import ACCELERATION_NAMES, BOW_WIND_CHANNELS, CHANNEL_UNITS, get_si_unit
-from residnet.core.units import canonical_unit, is_unit, si_unit
+from residnet.core.units import canonical_unit, find_unit, is_unit, si_unit
 
 _IN_BRACKETS = re.compile(r"[\[({]([^\])}]*)[\])}]")
 _FULL_RUDDER_DEG = 35.0
@@ -120,10 +119,8 @@ def parse_header_unit(column: str, expected: str | None) -> str | None:
         if len(unit) == 1 and unit.isalpha() and text not in _IN_BRACKETS.findall(column):
             # a single letter at the end is part of the name
             continue
-        try:
-            return canonical_unit(unit, expected)
-        except UsageError:
-            continue
+        if (name := find_unit(unit, expected)) is not None:
+            return name
     return None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, final
 
 import yaml
@@ -203,19 +204,22 @@ def _format_entries(
     indent = "  " * len(parent_path)
     for key, value in content.items():
         path = (*parent_path, str(key))
-        flow_text = _format_flow(value)
         lines += [line for text in comments(path) for line in _wrap_comment(text, indent)]
+        nested_lines = (
+            _format_entries(value, path, comments) if isinstance(value, Mapping) and value else []
+        )
+        if nested_lines and any(
+            isinstance(nested_value, Mapping) for nested_value in value.values()
+        ):
+            # never on one line, whose text takes most of the time of a draft's text
+            lines += [f"{indent}{_format_flow(key)}:", *nested_lines]
+            continue
+        flow_text = _format_flow(value)
         fits_on_line = len(indent) + len(str(key)) + 2 + len(flow_text) <= _LINE_WIDTH
-        if isinstance(value, Mapping) and value:
-            nested_lines = _format_entries(value, path, comments)
-            is_nested = any(isinstance(nested_value, Mapping) for nested_value in value.values())
-            if (
-                not fits_on_line
-                or is_nested
-                or any(line.lstrip().startswith("#") for line in nested_lines)
-            ):
-                lines += [f"{indent}{_format_flow(key)}:", *nested_lines]
-                continue
+        has_comments = any(line.lstrip().startswith("#") for line in nested_lines)
+        if nested_lines and (has_comments or not fits_on_line):
+            lines += [f"{indent}{_format_flow(key)}:", *nested_lines]
+            continue
         if isinstance(value, list) and value and not fits_on_line:
             lines += [
                 f"{indent}{_format_flow(key)}:",
@@ -227,6 +231,16 @@ def _format_entries(
 
 
 def _format_flow(value: Any) -> str:
+    return _format_text_flow(value) if type(value) is str else _format_any_flow(value)
+
+
+@lru_cache(maxsize=4096)
+def _format_text_flow(text: str) -> str:
+    """Format a text; keys occur again and again."""
+    return _format_any_flow(text)
+
+
+def _format_any_flow(value: Any) -> str:
     text: str = yaml.safe_dump(
         value, default_flow_style=True, width=10**6, sort_keys=False, allow_unicode=True
     )
