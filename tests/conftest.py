@@ -51,6 +51,7 @@ DEAR = (
     "contracts/test_beyond_the_plane.py",
     "tasks/test_sklearn_run.py",
     "autopilot/test_heading.py",
+    "tasks/test_check_without_torch.py",
     "tasks/test_simulate.py",
     "report/test_sections.py",
     "tasks/test_scale.py",
@@ -65,7 +66,6 @@ DEAR = (
     "studies/test_force_residual.py",
     "quality/test_lack_of_fit.py",
     "io/test_drafting_habits.py",
-    "autopilot/test_guidance.py",
     "preprocessing/test_compatibility.py",
 )
 """Files of four seconds or more, the longest first, so that the last ones are short."""

@@ -69,7 +69,10 @@ def write_layout(folder: Path, seed: int) -> tuple[str, list[dict[str, np.ndarra
     return f"{layout}, {has_track=}, {has_units=}, {is_excel=}", truth
 
 
-@pytest.mark.parametrize("seed", range(10))
+# the first five layouts have both values of every choice; other combinations are long tests
+@pytest.mark.parametrize(
+    "seed", [*range(5), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(5, 10))]
+)
 def test_speed_and_drift_angle_of_drawn_layouts_become_u_and_v(seed: int, tmp_path: Path) -> None:
     layout, truth = write_layout(tmp_path, seed)
     logs = residnet.read_logs(tmp_path)

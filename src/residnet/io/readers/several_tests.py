@@ -240,10 +240,12 @@ def _choose_delimiter(lines: Sequence[str]) -> str:
     sample = [line for line in lines if line.strip()][:_SAMPLED_LINES]
 
     def count_values(delimiter: str) -> int:
-        return sum(
-            len(cells) > 1 and 2 * sum(map(is_value, cells)) > len(cells)
-            for cells in (split_line(line, delimiter) for line in sample)
-        )
+        is_whitespace = delimiter == WHITESPACE_DELIMITER
+        # a line without the separator is one cell
+        rows = [
+            split_line(line, delimiter) for line in sample if is_whitespace or delimiter in line
+        ]
+        return sum(len(cells) > 1 and 2 * sum(map(is_value, cells)) > len(cells) for cells in rows)
 
     counts = {delimiter: count_values(delimiter) for delimiter in (";", "\t", "|", ",")}
     best = max(counts, key=lambda delimiter: counts[delimiter])
