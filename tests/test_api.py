@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -22,6 +23,7 @@ from residnet.evaluation.metrics_file import build_metrics_table
 from residnet.evaluation.protocol import EvaluationConfig
 from residnet.evaluation.records import MetricsFile
 from residnet.export import vessel
+from residnet.io.split import split_logs
 from residnet.manoeuvres.trials import simulate_trial_logs
 from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.physics.signals_config import SignalsConfig
@@ -149,6 +151,33 @@ def test_inputs_that_move_as_others_are_unexcited(logs: list[residnet.Log]) -> N
     signals = residnet.prepare(alike).signals
     assert signals.inputs == ("n_port", "delta")
     assert signals.unexcited == ("n_stbd",)
+
+
+def test_inputs_that_only_other_logs_vary_are_held(logs: list[residnet.Log]) -> None:
+    splits = {split: [log.name for log in members] for split, members in split_logs(logs).items()}
+    varying = splits["test"][0]
+    with_trim = [
+        log.replace(
+            channels={
+                **log.channels,
+                "n": np.where((log.name == varying) & (log.t > log.t.mean()), 20.0, 12.0),
+            }
+        )
+        for log in logs
+    ]
+    heard: list[residnet.Progress] = []
+    data = residnet.prepare(with_trim, progress=heard.append)
+    assert "n" not in data.signals.inputs
+    assert data.signals.unexcited == ("n",)
+    text = f"n is constant at 12 in the training logs.*train on {varying} to identify"
+    assert any(re.search(text, report.message) for report in heard)
+    models = residnet.fit(data, "regressors", bands=None)
+    assert any("n was held at" in sentence for sentence in models.excitation.domain)
+    explicit = residnet.prepare(with_trim, [*data.signals.inputs, "n"])
+    with pytest.raises(ResidnetError, match=r"regressor 'n' is constant.*`unexcited`"):
+        residnet.fit(explicit, "regressors", bands=None)
+    held = residnet.prepare(with_trim, data.signals.inputs, unexcited=["n"])
+    assert held.signals == data.signals
 
 
 @pytest.mark.long

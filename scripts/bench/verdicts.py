@@ -9,7 +9,8 @@ otherwise all vessels would share one comparison of kinds. For every horizon tha
 verdict rates good or limited, the mean errors of position and heading on the new trials are
 compared with the prediction intervals and with the errors of constant velocity. Printed for each
 vessel: the level at the main horizon, and every violation. Then the shares over all vessels.
-`--first` and `--last` select some of the vessels, so that a long run can be divided.
+`--first` and `--last` select some of the vessels, so that a long run can be divided. A vessel whose
+fit ends with an error is counted as failed.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import numpy as np
 from fleets import drawn
 
 import residnet
+from residnet.core.errors import ResidnetError
 from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.evaluation.verdict import (
     GOOD_LEVEL,
@@ -101,6 +103,7 @@ def main() -> None:
     """Print the table."""
     options = bench.options(__doc__, vessels=60, seed=11, first=0, last=10_000)
     comparisons: list[Comparison] = []
+    n_failed = 0
     numbers = range(options.vessels)[options.first : options.last]
     for kind, first in (("boat", 0), ("twin", options.vessels // 2)):
         count = options.vessels // 2
@@ -113,9 +116,14 @@ def main() -> None:
             began = time.process_time()
             order = np.random.default_rng([options.seed, first, i]).permutation(_LENGTH_OF_FLEETS)
             logs = [fleet.logs[j] for j in order]
-            models = residnet.fit(logs[:_N_FITTED], "regressors", ("plsr", "mlp"))
-            new = logs[_N_FITTED:][: len(models.data.logs("test"))]
-            comparison = compare_with_new_trials(models, new)
+            try:
+                models = residnet.fit(logs[:_N_FITTED], "regressors", ("plsr", "mlp"))
+                new = logs[_N_FITTED:][: len(models.data.logs("test"))]
+                comparison = compare_with_new_trials(models, new)
+            except ResidnetError as error:
+                n_failed += 1
+                print(f"{fleet.name:8s} failed: {error}", flush=True)
+                continue
             comparisons.append(comparison)
             took = time.process_time() - began
             print(
@@ -129,7 +137,7 @@ def main() -> None:
     n_horizons = sum(c.n_horizons for c in comparisons)
     levels = [c.level for c in comparisons]
     print(
-        f"{len(comparisons)} vessels: {levels.count(GOOD_LEVEL)} good,"
+        f"{len(comparisons)} vessels, {n_failed} failed: {levels.count(GOOD_LEVEL)} good,"
         f" {levels.count(LIMITED_LEVEL)} limited; of {n_errors} errors"
         f" {sum(c.n_within for c in comparisons)} within the interval,"
         f" {sum(c.n_above for c in comparisons)} above; of {n_horizons} horizons"

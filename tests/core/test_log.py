@@ -30,6 +30,14 @@ def log() -> Log:
     )
 
 
+def test_log_is_a_mapping_of_channels(log: Log) -> None:
+    assert list(log) == list(log.keys()) == ["u", "psi", "fuel"]
+    assert "u" in log
+    assert "t" not in log
+    assert dict(log)["psi"] is log["psi"]
+    assert len(log) == 50
+
+
 def test_log_save_and_load_are_lossless(log: Log, tmp_path: Path) -> None:
     for one in (log, Log("empty", np.zeros(0), {}, meta={"vessel": None})):
         one.save(tmp_path / "log.parquet")

@@ -24,6 +24,7 @@ from residnet.identification.prepared import prepare_splits
 from residnet.identification.recipe import choose_window_length, make_evaluation_settings
 from residnet.io.readers import ReaderConfig
 from residnet.io.sources import read_split_logs
+from residnet.io.split import split_logs
 from residnet.tasks.drafting import write_new_config
 from residnet.tasks.fit.config import FitConfig
 from residnet.tasks.registry import load_task
@@ -120,6 +121,19 @@ def test_a_config_from_logs_alone(folder: Path) -> None:
     for file, said in (("boat.yaml", "exists; give --overwrite"), ("a.txt", r"name it .*a\.txt\.")):
         with pytest.raises(UsageError, match=said):
             write_new_config([folder / "trials"], folder / file, None, overwrite=False)
+
+
+def test_an_input_that_the_training_logs_hold_is_unexcited(logs: list[Log], tmp_path: Path) -> None:
+    training = {log.name for log in split_logs(logs)["train"]}
+    for log in logs:
+        revolutions = np.where((log.name in training) | (log.t < 30.0), 5.0, 8.0)
+        log.replace(channels={**log.channels, "n": revolutions}).save(
+            tmp_path / f"{log.name}.parquet"
+        )
+    draft = residnet.draft_config(tmp_path, folder=tmp_path)
+    assert draft.config["signals"]["inputs"] == ["delta"]
+    assert draft.config["signals"]["unexcited"] == ["n"]
+    assert "n is constant at 5 in the training logs" in draft.text
 
 
 # 4 s; test_a_config_from_logs_alone drafts a split, too

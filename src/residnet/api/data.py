@@ -50,7 +50,11 @@ from residnet.preprocessing.prepare import PrepareConfig, PreparedLog
 from residnet.preprocessing.prepare import prepare_log as prepare_log
 from residnet.quality import inspect_log, inspect_log_set
 from residnet.tasks.drafting import ConfigDraft, describe_missing_steering, draft_fit_config
-from residnet.tasks.input_selection import choose_inputs, find_unexcited_inputs
+from residnet.tasks.input_selection import (
+    choose_inputs,
+    find_inputs_held_in_training,
+    find_unexcited_inputs,
+)
 from residnet.tasks.naval_draft import NavalParticulars
 
 if TYPE_CHECKING:
@@ -471,7 +475,7 @@ def prepare(
         all_logs = [log for members in complete_logs.values() for log in members]
         unexcited: Sequence[str] = ()
         if inputs is None:
-            input_names, unexcited = _derive_inputs(all_logs, dof)
+            input_names, unexcited = _derive_inputs(complete_logs, dof)
         else:
             input_names = inputs
         common_inputs = [
@@ -556,17 +560,19 @@ def _find_first_protocol(protocols: Any) -> str:
 
 
 def _derive_inputs(
-    logs: Sequence[Log], dof: DegreesOfFreedom
+    splits: Mapping[str, Sequence[Log]], dof: DegreesOfFreedom
 ) -> tuple[Sequence[str], Sequence[str]]:
     """Return the inputs and the unexcited inputs of a model, as `draft_config` chooses them.
 
     Args:
-        logs: logs with complete motion.
+        splits: logs with complete motion by split.
         dof: degrees of freedom of the model.
 
     Raises:
-        UsageError: if no channel is an input, or the vessel turns and no input steers it.
+        UsageError: if no channel is an input, or the vessel turns and no input steers it, or the
+            one that does is constant in the training logs.
     """
+    logs = [log for members in splits.values() for log in members]
     channels_text = f"the first log has {', '.join(logs[0].channels)}"
     input_names = choose_inputs(logs, DraftNotes())
     if not input_names:
@@ -580,7 +586,11 @@ def _derive_inputs(
             f"prepare: inputs: {problem}; map the column that does to a channel (read_logs:"
             f" reader), or pass inputs={list(input_names)} to fit without it; {channels_text}"
         )
-    unexcited = find_unexcited_inputs(logs, input_names)
+    held = find_inputs_held_in_training(splits, input_names)
+    input_names = tuple(name for name in input_names if name not in held)
+    if held and (problem := describe_missing_steering(input_names, dof, logs)):
+        raise UsageError(f"prepare: inputs: {problem}: {'; '.join(held.values())}")
+    unexcited = held | find_unexcited_inputs(logs, (*input_names, *held))
     for text in unexcited.values():
         log_message(f"inputs: {text}")
     return input_names, list(unexcited)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterator, KeysView
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -101,6 +102,17 @@ class Log:
                 f"log {self.name}: no channel '{name}'{suggest_name(name, self.channels)}"
             )
         return self.channels[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of the channels; `len` is the number of samples, as in pandas."""
+        return iter(self.channels)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.channels
+
+    def keys(self) -> KeysView[str]:
+        """Return the names of the channels, so that `dict(log)` has their values."""
+        return self.channels.keys()
 
     def stack(self, names: tuple[str, ...] | list[str]) -> np.ndarray:
         """Return channels as the columns of an array [T, len(names)]."""

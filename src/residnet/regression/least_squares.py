@@ -30,6 +30,8 @@ _MIN_COLLINEAR_LOADING = 0.1
 """Loading in the smallest singular vector, relative to the largest one, above which an error
 message lists a column as collinear.
 """
+_INTERCEPT = "1"
+"""Name of the column of ones."""
 _ROUNDING_FACTOR = 10
 """Largest rounding error of a zero eigenvalue of a Gram matrix, relative to its largest
 eigenvalue, in units of the number of columns times the machine precision.
@@ -95,9 +97,18 @@ class LeastSquares(Estimator):
             _ROUNDING_FACTOR * len(names) * torch.finfo(gram.dtype).eps * float(eigenvalues[-1])
         )
         if float(eigenvalues[0]) + min(self.penalties) < rounding_error:
-            collinear_names = [
-                names[i] for i in eigenvectors[:, 0].abs().argsort(descending=True)[:2].tolist()
-            ]
+            loadings = eigenvectors[:, 0].abs()
+            order = loadings.argsort(descending=True).tolist()
+            collinear_names = [names[i] for i in order[:2]]
+            is_pair = bool(loadings[order[2:]].le(_MIN_COLLINEAR_LOADING * loadings.max()).all())
+            if is_pair and _INTERCEPT in collinear_names:
+                collinear_names.remove(_INTERCEPT)
+                raise FitError(
+                    f"regressor '{collinear_names[0]}' is constant on these data, so its effect is"
+                    f" not identifiable (condition number {condition:.1e}); move an input that the"
+                    " training logs hold from `inputs` to `unexcited`, train on logs that vary it,"
+                    " or set a ridge penalty"
+                )
             raise FitError(
                 f"regressors '{collinear_names[0]}' and '{collinear_names[1]}' are collinear on"
                 f" these data (condition number {condition:.1e}); remove one, excite them"

@@ -46,7 +46,12 @@ from residnet.io.readers.quantities import (
 from residnet.io.split import SPLITS, extract_segment, remove_copies, split_logs, splits_from_names
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.quality import inspect_log
-from residnet.tasks.input_selection import choose_inputs, find_unexcited_inputs, missing_control
+from residnet.tasks.input_selection import (
+    choose_inputs,
+    find_inputs_held_in_training,
+    find_unexcited_inputs,
+    missing_control,
+)
 from residnet.tasks.naval_draft import NavalParticulars, choose_held_out_logs, draft_naval_sections
 
 if TYPE_CHECKING:
@@ -260,13 +265,6 @@ def draft_fit_config(
     preparation_plan = PreparationPlan.from_logs(
         list(draft_logs.complete_logs.values()), inputs, dof, masks
     )
-    signals = _choose_signals(
-        inputs,
-        dict(zip(all_inputs[len(inputs) :], reasons_by_unexcited_input.values(), strict=True)),
-        dof,
-        preparation_plan.wind_channels,
-        draft_notes,
-    )
     _note_unused_channels(draft_logs, draft_notes, has_wind=bool(preparation_plan.wind_channels))
     preparation = preparation_plan.to_config()
     for text in quality_warnings:
@@ -283,6 +281,19 @@ def draft_fit_config(
     split = {name: [entry for entry, *_ in members] for name, members in split_entries.items()}
     splits = {name: [log for _, log, _ in members] for name, members in split_entries.items()}
     durations = {name: [time for *_, time in members] for name, members in split_entries.items()}
+    held_in_training = find_inputs_held_in_training(splits, inputs)
+    regressors = tuple(name for name in inputs if name not in held_in_training)
+    if held_in_training and not missing_text:
+        problem = describe_missing_steering(regressors, dof, list(usable_logs.values()))
+        missing_text = problem and f"{problem}: {'; '.join(held_in_training.values())}"
+    unexcited = zip(all_inputs[len(inputs) :], reasons_by_unexcited_input.values(), strict=True)
+    signals = _choose_signals(
+        regressors,
+        held_in_training | dict(unexcited),
+        dof,
+        preparation_plan.wind_channels,
+        draft_notes,
+    )
     evaluation_settings = make_evaluation_settings(
         splits, durations, preparation_plan.correlation_time, masks, dof
     )
@@ -302,7 +313,7 @@ def draft_fit_config(
     if naval is not None and not missing_text:
         config |= draft_naval_sections(
             [logs_with_commands[path] for path in usable_logs],
-            inputs,
+            regressors,
             naval,
             SINGLE_MODEL_NAME,
             draft_notes,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -134,7 +134,7 @@ def find_unexcited_inputs(logs: Sequence[Log], inputs: Sequence[str]) -> dict[st
         if not np.isfinite(values).all():
             continue
         level = float(np.median(values))
-        if float(values.std()) <= _MIN_RELATIVE_STD * float(np.abs(values).max()):
+        if not _is_varying(values):
             unexcited[name] = f"{name} stays at {level:.4g}: other values are flagged as outside"
             continue
         for input_name in inputs:
@@ -149,6 +149,49 @@ def find_unexcited_inputs(logs: Sequence[Log], inputs: Sequence[str]) -> dict[st
                 )
                 break
     return unexcited
+
+
+def find_inputs_held_in_training(
+    splits: Mapping[str, Sequence[Log]], inputs: Sequence[str]
+) -> dict[str, str]:
+    """Return selected inputs that only logs outside the training split vary, or vary separately.
+
+    The training logs do not identify their effect, so that they become unexcited inputs.
+
+    Args:
+        splits: logs in SI units by split.
+        inputs: selected inputs, all of which vary in some log.
+
+    Returns:
+        Name of each such input -> its values in the training logs, as text.
+    """
+    values = {name: np.concatenate([log[name] for log in splits["train"]]) for name in inputs}
+    other_logs = [log for split, logs in splits.items() if split != "train" for log in logs]
+    held: dict[str, str] = {}
+    for number, name in enumerate(inputs):
+        finite_values = values[name][np.isfinite(values[name])]
+        duplicates = [
+            other
+            for other in inputs[:number]
+            if other not in held and _are_duplicates(values[name], values[other])
+        ]
+        if not _is_varying(finite_values):
+            level = float(np.median(finite_values)) if finite_values.size else 0.0
+            relation = f"is constant at {level:.4g}"
+            varying_logs = [log.name for log in other_logs if _is_varying(log[name])]
+        elif duplicates:
+            relation = f"moves as {duplicates[0]} does"
+            varying_logs = [
+                log.name for log in other_logs if not _are_duplicates(log[name], log[duplicates[0]])
+            ]
+        else:
+            continue
+        examples = ", ".join(varying_logs[:3]) or "other logs"
+        held[name] = (
+            f"{name} {relation} in the training logs: its effect is not identified, and other"
+            f" values are flagged as outside; train on {examples} to identify it"
+        )
+    return held
 
 
 def _is_actuator_name(name: str, draft_notes: DraftNotes) -> bool:
@@ -168,11 +211,17 @@ def _is_actuator_name(name: str, draft_notes: DraftNotes) -> bool:
     return True
 
 
+def _is_varying(values: np.ndarray) -> bool:
+    """Return whether the finite values of an input are not constant."""
+    values = values[np.isfinite(values)]
+    return values.size > 1 and bool(
+        np.std(values) > _MIN_RELATIVE_STD * float(np.abs(values).max())
+    )
+
+
 def _is_excited(name: str, values: np.ndarray, draft_notes: DraftNotes) -> bool:
     finite_values = values[np.isfinite(values)]
-    if finite_values.size > 1 and float(np.std(finite_values)) > _MIN_RELATIVE_STD * float(
-        np.abs(finite_values).max()
-    ):
+    if _is_varying(finite_values):
         return True
     level = float(np.median(finite_values)) if finite_values.size else 0.0
     draft_notes.add_guess(
