@@ -220,6 +220,8 @@ _N_WINDOW_PARTS = 5
 """Number of parts of a window that are also free-run, each from its measured start."""
 _MIN_PART_STEPS = 10
 """Smallest number of steps of a part; shorter windows are not divided."""
+_MAX_GROUPS_PER_BATCH = 32
+"""Largest number of groups of clean windows that are run in one batch."""
 _DIVERGENCE_FACTOR = 3.0
 """Innovation above which a free run has diverged, relative to the largest clean velocity."""
 _MAX_HEADING_INNOVATION = 2.0 * np.pi
@@ -355,10 +357,9 @@ class ChangeDetector:
         self.part_counts = (
             [1, _N_WINDOW_PARTS] if self.window_steps >= _MIN_PART_STEPS * _N_WINDOW_PARTS else [1]
         )
-        innovations_by_group = [
-            [self.compute_innovations(windows_of_group, parts) for parts in self.part_counts]
-            for _, windows_of_group in indexed_groups
-        ]
+        innovations_by_group = self._compute_innovations_of_groups(
+            [windows_of_group for _, windows_of_group in indexed_groups]
+        )
         # windows with a diverged free run have zero innovations, see `compute_innovations`
         has_diverged = np.concatenate(
             [(group[0][0] == 0.0).all(axis=1) for group in innovations_by_group]
@@ -575,6 +576,29 @@ class ChangeDetector:
         )
         innovation[has_diverged], effects[has_diverged] = 0.0, 0.0
         return innovation, effects
+
+    def _compute_innovations_of_groups(
+        self, groups: Sequence[Sequence[MeasuredWindow]]
+    ) -> list[list[_InnovationsAndEffects]]:
+        """Return innovations and effects of each group of windows and each division of windows."""
+        innovations_by_group: list[list[_InnovationsAndEffects]] = []
+        for first in range(0, len(groups), _MAX_GROUPS_PER_BATCH):
+            # a step of many windows takes little longer than that of one group
+            batch = groups[first : first + _MAX_GROUPS_PER_BATCH]
+            windows = [window for group in batch for window in group]
+            group_stops = np.cumsum([len(group) for group in batch])[:-1]
+            innovations_by_division = [
+                [
+                    np.split(values, group_stops)
+                    for values in self.compute_innovations(windows, n_parts)
+                ]
+                for n_parts in self.part_counts
+            ]
+            innovations_by_group += [
+                [(innovations[k], effects[k]) for innovations, effects in innovations_by_division]
+                for k in range(len(batch))
+            ]
+        return innovations_by_group
 
     def expected_innovations(self, effects: np.ndarray, model_bias: np.ndarray) -> np.ndarray:
         """Return the expected innovations [B, n] of clean logs, given their effects [B, C, n].

@@ -13,6 +13,7 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import islice
 from operator import add
 
 import numpy as np
@@ -174,7 +175,11 @@ def make_refitted_model(fitted_model: FittedModel, refit: RecursiveRefit) -> Fit
 def _evaluate_groups(
     detector: ChangeDetector, indexed_groups: Sequence[tuple[int, Sequence[MeasuredWindow]]]
 ) -> MonitorVerdict:
-    sums = [reduce(add, detector.compute_sums(group)) for _, group in indexed_groups]
+    # the windows of all groups are run in one batch
+    sums_of_windows = iter(
+        detector.compute_sums([window for _, group in indexed_groups for window in group])
+    )
+    sums = [reduce(add, islice(sums_of_windows, len(group))) for _, group in indexed_groups]
     return detector.evaluate([log for log, _ in indexed_groups], sums)
 
 
