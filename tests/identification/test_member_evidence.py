@@ -11,6 +11,7 @@ import torch
 from tiny import TINY
 from tiny_fit import logs_of, settings_of
 
+from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.ensemble import MeanOfTrajectories
 from residnet.dynamics.store import load_model, save_model
 from residnet.evaluation.freerun import Candidate, run_free_runs
@@ -128,8 +129,10 @@ def members(fitter: Fitter) -> list[FittedModel]:
     """Two baselines, of which the second drifts to one side."""
     good = fitter.fit_baseline("baseline")
     drifting = fitter.fit_baseline("drifting")
+    baseline = drifting.model.baseline
+    assert isinstance(baseline, RegressorBaseline)
     with torch.no_grad():
-        drifting.model.baseline.theta[1, 0] += 0.2
+        baseline.theta[1, 0] += 0.2
     return [good, drifting]
 
 

@@ -116,11 +116,11 @@ def draft(table: dict[str, np.ndarray], path: Path) -> tuple[dict[str, dict[str,
 
 def test_the_unit_of_a_drift_angle_is_no_unit_of_a_velocity(tmp_path: Path) -> None:
     trip = TRUTH[0]
-    table = {name: trip[name] for name in ("t", "x", "y", "psi", "delta")}
+    table = trip[["t", "x", "y", "psi", "delta"]].copy()
     table["V"] = np.hypot(trip["u"], trip["v"])
     table["beta"] = np.degrees(-np.arctan2(trip["v"], trip["u"]))
     path = tmp_path / "trip.csv"
-    pd.DataFrame(table).to_csv(path, index=False)
+    table.to_csv(path, index=False)
     notes = DraftNotes()
     draft_tables([path], notes)
     texts = {
@@ -153,7 +153,7 @@ def test_a_drift_angle_of_another_time_or_at_zero_is_left_out(
     is_other_motion: bool, text: str, tmp_path: Path
 ) -> None:
     trip = TRUTH[0]
-    beta = np.degrees(np.arctan2(-trip.v, trip.u)).to_numpy()
+    beta = np.degrees(np.arctan2(-trip.v.to_numpy(), trip.u.to_numpy()))
     beta = 12.0 * np.sin(0.9 * trip.t) if is_other_motion else 0.0 * beta
     table = {"t": trip.t, "x [m]": trip.x, "y [m]": trip.y, "psi [deg]": np.degrees(trip.psi)}
     table |= {"V": np.hypot(trip.u, trip.v), "beta": beta, "rudder": trip.delta}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -32,7 +33,7 @@ def write_take(
     up: str = "y",
     bow: str = "x",
     unit: str = "Meters",
-    rotation: str = "Quaternion",
+    rotation: Literal["Quaternion", "XYZ", "ZYX"] = "Quaternion",
     bodies: tuple[str, ...] = ("hover",),
 ) -> None:
     """Write a motion as Motive exports it; x of the room is north."""
@@ -72,7 +73,7 @@ def write_take(
 @pytest.mark.parametrize("unit", [*UNITS])
 @pytest.mark.parametrize("rotation", ["Quaternion", "XYZ", "ZYX"])
 def test_an_export_of_rigid_bodies_is_read(
-    up: str, bow: str, unit: str, rotation: str, tmp_path: Path
+    up: str, bow: str, unit: str, rotation: Literal["Quaternion", "XYZ", "ZYX"], tmp_path: Path
 ) -> None:
     write_take(tmp_path / "take.csv", up, bow, unit, rotation)
     assert detect_mocap_axes(tmp_path / "take.csv", 20_000) == (up, bow)
@@ -177,7 +178,7 @@ def test_the_body_that_moves_most_is_proposed_among_several(tmp_path: Path) -> N
     (log,) = residnet.read_logs(tmp_path)
     assert isinstance(log, Log)
     assert np.nanmax(np.abs(log["x"] - TRUTH.x)) < 1e-5
-    answers = {(*READER_KEY, "mocap_body"): "frame"}
+    answers: dict[tuple[str, ...], str] = {(*READER_KEY, "mocap_body"): "frame"}
     result = read_mixed_formats([tmp_path / "take.tsv"], answers)[0]
     assert result.reader["mocap_body"] in ("frame", "hull")
     settings = {

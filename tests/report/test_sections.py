@@ -104,8 +104,8 @@ def made_roll(run: Path) -> Path:
     resolved(run, {"task": "roll"})
     kinds = dict.fromkeys(("heading", "rudder", "fins", "both"), "classical")
     kinds |= {"both_trained": "constants", "learned": "policy"}
-    gain_names = ("heading_gain", "yaw_rate_gain", "filter_share", "rudder_roll_rate_gain")
-    gain_names += ("rudder_roll_gain", "fin_roll_rate_gain", "fin_roll_gain")
+    gain_names = ["heading_gain", "yaw_rate_gain", "filter_share", "rudder_roll_rate_gain"]
+    gain_names += ["rudder_roll_gain", "fin_roll_rate_gain", "fin_roll_gain"]
     rows = []
     totals = []
     controllers = []

@@ -11,7 +11,7 @@ from tiny import write_yaml
 
 from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.report.client import ClientText, read_client_text, write_client_report
-from residnet.report.client_content import build_sections
+from residnet.report.client_content import ReportTable, build_sections
 from residnet.report.run_reader import RunFiles
 
 typst = pytest.importorskip("typst")
@@ -33,9 +33,9 @@ def test_the_sections_have_the_tests_the_errors_and_the_limits(tmp_path: Path) -
         "Limits of validity",
     ]
     for section in sections:
-        for block in section.to_data()["blocks"]:
-            if block["kind"] == "table":
-                assert all(len(row) == len(block["header"]) for row in block["rows"])
+        for block in section.blocks:
+            if isinstance(block, ReportTable):
+                assert all(len(row) == len(block.header) for row in block.rows)
 
 
 def test_the_pdf_has_logo_and_text_of_the_user(tmp_path: Path) -> None:
