@@ -14,6 +14,8 @@ import residnet
 from residnet.core.errors import ResidnetError
 from residnet.core.layout import SIX_DOF_LAYOUT, DegreesOfFreedom
 from residnet.core.log import Log
+from residnet.io.drafting.questions import DraftNotes
+from residnet.io.drafting.tables import draft_tables
 from residnet.io.drafting.vertical import refuse_vertical_y
 from residnet.io.readers.several_tests import list_tests
 from residnet.io.sources import MeasuredLogs, list_input_files, read_split_logs
@@ -67,6 +69,48 @@ def test_a_sheet_for_each_test_is_a_log(tmp_path: Path) -> None:
     assert_is_test(read_tests(file / "ZZ_20")["ZZ_20"], 400)
     with pytest.raises(ResidnetError, match=r"ZZ_30: no test of this name; did you mean 'ZZ_20'"):
         residnet.read_logs(file / "ZZ_30")
+
+
+def test_two_sheets_of_each_test_are_joined_by_time(tmp_path: Path) -> None:
+    file = tmp_path / "tests.xlsx"
+    with pd.ExcelWriter(file) as book:
+        for name, first in (("ZZ 10", 0), ("TC 35", 400)):
+            table = make_test(first)
+            control = table.iloc[:, [0, 4, 5]]
+            table.iloc[:, :4].to_excel(book, sheet_name=f"{name} motion", index=False)
+            control.to_excel(book, sheet_name=f"{name} control", index=False)
+    logs = read_tests(tmp_path)
+    assert [*logs] == ["ZZ_10", "TC_35"]
+    assert [log.manoeuvre for log in logs.values()] == ["zigzag", "turning_circle"]
+    assert_is_test(logs["TC_35"], 400)
+    notes = DraftNotes()
+    draft_tables(list_tests(file), notes)
+    text = "sheets of a test (ZZ 10 motion, ZZ 10 control) are joined"
+    assert any(text in guess for _, guess in notes.guessed_values)
+    # sheets of different tests
+    book = openpyxl.load_workbook(file)
+    book["TC 35 control"].title = "TC 20 control"
+    book.save(file)
+    assert not list_tests(file)
+
+
+def test_zeros_of_a_lost_pose_are_missing(tmp_path: Path) -> None:
+    table = make_test()
+    is_lost = np.zeros(len(table), dtype=bool)
+    is_lost[[100, 101, 250]] = True
+    is_lost[150:180] = True
+    pose = ["X [m]", "Y [m]", "Heading [deg]"]
+    # the vessel is at rest at the origin at first
+    table[pose] -= table.loc[20, pose]
+    table.loc[:20, pose] = 0.0
+    table.loc[is_lost, pose] = 0.0
+    table.to_csv(tmp_path / "log.csv", index=False)
+    (log,) = residnet.read_logs(tmp_path)
+    assert isinstance(log, Log)
+    for name in ("x", "y", "psi"):
+        np.testing.assert_array_equal(np.isnan(log[name]), is_lost, err_msg=name)
+    (remark,) = log.meta["findings"]
+    assert remark["figures"] == {"count": 33.0}
 
 
 @pytest.mark.parametrize("mark", ["title", "names", "blank", "restart", "number"])
@@ -133,6 +177,47 @@ def test_a_table_is_one_log_where_only_its_clock_is_corrected(tmp_path: Path) ->
     table.to_csv(tmp_path / "log.csv", index=False)
     with pytest.raises(ResidnetError, match="time runs backwards"):
         residnet.read_logs(tmp_path)
+
+
+def test_short_starts_of_a_recorder_are_left_out(tmp_path: Path) -> None:
+    def write(name: str, parts: list[tuple[int, int]]) -> None:
+        texts = [make_test(first, n_rows).to_csv(index=False) for first, n_rows in parts]
+        (tmp_path / name).write_text("".join(texts))
+
+    write("one.csv", [(0, 3), (0, 1), (0, 1), (400, 300), (0, 3)])
+    write("two.csv", [(0, 3), (0, 300), (0, 3), (400, 300)])
+    logs = read_tests(tmp_path)
+    assert [*logs] == ["one", "test_1", "test_2"]
+    for name, first in (("one", 400), ("test_1", 0), ("test_2", 400)):
+        assert_is_test(logs[name], first)
+    (remark,) = logs["one"].meta["findings"]
+    assert "fewer than 10 rows are left out: 4 in one.csv" in remark["text"]
+    # a counter that overflows after rows with the column names is no start of a recorder
+    table = make_test()
+    table["Time [s]"] = (table["Time [s]"] + 2.0**32 * 1e-6 - 15.0).round(6) % (2.0**32 * 1e-6)
+    lines = table.to_csv(index=False).splitlines()
+    lines[150:150] = [lines[0]]
+    (tmp_path / "one.csv").write_text("\n".join([*lines, ""]))
+    assert not list_tests(tmp_path / "one.csv")
+
+
+@pytest.mark.parametrize("has_names", [True, False])
+def test_titles_of_vessels_divide_a_table(has_names: bool, tmp_path: Path) -> None:
+    header = ",".join(make_test().columns)
+    lines: list[str] = []
+    for vessel, first, start in (("Vessel A", 0, 0.0), ("Vessel B", 400, 1000.0)):
+        lines += [vessel, *([header] if has_names or not lines else [])]
+        table = make_test(first)
+        table["Time [s]"] += start
+        lines += [",".join(map(str, row)) for row in table.round(6).to_numpy().tolist()]
+    file = tmp_path / "two.csv"
+    file.write_text("\n".join([*lines, ""]))
+    logs = read_tests(tmp_path)
+    assert [*logs] == ["Vessel_A", "Vessel_B"]
+    assert_is_test(logs["Vessel_B"], 400)
+    notes = DraftNotes()
+    draft_tables(list_tests(file), notes)
+    assert any("several vessels (Vessel A, Vessel B)" in text for _, text in notes.guessed_values)
 
 
 def test_midnight_and_reverse_order_are_no_new_tests(tmp_path: Path) -> None:

@@ -61,6 +61,8 @@ MANOEUVRE_PATTERNS: dict[str, re.Pattern[str]] = {
 """Kind of manoeuvre -> pattern of the normalised names of its files."""
 TEST_NAME_PATTERN = re.compile(re.sub(r"\|\s+", "|", _VOCABULARY["test_names"].strip()))
 """Words for a test in normalised titles, and names of columns with its number or name."""
+VESSEL_TITLE_PATTERN = re.compile(re.sub(r"\|\s+", "|", _VOCABULARY["vessel_titles"].strip()))
+"""Normalised title that names a vessel."""
 _DRIFT_ANGLE_PATTERN = re.compile(
     re.sub(r"\|\s+", "|", _VOCABULARY["drift_angle_names"].strip()), re.IGNORECASE
 )

@@ -45,6 +45,10 @@ _MIN_SAMPLES = 20
 """Smallest number of samples for the detection of spikes; chosen by hand."""
 CACHED_SAMPLES = 8_192
 """Samples per chunk, so that the neighbours fit into the cache of a core."""
+_MIN_LOST_DISTANCE = 10.0
+"""Minimum distance of a vessel from the origin at a lost pose, relative to the 99 % quantile of the
+distance between samples.
+"""
 _MAX_SUBSAMPLE = 40_000
 """Number of samples for quantiles of a long channel."""
 _N_SUBSAMPLE_SEGMENTS = 40
@@ -104,6 +108,33 @@ def nan_std(values: np.ndarray) -> float:
         return np.nan
     deviations = finite_values - finite_values.sum() / finite_values.size
     return math.sqrt(float(deviations @ deviations) / finite_values.size)
+
+
+def find_lost_poses(x: np.ndarray, y: np.ndarray, angles: Sequence[np.ndarray]) -> np.ndarray:
+    """Return where a tracking system lost the vessel and wrote zeros for its pose, bool [T].
+
+    A vessel that passes the origin moves there in small steps.
+
+    Args:
+        x: first coordinate of the position [T]; NaN where it is missing.
+        y: second coordinate of the position [T].
+        angles: heading, or the components of the quaternion, [T] each; at least one.
+    """
+    is_zero = (x == 0.0) & (y == 0.0)
+    for angle in angles:
+        is_zero &= angle == 0.0
+    is_lost = np.zeros(x.size, dtype=bool)
+    measured = np.flatnonzero(~is_zero & np.isfinite(x) & np.isfinite(y))
+    if not is_zero.any() or measured.size < _MIN_SAMPLES:
+        return is_lost
+    distance = np.hypot(x[measured], y[measured])
+    steps = np.hypot(np.diff(x[measured]), np.diff(y[measured]))
+    limit = _MIN_LOST_DISTANCE * nan_quantiles(steps, 0.99)[0]
+    for start, stop in zip(*find_runs(is_zero), strict=True):
+        # the measured samples before and after the zeros
+        position = int(np.searchsorted(measured, start))
+        is_lost[start:stop] = distance[max(position - 1, 0) : position + 1].min() > limit
+    return is_lost
 
 
 def _selection_medians(

@@ -19,6 +19,7 @@ from residnet.io.readers.base import locate_file, require_file
 from residnet.io.readers.excel_tables import join_excel_sheets, list_sheet_names, read_excel_sheet
 from residnet.io.readers.json_tables import read_json_head
 from residnet.io.readers.motion_capture import list_mocap_bodies
+from residnet.io.readers.several_tests import list_joined_sheets
 from residnet.io.readers.tables import TABLE_KINDS, read_parquet_head
 from residnet.io.readers.text_tables import HeaderlessTableError, read_table_head
 from residnet.preprocessing.channel_values import mask_fill_values
@@ -316,6 +317,9 @@ def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]
         DataError: if several sheets have the same columns, such as a sheet for each test.
     """
     names = list_sheet_names(path)
+    if list_joined_sheets(path):
+        tables = {name: read_excel_sheet(path, name, rows) for name in names}
+        return join_excel_sheets(path, tables), {"kind": "excel"}
     tables = {name: read_excel_sheet(path, name, rows) for name in names}
     numeric_sheets = [
         n for n, table in tables.items() if len(table.select_dtypes("number").columns) > 1

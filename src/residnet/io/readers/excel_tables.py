@@ -222,11 +222,11 @@ def join_excel_sheets(path: Path, tables: Mapping[str, pd.DataFrame]) -> pd.Data
 
 
 def list_sheet_names(path: Path) -> list[str]:
-    """Return the names of the sheets of an Excel file, or that of one of its tests, in order.
+    """Return the names of the sheets of an Excel file, or those of one of its tests, in order.
 
     Raises:
         UsageError: if openpyxl is not installed.
         DataError: if the file cannot be read.
     """
     test = find_test(path)
-    return [test.sheet] if test is not None else list_worksheets(path)
+    return [*test.sections] if test is not None else list_worksheets(path)

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from residnet.core.errors import ResidnetError, UsageError
+from residnet.core.log import Remark, make_remark
 from residnet.core.names import suggest_name
 from residnet.io.header_vocabulary import MANOEUVRE_PATTERNS, normalize_name
 from residnet.io.readers.base import locate_file
@@ -22,9 +23,11 @@ from residnet.io.readers.cell_values import is_value
 from residnet.io.readers.excel_cells import list_worksheets, read_cells
 from residnet.io.readers.table_lines import WHITESPACE_DELIMITER, split_line
 from residnet.io.readers.table_sections import (
+    MIN_ROWS,
     RowKind,
     Rows,
     Section,
+    are_similar,
     classify_cells,
     find_sections,
     select_similar,
@@ -48,20 +51,23 @@ class PlacedTest(NamedTuple):
 
     Attributes:
         name: name of the test, without characters that have a meaning in paths.
-        sheet: name of its sheet; empty for a text.
-        section: its rows and columns.
+        sections: name of its sheet -> its rows and columns, of several sheets whose rows are joined
+            by their times; the name is empty for a text.
         delimiter: separator of cells; empty for a sheet.
+        vessel: title with its vessel if the file names several vessels; otherwise empty.
+        n_short: number of sections of the file that are too short for tests.
     """
 
     name: str
-    sheet: str
-    section: Section
+    sections: Mapping[str, Section]
     delimiter: str
+    vessel: str
+    n_short: int
 
     @property
-    def row_offset(self) -> int:
-        """Number to add to a row of the extracted test to get its row in the file."""
-        return self.section.start - len(self.section.head_rows)
+    def section(self) -> Section:
+        """Rows and columns of a test in one sheet or text."""
+        return next(iter(self.sections.values()))
 
 
 def expand_files(paths: Iterable[Path]) -> list[Path]:
@@ -93,6 +99,25 @@ def find_test(path: Path) -> PlacedTest | None:
     if path.name not in tests:
         raise UsageError(f"{path}: no test of this name{suggest_name(path.name, tests)}")
     return tests[path.name]
+
+
+def list_vessels(tests: Iterable[Path]) -> list[str]:
+    """Return the titles that name the vessels of tests if they are several; empty otherwise."""
+    placed_tests = [find_test(path) for path in tests]
+    vessels = [*dict.fromkeys(test.vessel for test in placed_tests if test and test.vessel)]
+    return vessels if len(vessels) > 1 else []
+
+
+def describe_short_sections(path: Path) -> list[Remark]:
+    """Return the remark that a file has sections too short for tests; empty without them."""
+    test = find_test(path)
+    if test is None or not test.n_short:
+        return []
+    text = (
+        f"starts of the recorder with fewer than {MIN_ROWS} rows are left out: {test.n_short} in"
+        f" {locate_file(path).name}"
+    )
+    return [make_remark("note", "short_sections", text, count=float(test.n_short))]
 
 
 @contextmanager
@@ -129,7 +154,7 @@ def open_test_as_utf8(path: Path, encoding: str | None = None) -> Iterator[tuple
         with tempfile.TemporaryDirectory() as folder:
             copy = Path(folder) / f"{path.name}{locate_file(path).suffix}"
             copy.write_text("\n".join([*text_lines, ""]), encoding="utf-8")
-            yield copy, test.row_offset
+            yield copy, _row_offset(section)
 
 
 def read_excel_cells(path: Path, sheet: str | None, rows: int | None) -> tuple[pd.DataFrame, int]:
@@ -146,12 +171,18 @@ def read_excel_cells(path: Path, sheet: str | None, rows: int | None) -> tuple[p
     test = find_test(path)
     if test is None:
         return read_cells(path, list_worksheets(path)[0] if sheet is None else sheet, rows), 0
-    section = test.section
-    cells = read_cells(locate_file(path), test.sheet, None)
+    sheet = next(iter(test.sections)) if sheet is None else sheet
+    section = test.sections[sheet]
+    cells = read_cells(locate_file(path), sheet, None)
     row_indices = [*section.head_rows, *range(section.start, section.stop)][:rows]
     columns = slice(None) if section.columns is None else slice(*section.columns)
     selected = cells.iloc[row_indices, columns].reset_index(drop=True)
-    return selected, test.row_offset
+    return selected, _row_offset(section)
+
+
+def _row_offset(section: Section) -> int:
+    """Return the number to add to a row of an extracted test to get its row in the file."""
+    return section.start - len(section.head_rows)
 
 
 def _find_tests_of(file: Path) -> tuple[PlacedTest, ...]:
@@ -163,12 +194,11 @@ def _find_tests_of(file: Path) -> tuple[PlacedTest, ...]:
 def _find_tests_of_version(file: Path, modified_ns: int, size: int) -> tuple[PlacedTest, ...]:
     """Find the tests of a file; `modified_ns` and `size` distinguish its versions."""
     if file.suffix.lower() == ".xlsx":
-        places = [
-            ("" if len(sections) > 1 else sheet, sheet, section, "")
-            for sheet in list_worksheets(file)
-            for sections in [find_sections(_rows_of_cells(read_cells(file, sheet, None)))]
-            for section in sections
-        ]
+        places = []
+        for sheet in list_worksheets(file):
+            sections = find_sections(_rows_of_cells(read_cells(file, sheet, None)))
+            title = sheet if sum(section.is_long for section in sections) == 1 else ""
+            places += [(title, sheet, section, "") for section in sections]
     elif size <= _MAX_TEXT_BYTES:
         with open_as_utf8(file) as text_file, text_file.open(encoding="utf-8-sig") as stream:
             lines = stream.read().splitlines()
@@ -177,20 +207,64 @@ def _find_tests_of_version(file: Path, modified_ns: int, size: int) -> tuple[Pla
         places = [("", "", section, delimiter) for section in sections]
     else:
         return ()
-    similar = select_similar([section for _, _, section, _ in places])
+    similar, n_short = select_similar([section for _, _, section, _ in places])
+    if not similar:
+        return _join_sheets(places)
+    vessels = {places[k][2].vessel for k in similar}
     names: list[str] = []
     tests = []
     for number, k in enumerate(similar, 1):
         sheet_title, sheet, section, delimiter = places[k]
-        name = _name_test(sheet_title, section.title, number)
+        # the only test of a file has its name
+        default = f"test_{number}" if len(similar) > 1 else file.stem
+        vessel = section.vessel if len(vessels) > 1 else ""
+        title = f"{vessel} {section.title}".strip()
+        name = _name_test(sheet_title, title, default)
         name = name if name not in names else f"{name}_{number}"
         names.append(name)
-        tests.append(PlacedTest(name, sheet, section, delimiter))
+        tests.append(PlacedTest(name, {sheet: section}, delimiter, vessel, n_short))
     return tuple(tests)
 
 
-def _name_test(sheet: str, title: str, number: int) -> str:
-    """Return the name of a test from its sheet and title, or from its number.
+def _join_sheets(places: Sequence[tuple[str, str, Section, str]]) -> tuple[PlacedTest, ...]:
+    """Return tests with several sheets each, as `T1 motion`, `T1 control`, `T2 motion`, ...
+
+    The sheets of each kind have the same column names and a common word in their names. Without
+    this word their names are the names of the tests, which each kind of sheets has.
+
+    Args:
+        places: title, sheet, section and delimiter of each section; a title is the name of a sheet
+            with one section.
+    """
+    sections = {sheet: section for title, sheet, section, _ in places if title and section.is_long}
+    kinds: list[list[str]] = []
+    for sheet, section in sections.items():
+        same_kind = [kind for kind in kinds if are_similar(sections[kind[0]].names, section.names)]
+        if same_kind:
+            same_kind[0].append(sheet)
+        else:
+            kinds.append([sheet])
+    sheets_by_test: dict[str, dict[str, Section]] = {}
+    for kind in kinds:
+        words = [re.findall(r"[^\W_]+", sheet) for sheet in kind]
+        common_words = set.intersection(*map(set, words))
+        for sheet, sheet_words in zip(kind, words, strict=True):
+            test = "_".join(word for word in sheet_words if word not in common_words)
+            sheets_by_test.setdefault(test, {})[sheet] = sections[sheet]
+    is_complete = all(len(sheets) == len(kinds) for sheets in sheets_by_test.values())
+    if len(kinds) < 2 or len(sheets_by_test) < 2 or not is_complete or "" in sheets_by_test:
+        return ()
+    return tuple(PlacedTest(name, sheets, "", "", 0) for name, sheets in sheets_by_test.items())
+
+
+def list_joined_sheets(path: Path) -> list[str]:
+    """Return the names of the sheets of a test that are joined; empty for one sheet or a file."""
+    test = find_test(path)
+    return [*test.sections] if test is not None and len(test.sections) > 1 else []
+
+
+def _name_test(sheet: str, title: str, default: str) -> str:
+    """Return the name of a test from its sheet and title; `default` without both.
 
     The sheet names the test, and the title adds the manoeuvre that it lacks.
     """
@@ -203,7 +277,7 @@ def _name_test(sheet: str, title: str, number: int) -> str:
     title = title.removeprefix(sheet).strip(" :,;-")
     text = f"{sheet} {title if kinds else ''}" if sheet else title
     # names of paths have neither separators nor points, which would begin an extension
-    return re.sub(r"[^\w+-]+", "_", text).strip("_") or f"test_{number}"
+    return re.sub(r"[^\w+-]+", "_", text).strip("_") or re.sub(r"[^\w+-]+", "_", default)
 
 
 def _rows_of_cells(cells: pd.DataFrame) -> Rows:

@@ -18,13 +18,14 @@ from residnet.io.header_vocabulary import (
     MANOEUVRE_PATTERNS,
     TEST_NAME_PATTERN,
     VESSEL_COLUMN_NAMES,
+    VESSEL_TITLE_PATTERN,
     normalize_name,
     parse_name,
 )
 from residnet.io.readers.cell_values import is_value
 
 RowKind = Literal["blank", "values", "text"]
-_MIN_ROWS = 10
+MIN_ROWS = 10
 """Fewest rows of a test below a title, below column names, or behind a blank row."""
 _MIN_ROWS_AT_RESTART = 20
 """Fewest rows before and behind a restart of the time that nothing else marks."""
@@ -53,6 +54,7 @@ class Section(NamedTuple):
         stop: index behind the last row of values.
         columns: index of the first column, and behind the last one; None for all columns.
         title: text that names the test; empty if there is none.
+        vessel: text that names the vessel; empty if there is none.
         names: cells of the column names and units.
     """
 
@@ -61,7 +63,13 @@ class Section(NamedTuple):
     stop: int
     columns: tuple[int, int] | None
     title: str
+    vessel: str
     names: frozenset[str]
+
+    @property
+    def is_long(self) -> bool:
+        """Whether the section has enough rows for a test."""
+        return self.stop - self.start >= MIN_ROWS
 
 
 class Rows(NamedTuple):
@@ -88,7 +96,11 @@ def classify_cells(cells: Sequence[str]) -> RowKind:
 
 
 def find_sections(rows: Rows) -> list[Section]:
-    """Return the tests of a sheet or a text in order; one section if it has one test."""
+    """Return the tests of a sheet or a text in order; one section if it has one test.
+
+    Sections of fewer than `MIN_ROWS` rows are no tests but, for example, failed starts of the
+    recorder.
+    """
     kinds = [rows.classify(i) for i in range(rows.n_rows)]
     first_values = next((i for i, kind in enumerate(kinds) if kind == "values"), None)
     if first_values is None:
@@ -130,12 +142,14 @@ class _Head(NamedTuple):
         rows: indices of all text rows.
         names_row: index of the row of column names; None without one.
         title: text that names the test; empty if there is none.
+        vessel: text that names the vessel; empty if there is none.
         names: cells of the column names and units.
     """
 
     rows: tuple[int, ...]
     names_row: int | None
     title: str
+    vessel: str
     names: frozenset[str]
 
 
@@ -154,11 +168,19 @@ def _parse_head(rows: Rows, text_rows: Sequence[int], n_columns: int) -> _Head:
     titles = [" ".join(cells_of_rows[i]) for i in text_rows if names_row is None or i < names_row]
     named_titles = [title for title in titles if _names_test(title)]
     title = named_titles[-1] if named_titles else ""
+    vessels = [title for title in titles if VESSEL_TITLE_PATTERN.match(normalize_name(title))]
+    vessel = vessels[-1] if vessels else ""
     names = [
         cell for i in text_rows if names_row is not None and i >= names_row
         for cell in cells_of_rows[i]
     ]  # fmt: skip
-    return _Head(tuple(text_rows), names_row, title[:_MAX_TITLE_LENGTH], frozenset(names))
+    return _Head(
+        tuple(text_rows),
+        names_row,
+        title[:_MAX_TITLE_LENGTH],
+        vessel[:_MAX_TITLE_LENGTH],
+        frozenset(names),
+    )
 
 
 def _names_test(title: str) -> bool:
@@ -176,7 +198,8 @@ def _find_stacked(rows: Rows, kinds: Sequence[RowKind]) -> list[Section]:
         return []
     breaks = np.flatnonzero(np.diff(value_rows) > 1) + 1
     sections: list[Section] = []
-    head = _Head((), None, "", frozenset())
+    head = _Head((), None, "", "", frozenset())
+    vessel = ""
     previous_stop = 0
     clock: _Clock | None = None
     for run in np.split(value_rows, breaks):
@@ -191,23 +214,33 @@ def _find_stacked(rows: Rows, kinds: Sequence[RowKind]) -> list[Section]:
         times = clock.parse(rows, start, stop)
         if sections:
             step = float(times[-1] - times[0]) / max(1, len(run) - 1)
+            # a recorder that fails at its start writes its column names and the first time again
+            is_same = not sections[-1].is_long and bool(times[0] == clock.last)
             # in a table in reverse order of time all times are earlier than the previous one
-            is_earlier = bool(times[0] < clock.last) and step > 0.0
-            is_earlier &= not _is_overflow(clock.last, float(times[0]), step)
+            is_earlier = bool(times[0] < clock.last) or (has_names and is_same)
+            is_earlier &= step > 0.0 or (has_names and len(run) == 1)
+            # a counter does not overflow within a few rows
+            is_overflow = _is_overflow(clock.last, float(times[0]), step)
+            is_earlier &= not (sections[-1].is_long and is_overflow)
             is_new = is_earlier or (has_names and gap.names != sections[-1].names)
             # the mark of an operator in a comment is no title
             is_new |= bool(gap.title) and not gap.title.startswith(_COMMENT_SIGNS)
-            if len(run) < _MIN_ROWS or not is_new:
+            # other titles with a word for a vessel are remarks
+            is_new |= bool(vessel and gap.vessel) and gap.vessel != vessel
+            is_restart = is_earlier and has_names
+            if not is_new or (len(run) < MIN_ROWS and not is_restart):
                 # marks, comments and repeated names within a test
                 sections[-1] = sections[-1]._replace(stop=stop)
                 clock.last = clock.latest(times)
                 continue
         head_rows = gap.rows if has_names else (*head.rows, *gap.rows)
         head = gap if has_names else head
-        for first, last, title in clock.split(rows, start, stop, times):
-            sections.append(Section(head_rows, first, last, None, gap.title or title, head.names))
+        vessel = gap.vessel or vessel
+        for first, last, label in clock.split(rows, start, stop, times):
+            title = gap.title or label
+            sections.append(Section(head_rows, first, last, None, title, vessel, head.names))
         clock.last = clock.latest(times)
-    return [section for section in sections if section.stop - section.start >= _MIN_ROWS]
+    return sections
 
 
 class _Clock:
@@ -321,21 +354,25 @@ def _is_overflow(before: float, after: float, step: float) -> bool:
     )
 
 
-def select_similar(sections: Sequence[Section]) -> list[int]:
-    """Return the indices of the sections with the most frequent column names.
+def select_similar(sections: Sequence[Section]) -> tuple[list[int], int]:
+    """Select the tests among sections: those with the most frequent column names.
 
-    The list is empty if these are less than two, or if other sections are as many: these may be
-    parts of the same tests.
+    Returns:
+        The indices of the tests, and the number of shorter sections with the same names. There is
+        no test if other sections are as many, which may be parts of the same tests, or if the only
+        section is the whole table.
     """
-    groups = [
-        [k for k, other in enumerate(sections) if _are_similar(section.names, other.names)]
-        for section in sections
-    ]
+    long = [k for k, section in enumerate(sections) if section.is_long]
+    groups = [[k for k in long if are_similar(sections[i].names, sections[k].names)] for i in long]
     largest = max(groups, key=len, default=[])
     n_others = max((len(group) for group in groups if not {*group} & {*largest}), default=0)
-    return largest if len(largest) > max(1, n_others) else []
+    if len(largest) <= n_others:
+        return [], 0
+    names = sections[largest[0]].names
+    n_short = sum(not section.is_long and are_similar(section.names, names) for section in sections)
+    return (largest, n_short) if len(largest) > 1 or n_short else ([], 0)
 
 
-def _are_similar(first: frozenset[str], second: frozenset[str]) -> bool:
+def are_similar(first: frozenset[str], second: frozenset[str]) -> bool:
     """Return whether two tables have most column names in common."""
     return len(first & second) >= _MIN_COMMON_NAMES * len(first | second) > 0

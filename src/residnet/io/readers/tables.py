@@ -62,6 +62,7 @@ from residnet.io.readers.quantities import (
     require_speed_units,
     resolve_drift_angle,
 )
+from residnet.io.readers.several_tests import describe_short_sections, list_joined_sheets
 from residnet.io.readers.text_tables import (
     coerce_numeric,
     count_numbers,
@@ -70,6 +71,7 @@ from residnet.io.readers.text_tables import (
 )
 from residnet.io.readers.timestamps import DateOrder, parse_texts, parse_zone
 from residnet.preprocessing.channel_values import (
+    find_lost_poses,
     is_ais_sentinel,
     is_fill_value,
     is_implausible,
@@ -312,12 +314,14 @@ class TableConfig(ConfiguredReader, ABC):
         )
         self._require_matching_units(path, attributes.get("units", ()))
         t, start_ns, findings = self._parse_times(path, cells, len(table), n_lines_above)
+        findings += describe_short_sections(path)
         raw = {name: self._parse_channel(path, name, cells, n_lines_above) for name in channel_maps}
         is_selected, new_findings = self._select_rows(path, cells, len(table))
         findings += new_findings
         if not is_selected.all():
             t = np.where(is_selected, t, np.nan)
             raw = {name: np.where(is_selected, values, np.nan) for name, values in raw.items()}
+        findings += _mask_lost_poses(raw)
         # free the table before the channels are copied
         del table, cells
         is_measured = np.zeros(t.size, dtype=bool)
@@ -571,6 +575,24 @@ class TableConfig(ConfiguredReader, ABC):
         return values, findings
 
 
+def _mask_lost_poses(channels: dict[str, np.ndarray]) -> list[Remark]:
+    """Replace zeros of a lost pose by NaN in the channels [T], in place; returns a remark."""
+    angles = ["psi"] if "psi" in channels else [n for n in QUATERNION if n in channels]
+    if not angles or not {"x", "y"} <= channels.keys():
+        return []
+    is_lost = find_lost_poses(channels["x"], channels["y"], [channels[name] for name in angles])
+    if not is_lost.any():
+        return []
+    for name in {"x", "y", *angles, "z", "phi", "theta"} & channels.keys():
+        channels[name] = np.where(is_lost & (channels[name] == 0.0), np.nan, channels[name])
+    count = int(is_lost.sum())
+    text = (
+        f"position and heading are exactly 0 in {count} rows, where the vessel is elsewhere: its"
+        " tracking was lost; these samples count as missing"
+    )
+    return [make_remark("note", "lost_poses", text, count=float(count))]
+
+
 @final
 class CsvConfig(TableConfig):
     """Reader of text tables.
@@ -647,8 +669,9 @@ class ExcelConfig(TableConfig):
 
     Attributes:
         sheet: name of the sheet; null takes the first one, and reads each test of a file with
-            several tests as a log. Several names are the sheets of one recording, whose first
-            columns are the time: their rows are merged in order of time.
+            several tests as a log, also tests with several sheets each. Several names are the
+            sheets of one recording, whose first columns are the time: their rows are merged in
+            order of time.
     """
 
     kind: Literal["excel"] = "excel"
@@ -662,10 +685,11 @@ class ExcelConfig(TableConfig):
         return list(dict.fromkeys(locate_file(path) for path in paths))
 
     def load(self, path: Path, columns: Sequence[str], advance: ProgressCallback) -> pd.DataFrame:
+        sheets = self.sheet if isinstance(self.sheet, tuple) else list_joined_sheets(path)
         table = (
-            join_excel_sheets(path, {name: read_excel_sheet(path, name) for name in self.sheet})
-            if isinstance(self.sheet, tuple)
-            else read_excel_sheet(path, self.sheet)
+            join_excel_sheets(path, {name: read_excel_sheet(path, name) for name in sheets})
+            if sheets
+            else read_excel_sheet(path, None if self.sheet is None else str(self.sheet))
         )
         selected = table.iloc[
             :, find_column_positions(path, [str(name) for name in table.columns], columns)
