@@ -14,7 +14,7 @@ tests (`identification.member_evidence`).
 |---|---|
 | twin | boats with two propellers in gusts, `tests/support/twin_boats.py` |
 | reversed | the same, one motor is recorded with the wrong sign |
-| sway | the same, with a slowly varying sway velocity that no input explains, so that constant velocity is better than a hull |
+| sway | the same, with a slow unexplained sway velocity: constant velocity beats a hull |
 | input | the same, one input is recorded through a strong nonlinearity |
 | measured | stretches of measured logs of a model tanker |
 
@@ -22,7 +22,7 @@ Members are a hull, ridge regression on it, and partial least squares and ridge 
 linear baseline, which take seconds. With `--networks` the members are the hull, recurrent networks
 on it and recurrent networks with an encoder of the measured past, which are those of the recipe and
 of `recurrent.py`; each mean has the hull.
-"""  # noqa: E501
+"""
 
 from __future__ import annotations
 

@@ -82,7 +82,8 @@ def run_cli(command: Callable[[], object]) -> None:
     # a service may start a command with closed streams
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            stream = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115 (to the end)
+            # the stream stays open until the process ends
+            stream = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115
             setattr(sys, name, stream)
     try:
         with signals.handle_signals():

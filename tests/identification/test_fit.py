@@ -293,11 +293,11 @@ def test_accelerations_are_those_of_the_models_rate_at_the_sample(
     log = forced_logs["test"][0]
     model = identified["ridge"].model.double()
     # inputs move on within a step: else one rule could not be told from the other
-    assert np.abs(log.w - log.rate_inputs).max() > 1.0
+    assert np.abs(log.w - log.regression_inputs).max() > 1.0
     at = int(np.flatnonzero(log.trainable)[50])
     x, w = (
         torch.from_numpy(log.smoothed[at : at + 1]),
-        torch.from_numpy(log.rate_inputs[at : at + 1]),
+        torch.from_numpy(log.regression_inputs[at : at + 1]),
     )
     z = compute_channels(log, model.signals)[at : at + 1]
     torch.testing.assert_close(z, model.compute_channels(x, w), rtol=1e-12, atol=1e-12)
@@ -315,7 +315,7 @@ def test_training_sees_the_channels_of_the_closed_forms(
     signals = SETTINGS.signals.build()
     known = make_samples(forced_logs["train"], signals)
     store = WindowStore.from_logs(forced_logs["train"], torch.float64)
-    z = signals(store.smoothed, signals.prepare(store.rate_inputs))[store.trainable]
+    z = signals(store.smoothed, signals.prepare(store.regression_inputs))[store.trainable]
     torch.testing.assert_close(z, known.z, rtol=1e-12, atol=1e-12)
     runs = [
         (log, run_teacher_forced(identified["baseline"].model, log)) for log in forced_logs["train"]

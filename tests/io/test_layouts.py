@@ -19,7 +19,7 @@ from residnet.io.drafting.problems import (
     UnreadableLogsError,
     group_problems,
     name_files_in_errors,
-    without_channel_map,
+    rewrite_advice_for_files,
 )
 from residnet.io.drafting.questions import DraftNotes
 from residnet.io.drafting.tables import draft_manoeuvre_setting, draft_tables
@@ -97,10 +97,10 @@ def test_a_problem_of_many_files_is_one_line() -> None:
 
 
 def test_a_file_without_a_channel_map_is_not_told_to_correct_one() -> None:
-    error = without_channel_map(DataError("a.csv: no number; remove it from the channel map"))
+    error = rewrite_advice_for_files(DataError("a.csv: no number; remove it from the channel map"))
     assert str(error) == "a.csv: no number; fill it with values, or leave the file out"
     other = DataError("a.csv: the clock runs backwards")
-    assert without_channel_map(other) is other
+    assert rewrite_advice_for_files(other) is other
 
 
 def write_rows(path: Path, rows: int, columns: int = 4) -> Path:

@@ -244,7 +244,7 @@ def test_complete_motion_integrates_a_missing_pose(lacking: tuple[str, ...]) -> 
     channels = {name: values for name, values in TRUTH.channels.items() if name not in lacking}
     log = complete_motion(TRUTH.replace(channels=channels), MotionConfig())
     assert log.meta["integrated"] == list(lacking)
-    assert "not of a place" in log.meta["findings"][0]["text"]
+    assert "errors of the integrated velocities" in log.meta["findings"][0]["text"]
     away = np.exp(1j * (TRUTH["psi"][0] if "psi" in lacking else 0.0))
     place = (log["x"] + 1j * log["y"] - log["x"][0] - 1j * log["y"][0]) * away
     true = TRUTH["x"] + 1j * TRUTH["y"] - TRUTH["x"][0] - 1j * TRUTH["y"][0]

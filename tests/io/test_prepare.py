@@ -33,7 +33,7 @@ def made(hold: str, *, broken: bool = False) -> PreparedLog:
 
 def test_prepare_log_holds_inputs_from_the_sample_by_default() -> None:
     log = made("start")
-    assert np.array_equal(log.w, log.rate_inputs)
+    assert np.array_equal(log.w, log.regression_inputs)
     assert np.allclose(log.w[:, 0], (STEP * np.arange(60)) ** 2)
 
 
@@ -45,7 +45,9 @@ def test_prepare_log_mean_inputs_end_with_the_segment(broken: bool) -> None:
             continue
         goes_on = k + 1 < 60 and log.segment[k + 1] == log.segment[k]
         expected = (
-            (log.rate_inputs[k] + log.rate_inputs[k + 1]) / 2 if goes_on else log.rate_inputs[k]
+            (log.regression_inputs[k] + log.regression_inputs[k + 1]) / 2
+            if goes_on
+            else log.regression_inputs[k]
         )
         assert log.w[k] == pytest.approx(expected)
 

@@ -172,7 +172,7 @@ def test_windows_data_module_yields_windows_of_each_stage(
     starts = WindowSampler(STORE.find_starts(5), 4, 2).draw_epoch(9, 2)[1]
     for row, start in enumerate(starts.tolist()):
         whole = slice(start, start + 5)
-        for part in ("y", "smoothed", "nu_dot", "w", "rate_inputs", "usable", "trainable"):
+        for part in ("y", "smoothed", "nu_dot", "w", "regression_inputs", "usable", "trainable"):
             assert torch.equal(getattr(anywhere, part)[row], getattr(STORE, part)[whole])
     past, w_past = STORE.take_history(starts, 2)
     assert torch.equal(anywhere.past_y, past)

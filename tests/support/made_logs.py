@@ -39,7 +39,7 @@ def prepared(
         smoothed=y.copy(),
         nu_dot=np.zeros((len(y), 3)),
         w=w,
-        rate_inputs=w,
+        regression_inputs=w,
         segment=piece,
         usable=usable,
         trainable=usable,

@@ -100,10 +100,12 @@ def test_wind_is_that_of_the_frame() -> None:
     signals = SignalsConfig(inputs=("n", "delta"), exogenous=("wind_speed", "wind_dir")).build()
     log = sailed()[0][0]
     windy = np.concatenate((log.w, np.tile([5.0, 0.7], (len(log), 1))), axis=1)
-    log = dataclasses.replace(log, w=windy, rate_inputs=windy)
+    log = dataclasses.replace(log, w=windy, regression_inputs=windy)
     moved = through_water(log, np.array([0.8, -0.5]), signals)
     before, after = (
-        signals(torch.from_numpy(p.smoothed), signals.prepare(torch.from_numpy(p.rate_inputs)))
+        signals(
+            torch.from_numpy(p.smoothed), signals.prepare(torch.from_numpy(p.regression_inputs))
+        )
         for p in (log, moved)
     )
     # the air that the vessel feels is the same, whatever frame it is told in

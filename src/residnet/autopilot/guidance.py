@@ -694,9 +694,17 @@ class CrossingConfig(Config):
 
 @final
 class Crossing(Reference):
-    """Reference [B, 18] for `LagCompensatedPID`: filtered line-of-sight target and model forces.
+    """Reference [B, 18] for `LagCompensatedPID` on straight legs, from a filtered target point.
+
+    The reference holds pose, velocities and accelerations (9), and the thruster force that they
+    require according to a model, with its first and second derivative (9).
 
     Memory [B, 13]: nine entries of the filter, number of the leg, last target point and heading.
+
+    Args:
+        config: legs, line-of-sight circle and reference filter.
+        dt: time step in s.
+        models: feed-forward model and actuator lag of each vessel of the batch; None for no lag.
     """
 
     def __init__(
@@ -711,6 +719,7 @@ class Crossing(Reference):
         self.dt = dt
         self.models = list(models)
         self.filter_config = config.filter_config()
+        # transition matrix of (error, rate, acceleration) over a step, by axis
         self.step_matrix = self.filter_config.build(dt).advance[0]
         self.points = torch.tensor(config.points, dtype=torch.float64)
 

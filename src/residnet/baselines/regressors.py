@@ -338,7 +338,7 @@ def fit_regressors(
         )
 
     # inactive velocities are zero, and rates of angles follow from kinematics: none is fitted
-    learned_axes = get_dof(selected_samples.names).regressed_indices
+    learned_axes = get_dof(selected_samples.names).active_velocity_indices
     axis_fits = {}
     velocity_slopes = (
         _own_velocity_slopes(baseline.library, selected_samples) if config.dissipative else None

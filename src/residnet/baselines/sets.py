@@ -316,7 +316,7 @@ def active_terms(
     all_axes = [*terms_by_axis, *[()] * (dof.n_dynamic - len(terms_by_axis))]
     return [
         tuple(term for term in axis_terms if is_active_term(term, names))
-        if axis in dof.regressed_indices
+        if axis in dof.active_velocity_indices
         else ()
         for axis, axis_terms in enumerate(all_axes)
     ]

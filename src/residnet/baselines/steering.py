@@ -139,13 +139,13 @@ def fit_steady_states(
     steady_constraints: dict[str, dict[str, Any]] = {}
     for block in config.steady_state_blocks():
         # static gain and bias from the steady states, then the dynamics
-        means = _steady_means(config, samples, (*block.states, block.drive))
+        means = _steady_means(config, samples, (*block.states, block.input_name))
         design_matrix = torch.stack((means[:, -1], torch.ones_like(means[:, -1])), dim=1)
         (steady_fit,) = LeastSquares().fit(
             design_matrix,
             means[:, :-1],
             torch.arange(len(means)),
-            names=(block.drive, "1"),
+            names=(block.input_name, "1"),
             outputs=block.states,
         )
         tables |= _fit_dynamics(samples, block, steady_fit)
@@ -155,7 +155,7 @@ def fit_steady_states(
                 for values in (steady_fit.coefficients, steady_fit.standard_errors)
             )
             steady_constraints[state] = {
-                "of": block.drive,
+                "of": block.input_name,
                 "phi": value,
                 "phi_error": standard_error,
             }
@@ -198,7 +198,7 @@ def _fit_dynamics(
     phi_standard_error = steady_fit.standard_errors
     states_matrix = torch.stack([dynamic_samples.channel(name) for name in states], dim=1)
     (fit,) = LeastSquares().fit(
-        states_matrix - dynamic_samples.channel(block.drive)[:, None] * phi[0] - phi[1],
+        states_matrix - dynamic_samples.channel(block.input_name)[:, None] * phi[0] - phi[1],
         dynamic_samples.target[:, [VELOCITY_NAMES.index(name) for name in states]],
         dynamic_samples.group,
         names=states,
@@ -214,7 +214,7 @@ def _fit_dynamics(
             Coefficient(
                 f"{state}_dot", term, float(coefficients[j, i]), float(standard_errors[j, i])
             )
-            for j, term in enumerate((*states, block.drive, "1"))
+            for j, term in enumerate((*states, block.input_name, "1"))
         )
         for i, state in enumerate(states)
     }

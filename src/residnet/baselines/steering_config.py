@@ -43,7 +43,10 @@ class SteeringBaselineConfig(IdentifiedConfig, ABC):
 
     @abstractmethod
     def axis_terms(self) -> tuple[tuple[str, ...], ...]:
-        """Return the terms per axis; sway with `("v",)` decays with the yaw time constant."""
+        """Return the terms of surge, sway and yaw.
+
+        Sway with the only term `v` decays with the time constant of yaw.
+        """
 
     @final
     def check_channels(self, names: Sequence[str]) -> None:
@@ -149,7 +152,7 @@ class SteadyStateBlock(NamedTuple):
     """States with a common input, and the kinds of manoeuvre that identify their dynamics."""
 
     states: tuple[str, ...]
-    drive: str
+    input_name: str
     manoeuvre_kinds: tuple[str, ...]
 
 
@@ -184,7 +187,7 @@ class LinearSteadyConfig(SteeringBaselineConfig):
     def axis_terms(self) -> tuple[tuple[str, ...], ...]:
         terms_of_axis: dict[str, tuple[str, ...]] = {"v": ("v",)}
         for block in self.steady_state_blocks():
-            terms_of_axis |= dict.fromkeys(block.states, (*block.states, block.drive, "1"))
+            terms_of_axis |= dict.fromkeys(block.states, (*block.states, block.input_name, "1"))
         return tuple(terms_of_axis[axis] for axis in VELOCITY_NAMES)
 
     def steady_state_blocks(self) -> list[SteadyStateBlock]:

@@ -34,7 +34,7 @@ def actuator_states(x: Tensor, n_dynamic: int = 3) -> Tensor:
 
 
 def motion_accelerations(x: Tensor) -> Tensor:
-    """Return the accelerations [..., 3] of a motion [..., 9] of pose, velocities, accelerations."""
+    """Return u_dot, v_dot, r_dot [..., 3] from pose, velocities and accelerations [..., 9]."""
     return x[..., 6:9]
 
 
@@ -80,7 +80,11 @@ def heading_rate(nu: Tensor, n_dynamic: int = 3) -> Tensor:
 
 
 def level_velocities(nu: Tensor) -> list[Tensor]:
-    """Return the velocities forward, starboard and down [...] in level axes, from [..., 9]."""
+    """Return the velocities forward, starboard and down [...] in level axes, in m/s.
+
+    Args:
+        nu: dynamic states u, v, r, w, p, q, z, phi, theta [..., 9].
+    """
     return to_level_axes(nu[..., 0], nu[..., 1], nu[..., 3], nu[..., 7], nu[..., 8])
 
 

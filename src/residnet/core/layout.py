@@ -338,7 +338,7 @@ class DegreesOfFreedom:
         return [self.dynamic_states.index(name) for name in self.active_states]
 
     @property
-    def regressed_indices(self) -> list[int]:
+    def active_velocity_indices(self) -> list[int]:
         """Indices of the active velocities among the dynamic states: those with an equation."""
         return [self.dynamic_states.index(name) for name in self.velocities]
 
@@ -354,7 +354,7 @@ class DegreesOfFreedom:
 
     @property
     def pose_error_names(self) -> tuple[str, ...]:
-        """Names of the pose errors of free runs, from `names.POSE_ERROR_UNITS`."""
+        """Those of position and heading, or position, depth and attitude, that change at all."""
         if self.is_six_dof:
             has_attitude = not self.is_vertical_plane or "q" in self.velocities
             return (*["position"] * self.has_position, "depth", *["attitude"] * has_attitude)
@@ -434,7 +434,7 @@ class DegreesOfFreedom:
         import torch
 
         is_regressed = torch.zeros(self.n_dynamic, dtype=torch.float64)
-        is_regressed[self.regressed_indices] = 1.0
+        is_regressed[self.active_velocity_indices] = 1.0
         return is_regressed
 
     def active_mask(self) -> Tensor:

@@ -51,7 +51,7 @@ class InnovationFilter(nn.Module):
         super().__init__()
         self.dof = dof.n_dynamic
         self.size = 1 + 2 * dof.n_dynamic
-        self.is_fully_regressed = len(dof.regressed_indices) == dof.n_dynamic
+        self.is_fully_regressed = len(dof.active_velocity_indices) == dof.n_dynamic
         self.mask = nn.Buffer(dof.equation_mask(), persistent=False)
         # exact discretisation of a first-order lag; the division by dt turns a velocity error per
         # step into an acceleration
@@ -169,7 +169,7 @@ class HybridDynamics(Dynamics):
         dof = get_dof(signals.names)
         self.dof = dof.n_dynamic
         self.is_complete = dof.is_complete
-        self.is_fully_regressed = len(dof.regressed_indices) == dof.n_dynamic
+        self.is_fully_regressed = len(dof.active_velocity_indices) == dof.n_dynamic
         self.has_roll = dof.has_roll
         self.set_attitude_columns(ATTITUDE if dof.is_six_dof else (), len(dof.state_names))
         self.equation_mask = nn.Buffer(dof.equation_mask(), persistent=False)

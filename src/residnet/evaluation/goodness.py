@@ -132,7 +132,7 @@ def find_pairs(
     if n_commands == 0:
         return
     search_stride = max(round(_SEARCH_INTERVAL / dt), 1)
-    recorded_commands = [log.rate_inputs[log.segment >= 0, :n_commands] for log in logs]
+    recorded_commands = [log.regression_inputs[log.segment >= 0, :n_commands] for log in logs]
     command_ranges = np.concatenate(recorded_commands).max(0) - np.concatenate(
         recorded_commands
     ).min(0)
@@ -140,7 +140,7 @@ def find_pairs(
     command_ranges[command_ranges == 0] = 1.0
     # at the stride of the search, since the comparison of all starts is expensive
     coarse_commands = [
-        np.nan_to_num(log.rate_inputs[::search_stride, :n_commands]) / command_ranges
+        np.nan_to_num(log.regression_inputs[::search_stride, :n_commands]) / command_ranges
         for log in logs
     ]
     for log_index, log in enumerate(logs):
@@ -148,7 +148,7 @@ def find_pairs(
             length = window.stop - window.start
             window_commands = (
                 np.nan_to_num(
-                    log.rate_inputs[window.start : window.stop : search_stride, :n_commands]
+                    log.regression_inputs[window.start : window.stop : search_stride, :n_commands]
                 )
                 / command_ranges
             )

@@ -6,8 +6,8 @@ selected instead. Faults elsewhere are reported and do not affect the selection.
 Some full hulls are unstable on a straight course. Instability is therefore a fault only if the
 vessel itself, with constant inputs, settled after a disturbance such as the entry of a turn, and
 remained settled for several growth times of the model's disturbances. An undisturbed straight run
-is no evidence. Disturbances have the size observed in the log, so that a model of logs with
-unmeasured wind may oscillate slightly in a steady turn, as the vessel did.
+is no evidence. The model is then simulated with disturbances as large as the deviations in the log.
+In unmeasured wind these are not zero, and a model may oscillate in a steady turn as the vessel did.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ _MAX_DOUBLING_TIME = 300.0
 _MAX_ASYMMETRY = 0.1
 """Largest asymmetric part of the acceleration of a symmetric model, relative to its spread."""
 _LONG_RUN_DURATION = 300.0
-"""Shortest run in s with constant inputs; a disturbance that counts doubles within it."""
+"""Shortest duration in s of the runs with constant inputs that check for bounded motion; equal to
+the longest doubling time."""
 _MEMORY_SETTLING_TIME = 10.0
 """Time in s in constant states after which the memory of a head counts as settled."""
 _STEADY_TOLERANCE = 1e-4
@@ -69,11 +70,12 @@ _CONSTANT_INPUT_TOLERANCE = 0.02
 _MIN_CONSTANT_DURATION = 5.0
 """Shortest duration in s of a run with constant inputs."""
 _MIN_MODEL_GROWTH = 20.0
-"""Growth of a disturbance of the model in a steady run from which the run contradicts it."""
+"""A steady run contradicts a model whose disturbances would grow by more than this factor in it."""
 _MAX_MEASURED_GROWTH = 3.0
-"""Growth of the measured deviation below which a run is steady."""
+"""A run is steady if its measured deviation grows by less than this factor."""
 _MIN_MEASURED_DECAY = 3.0
-"""Decay of the initial deviation above which a run shows that the vessel is stable."""
+"""A run shows that the vessel is stable if its initial deviation decays by more than this factor.
+"""
 _MAX_STEADY_RUNS = 20
 """Number of steady runs that are checked."""
 _SETTLING_SHARE = 0.25
@@ -337,7 +339,7 @@ def check_damping(
     damping_slopes = np.stack(
         [
             torch.autograd.grad(nu_dot[:, i].sum(), x, retain_graph=True)[0][:, SURGE + i].numpy()
-            for i in dof.regressed_indices
+            for i in dof.active_velocity_indices
         ],
         axis=1,
     )

@@ -31,8 +31,8 @@ It is less than half of the 2 % that `scripts/bench/excitation.py` allows, becau
 estimate a quantile with much scatter."""
 _MAX_RANGE_MARGIN: Final = 0.75
 """Largest margin of the ranges in standard deviations of a channel: a quarter of the range of a
-uniform distribution. Logs that differ more are of different kinds, and the space between them is no
-evidence for what lies beyond."""
+uniform distribution. Logs whose extremes differ more are of different kinds, and their differences
+do not predict the range of a new log."""
 _RIDGE: Final = 1e-4
 """Second moment that is added to that of each monomial. Channels that vary by less than 1 % of
 their scale in a direction count as if they varied by 1 %.
@@ -75,7 +75,7 @@ def detect_feedback_of_logs(
         states = {name: log.y[:, k] for k, name in enumerate(names)}
         inputs = {name: log.w[:, k] for k, name in enumerate(signals.input_columns)}
         table = {**states, **inputs}
-        # an interpolation of unusable samples would hide feedback no more than a gap does
+        # the detection needs uniform samples; few interpolated ones do not hide feedback
         tables.append({name: _fill_gaps(values) for name, values in table.items()})
     return detect_feedback(tables, signals.inputs, step)
 
@@ -341,7 +341,12 @@ def _factorize(moment: np.ndarray) -> np.ndarray:
 def _held_out_scores(
     features: Sequence[np.ndarray], moments: np.ndarray, folds: Sequence[Fold]
 ) -> list[np.ndarray]:
-    """Return the root of the inverse Christoffel function of each sample by the other logs."""
+    """Return the distance of each sample from the other logs, by the moments of its monomials.
+
+    It is sqrt(phi' M^-1 phi) for the monomials phi of the sample and the moment matrix M of the
+    other logs: the root of the inverse Christoffel function, and for linear monomials a Mahalanobis
+    distance.
+    """
     scores = [np.zeros(0)] * len(features)
     for other_logs, held_out in folds:
         factor = _factorize(moments[other_logs].mean(axis=0))
@@ -353,11 +358,11 @@ def _held_out_scores(
 def _predict_range_margins(rows: Sequence[np.ndarray]) -> np.ndarray:
     """Return the margins [c] beyond the ranges of some logs that hold the ranges of a new log.
 
-    The largest value of a new log exceeds that of K logs with probability 1 / (K + 1), and then for
-    many samples where each log has its own amplitude. The margin is the distance of the upper
-    prediction limit of a new extreme value, mean + t sqrt(1 + 1 / K) times the standard deviation
-    of the extreme values of the logs, to the largest of them. Source: G. J. Hahn and W. Q. Meeker,
-    Statistical Intervals (1991), section 4.7.
+    The largest value of a new log exceeds the largest of K logs with probability 1 / (K + 1). If
+    each log has its own amplitude, many samples of the new log then do. The margin is the distance
+    of the upper prediction limit of a new extreme value, mean + t sqrt(1 + 1 / K) times the
+    standard deviation of the extreme values of the logs, to the largest of them. Source: G. J. Hahn
+    and W. Q. Meeker, Statistical Intervals (1991), section 4.7.
     """
     n_logs = len(rows)
     if n_logs < 2:
@@ -458,7 +463,7 @@ def _relate_unexcited_input(
 ) -> InputRelation:
     """Return the value that an unexcited input held, or its relation to the nearest other input.
 
-    The tolerance is the smallest one that the resolution of the input justifies.
+    The tolerance is a smallest value, `_HELD_TOLERANCE`; calibration may increase it.
     """
     pooled_samples = np.concatenate(samples)
     values = pooled_samples[:, names.index(name)]
@@ -471,7 +476,7 @@ def _relate_unexcited_input(
         if abs(correlation) > abs(best[0]):
             best = (correlation, input_name, np.polyfit(other, values, 1))
     correlation, input_name, (gain, offset) = best
-    # a gain of an almost constant input would be noise
+    # with a weaker correlation the gain would be noise
     if abs(correlation) < 0.9:
         level = float(np.median(values))
         tolerance = max(_HELD_TOLERANCE * abs(level), 1e-9)

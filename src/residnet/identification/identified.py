@@ -523,7 +523,9 @@ def _concatenate_table(column_names: list[str], rows: list[tuple[Any, ...]]) -> 
 def _identified_accelerations(logs: Sequence[PreparedLog]) -> list[tuple[int, str]]:
     """Return index and name of each measured acceleration."""
     dof = logs[0].dof
-    return [(axis_index, dof.derivative_names[axis_index]) for axis_index in dof.regressed_indices]
+    return [
+        (axis_index, dof.derivative_names[axis_index]) for axis_index in dof.active_velocity_indices
+    ]
 
 
 GOODNESS_SPLITS = ("train", "test")

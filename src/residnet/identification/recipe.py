@@ -106,7 +106,7 @@ class TrainingDataSummary:
             evaluation: protocols.
             dt: time step of the grid, s.
         """
-        # the import of the test takes longer than the rest of a config
+        # imported late: a config must load fast, and this module imports SciPy
         from residnet.identification.symmetry import find_asymmetric_pairs
 
         channel_values = samples.z
@@ -210,8 +210,8 @@ def make_hull_terms(data_summary: TrainingDataSummary) -> list[str] | dict[str, 
     linear and quadratic in it and decreases with the inflow. Inputs that are forces are terms
     themselves.
 
-    For short logs each axis has only the terms of a mirror-symmetric vessel and the asymmetry of a
-    single propeller: half of the coefficients of all terms in all axes.
+    With short logs an axis has only the terms of a mirror-symmetric vessel and the asymmetry of a
+    single propeller, which are half of the coefficients. Long logs have all terms in all axes.
     """
     terms = _all_terms(data_summary)
     if has_long_logs(data_summary):
@@ -253,7 +253,7 @@ def make_model_test_terms(data_summary: TrainingDataSummary) -> dict[str, list[s
 
 
 def make_full_hull_terms(data_summary: TrainingDataSummary) -> list[str]:
-    """Return the terms of `make_hull_terms` for long logs: all terms in all axes."""
+    """Return the terms of long logs: hull, wind, saturation and drag of rudders, in all axes."""
     _, rudders, propellers = _classify_inputs(data_summary)
     additional_terms = ["wind_mag r", "wind_u r"] if data_summary.has_wind else []
     additional_terms += [
@@ -481,7 +481,8 @@ def make_portfolio(
         regressors = make_hull_terms(data_summary)
     refit_settings = make_refit_settings(data_summary)
     if has_model_tests:
-        # shrinking the asymmetry to zero made both sides' zigzags alike
+        # shrinking the asymmetry to zero gave zigzags to port and starboard equal overshoots, which
+        # a single propeller makes different
         refit_settings |= {"prior": 1.0, "asymmetric": 0.0}
     ridge = 1e-6 if get_dof(data_summary.channel_names).is_six_dof else 1e-4
     wind_channels = ["wind_u", "wind_v"] if data_summary.has_wind else []
@@ -623,15 +624,15 @@ class PreparationPlan:
     def to_config(self) -> dict[str, Any]:
         """Return the settings `prepare` of a config.
 
-        Roll angles are averaged over the derivative window, since the smoothed roll rate beside
-        them is an average over this window too.
+        For vessels that roll, regressors are means over the derivative window (`beside`), so that
+        roll angle and roll acceleration are filtered equally.
         """
         grid: dict[str, Any] = {"step": f"{self.grid_step:g} s"}
         grid |= {"held": list(self.held_inputs)} if self.held_inputs else {}
         window = f"{self.derivative_window:g} s"
         derivative = {"kind": "savitzky_golay", "window": window, "order": 2}
-        method_override = {"beside": "means"} if self.has_roll else {}
-        return {"grid": grid, "derivative": derivative, "hold": self.input_hold, **method_override}
+        roll_settings = {"beside": "means"} if self.has_roll else {}
+        return {"grid": grid, "derivative": derivative, "hold": self.input_hold, **roll_settings}
 
 
 def _is_held(logs: Sequence[Log], name: str) -> bool:

@@ -50,7 +50,8 @@ def align_to_grid(
     sampling rate.
 
     Grid points inside a gap, or whose value depends on a NaN, become NaN and are masked as
-    `hard:gap`. The masks of the log cover every grid point to which a masked sample contributes.
+    `hard:gap`; a hard mask splits the log. The masks of the log cover every grid point to which a
+    masked sample contributes.
 
     Args:
         log: log with an increasing clock.

@@ -90,7 +90,7 @@ class WindowBatch(NamedTuple):
     smoothed: Tensor
     nu_dot: Tensor
     w: Tensor
-    rate_inputs: Tensor
+    regression_inputs: Tensor
     usable: Tensor
     trainable: Tensor
     past_y: Tensor

@@ -33,7 +33,7 @@ from residnet.preprocessing.channel_values import (
 )
 
 _MIN_DENSE_QUANTILE = 0.9
-"""Quantile of the intervals between values that is one sample in a dense channel."""
+"""A channel is dense if this quantile of the intervals between its values is one sample."""
 MAX_BRIDGED_INTERVALS = 3.0
 """Longest gap that is interpolated, in median intervals between the values of a channel."""
 _JERK_LEVELS = 10.0 ** (0.5 * np.arange(-8, 5))
@@ -118,12 +118,12 @@ def _complete_states(log: Log, config: MotionConfig, dof: DegreesOfFreedom) -> L
             )
     log_without_held = mask_held_values(log)
     missing_channels = [name for name in STATE_NAMES if name not in log.channels]
-    made_names = {
+    estimated_names = {
         name
         for name in STATE_NAMES
         if name in missing_channels or not _is_dense(log_without_held[name])
     }
-    if not (made_names or config.has_position_offset):
+    if not (estimated_names or config.has_position_offset):
         return log
     if missing_pose := [name for name in POSE_NAMES if name in missing_channels]:
         # a heading integrated from the yaw rate would not agree with measured positions
@@ -140,17 +140,20 @@ def _complete_states(log: Log, config: MotionConfig, dof: DegreesOfFreedom) -> L
             " needs position and heading, or u, v and r without a position; name their columns"
             f"{'' if dof.is_complete else velocities_text}"
         )
-    made_names |= set(POSE_NAMES) if config.has_position_offset else set()
-    smoothed_names = [name for name in STATE_NAMES if name in made_names]
+    estimated_names |= set(POSE_NAMES) if config.has_position_offset else set()
+    smoothed_names = [name for name in STATE_NAMES if name in estimated_names]
     smoothed_motion = _smooth_planar_motion(log_without_held, config)
-    # its derivative is estimated with the velocity
-    made_channels = [*smoothed_names, *(["v_dot"] if "v_dot" in smoothed_motion else [])]
+    # the smoother estimates a missing sway velocity together with its derivative
+    estimated_channels = [*smoothed_names, *(["v_dot"] if "v_dot" in smoothed_motion else [])]
     note = f"{', '.join(smoothed_names)} come from a smoother of the measured motion: "
     note += ", ".join(
         f"{name} {_describe_source(log_without_held, name)}" for name in smoothed_names
     )
     return _with_channels(
-        log, {name: smoothed_motion[name] for name in made_channels}, note, smoothed=made_channels
+        log,
+        {name: smoothed_motion[name] for name in estimated_channels},
+        note,
+        smoothed=estimated_channels,
     )
 
 
@@ -423,7 +426,7 @@ def _integrate_pose(log: Log, missing_names: Sequence[str]) -> Log:
     new_channels = {name: integrated_pose[name] for name in missing_names}
     note = (
         f"{', '.join(missing_names)} were not measured and are integrated from the velocities:"
-        " errors of position and heading are those of integrated velocities, and not of a place"
+        " errors of position and heading are errors of the integrated velocities"
     )
     return _with_channels(
         log, new_channels, note, "integrated_pose", integrated=list(missing_names)
@@ -554,14 +557,14 @@ def _smooth_planar_motion(log: Log, config: MotionConfig) -> dict[str, np.ndarra
     heading, yaw_rate = _smooth_angle(log, psi, "r")
     filter_times = np.union1d(t, fix_times) if config.delay else t
     sample_indices = np.searchsorted(filter_times, t)
-    headings_at_clock = np.interp(filter_times, t, heading)
+    filter_headings = np.interp(filter_times, t, heading)
     measurements = np.full((filter_times.size, 2, 2), np.nan)
     measurements[np.searchsorted(filter_times, fix_times), 0] = positions[fix_indices]
-    measurements[:, 0] -= np.stack(rotate(antenna.x, antenna.y, headings_at_clock), axis=1)
+    measurements[:, 0] -= np.stack(rotate(antenna.x, antenna.y, filter_headings), axis=1)
     noise_ratio = 1.0
     if "u" in log.channels and "v" in log.channels:
         measurements[sample_indices, 1] = np.stack(
-            rotate(u, v, headings_at_clock[sample_indices]), axis=1
+            rotate(u, v, filter_headings[sample_indices]), axis=1
         )
         fix_positions = measurements[np.isfinite(measurements[:, 0]).all(axis=1), 0]
         position_noise = max(

@@ -83,7 +83,8 @@ class PreparedLog:
         smoothed: states with smoothed dynamic states [T, 3 + n].
         nu_dot: derivatives of the dynamic states [T, n].
         w: inputs over the step that follows each sample [T, m].
-        rate_inputs: inputs that are paired with the derivatives [T, m], see `PrepareConfig.beside`.
+        regression_inputs: inputs that are paired with the derivatives [T, m], see
+            `PrepareConfig.beside`.
         segment: segment number of each sample [T]; -1 outside of segments.
         usable: samples at which free runs are scored [T] bool.
         trainable: samples whose smoothed state and derivative enter fits [T] bool.
@@ -96,7 +97,7 @@ class PreparedLog:
     smoothed: np.ndarray
     nu_dot: np.ndarray
     w: np.ndarray
-    rate_inputs: np.ndarray
+    regression_inputs: np.ndarray
     segment: np.ndarray
     usable: np.ndarray
     trainable: np.ndarray
@@ -186,7 +187,7 @@ def prepare_log(
         nu, config.grid.step, clean_segment
     )
     held_inputs = _step_means(w, segment) if config.hold == "mean" else w
-    rate_inputs = w
+    regression_inputs = w
     if config.beside == "means":
         # the derivative of an integral by the same filter is the weighted mean over its window
         step_values = np.concatenate((0.5 * (nu[:-1] + nu[1:]), held_inputs[:-1]), axis=1)
@@ -197,7 +198,7 @@ def prepare_log(
             config.grid.step * cumulative_steps, config.grid.step, clean_segment
         )[1]
         smoothed_nu = window_means[:, : dof.n_dynamic]
-        rate_inputs = np.where(has_derivative[:, None], window_means[:, dof.n_dynamic :], w)
+        regression_inputs = np.where(has_derivative[:, None], window_means[:, dof.n_dynamic :], w)
     elif "v_dot" in log.meta.get("smoothed", ()):
         # the reconstruction estimates sway with its derivative: differentiation would add the noise
         # of a second estimate, and a second filter would attenuate both
@@ -227,7 +228,17 @@ def prepare_log(
     )
     trainable = usable & log.usable & has_derivative & is_inside_trim
     prepared = PreparedLog(
-        log, split, y, smoothed, nu_dot, held_inputs, rate_inputs, segment, usable, trainable, dof
+        log,
+        split,
+        y,
+        smoothed,
+        nu_dot,
+        held_inputs,
+        regression_inputs,
+        segment,
+        usable,
+        trainable,
+        dof,
     )
     return prepared.on_disk() if is_on_disk else prepared
 

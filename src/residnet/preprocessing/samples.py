@@ -18,7 +18,7 @@ def compute_channels(
 ) -> torch.Tensor:
     """Compute the channels z [T, nz] of a model at the samples of a log.
 
-    States are smoothed, and inputs are those of the derivatives (`PreparedLog.rate_inputs`): the
+    States are smoothed, and inputs are paired with the derivatives (`regression_inputs`): the
     derivative at an instant depends on the inputs at that instant, whereas a rollout uses the
     inputs over each step (`PreparedLog.w`). Comparisons with measured accelerations use these
     channels.
@@ -29,7 +29,7 @@ def compute_channels(
         is_selected: selected samples [T] bool; None for all, with 0 in gaps.
     """
     states = log.smoothed
-    inputs = log.rate_inputs
+    inputs = log.regression_inputs
     states, inputs = (
         (np.nan_to_num(states), np.nan_to_num(inputs))
         if is_selected is None

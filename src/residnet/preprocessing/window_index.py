@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _SEGMENTS_PER_LOG = 1_000_000
 """Offset of segment labels between logs, larger than the number of segments of any log."""
-WINDOW_COLUMNS = ("y", "smoothed", "nu_dot", "w", "rate_inputs", "usable", "trainable")
+WINDOW_COLUMNS = ("y", "smoothed", "nu_dot", "w", "regression_inputs", "usable", "trainable")
 """Attributes of `WindowStore` that windows contain by default."""
 
 

@@ -30,7 +30,7 @@ class WindowStore:
         smoothed: the same with smoothed velocities [N, 3 + n].
         nu_dot: accelerations [N, n].
         w: inputs that act during the step after the sample [N, m].
-        rate_inputs: inputs that are paired with the accelerations [N, m].
+        regression_inputs: inputs that are paired with the accelerations [N, m].
         usable: whether errors at the sample count [N] bool.
         trainable: whether the sample may be used for training [N] bool.
         n_remaining: samples up to the end of the segment, including this one [N]; 0 outside of
@@ -45,7 +45,7 @@ class WindowStore:
     smoothed: Tensor
     nu_dot: Tensor
     w: Tensor
-    rate_inputs: Tensor
+    regression_inputs: Tensor
     usable: Tensor
     trainable: Tensor
     n_remaining: Tensor
@@ -128,7 +128,7 @@ class WindowStore:
             **sampled_columns
             | {
                 "w": average_over_step(self.w),
-                "rate_inputs": average_over_step(self.rate_inputs),
+                "regression_inputs": average_over_step(self.regression_inputs),
                 "n_remaining": (self.n_remaining[row_order] + stride - 1) // stride,
                 "n_elapsed": self.n_elapsed[row_order] // stride,
             },

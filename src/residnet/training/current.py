@@ -244,7 +244,7 @@ def through_water(log: PreparedLog, current: np.ndarray, signals: Signals) -> Pr
         smoothed=transform(log.smoothed),
         nu_dot=log.nu_dot - current_acceleration,
         w=_transform_wind(log.w, current, signals),
-        rate_inputs=_transform_wind(log.rate_inputs, current, signals),
+        regression_inputs=_transform_wind(log.regression_inputs, current, signals),
     )
 
 
@@ -326,7 +326,7 @@ class _CurrentProblem:
         parts: list[list[np.ndarray]] = [[], [], [], [], []]
         for number, log in enumerate(self.logs):
             rows = log.trainable
-            columns = (log.y[:, HEADING], log.smoothed, log.rate_inputs, log.nu_dot)
+            columns = (log.y[:, HEADING], log.smoothed, log.regression_inputs, log.nu_dot)
             for part, values in zip(parts, columns, strict=False):
                 part.append(values[rows])
             parts[4].append(np.full(int(rows.sum()), number))

@@ -222,7 +222,7 @@ class HeadTraining(EpochTraining):
         precomputed = paged.allocate_rows(len(store.y), n_columns, dtype=store.y.dtype)
         with torch.no_grad():
             for rows in paged.iterate_row_chunks(len(precomputed)):
-                z = self.model.compute_channels(store.smoothed[rows], store.rate_inputs[rows])
+                z = self.model.compute_channels(store.smoothed[rows], store.regression_inputs[rows])
                 baseline = self.model.baseline_acceleration(z)
                 precomputed[rows] = torch.cat((z, baseline, store.nu_dot[rows]), dim=-1)
                 paged.release_pages()

@@ -47,39 +47,42 @@ def simulate_rudder_responses(
     exact_predictor: SimulatedPredictor,
     rudder: Tensor,
     settings: PredictorTraining,
-    states: int,
+    n_states: int,
     seed: int,
 ) -> RudderResponses:
     """Return the data of section 6.1.1: random states, simulated with all rudder angles.
 
     States are sampled from simulations with random angles, since most combinations of velocities
-    do not occur. Added noise covers their neighbourhood.
+    do not occur. Added noise covers their neighbourhood (`settings.scatter`, relative to the
+    standard deviations). An angle is held for `settings.hold` s on average, and a state is sampled
+    in the first `settings.wander` s.
 
     Args:
         vessel: vessel in calm water.
         exact_predictor: simulation of the changes.
         rudder: angles [C] in rad.
         settings: settings of the training.
-        states: number of states.
+        n_states: number of states.
         seed: seed of the random numbers.
     """
     generator = torch.Generator().manual_seed(seed)
     dt = min(settings.hold / 10.0, 0.25)
     steps = math.ceil(settings.wander / dt)
-    x, w = vessel.straight_course(torch.ones(states, dtype=torch.float64))
+    x, w = vessel.straight_course(torch.ones(n_states, dtype=torch.float64))
     # a Poisson process of changes: an angle applies from its switching step to the next one
-    is_switch = torch.rand(states, steps, generator=generator) < dt / settings.hold
+    is_switch = torch.rand(n_states, steps, generator=generator) < dt / settings.hold
     is_switch[:, 0] = True
     last_switch = torch.where(is_switch, torch.arange(steps), 0).cummax(1).values
-    angles = rudder[torch.randint(len(rudder), (states, steps), generator=generator)].gather(
+    angles = rudder[torch.randint(len(rudder), (n_states, steps), generator=generator)].gather(
         1, last_switch
     )
     inputs = torch.cat((angles.unsqueeze(-1), w[:, None, 1:].expand(-1, steps, -1)), dim=-1)
-    nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(states, -1)
+    # factors of rudder force and time constants, and rudder bias: no variation
+    nominal_steering = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(n_states, -1)
     with torch.no_grad():
-        trajectories = Rollout(vessel.model(dt))(x, inputs, vessel.memory(nominal))[0]
-        sample_steps = torch.randint(steps + 1, (states,), generator=generator)
-        x = trajectories[torch.arange(states), sample_steps]
+        trajectories = Rollout(vessel.model(dt))(x, inputs, vessel.memory(nominal_steering))[0]
+        sample_steps = torch.randint(steps + 1, (n_states,), generator=generator)
+        x = trajectories[torch.arange(n_states), sample_steps]
         x = x + settings.scatter * x.std(0) * torch.randn(
             x.shape, generator=generator, dtype=torch.float64
         )
@@ -126,8 +129,9 @@ class PredictorFit(EpochTraining):
         self._losses.append(float(loss.detach()))
         return loss
 
-    def _scaled_errors(self, answers: RudderResponses) -> Tensor:
-        return (self.predictor.predict_changes(answers.x) - answers.change) / self.predictor.scale
+    def _scaled_errors(self, responses: RudderResponses) -> Tensor:
+        errors = self.predictor.predict_changes(responses.x) - responses.change
+        return errors / self.predictor.scale
 
     def compute_validation_score(self) -> tuple[nn.Module, float]:
         """Return the predictor and its RMS error on validation states, relative to the spread."""
@@ -169,9 +173,9 @@ def train_predictor(
     rudder = config.build_law(predictor, task).rudder
     train, validation_set = (
         simulate_rudder_responses(
-            task.vessel, exact_predictor, rudder, settings, states, state_seed
+            task.vessel, exact_predictor, rudder, settings, n_states, state_seed
         )
-        for states, state_seed in (
+        for n_states, state_seed in (
             (settings.states, 2 * seed),
             (settings.states // 5, 2 * seed + 1),
         )

@@ -1,4 +1,4 @@
-"""Problems of many files in as few lines as possible."""
+"""Messages about problems of many files: one line for all files with the same problem."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import NoReturn
 from residnet.core.errors import DataError, ResidnetError
 from residnet.core.names import truncate
 
-_MAX_FILE_NAMES = 100
-"""Largest number of characters of the names of files with the same problem."""
+_MAX_FILE_NAMES_LENGTH = 100
+"""Largest number of characters for the list of files with the same problem."""
 
 
 class UnreadableLogsError(DataError):
@@ -55,10 +55,10 @@ def name_files_in_errors(paths: Sequence[Path]) -> Iterator[None]:
         raise DataError(f"{paths[0]}: {message}{other_files_text}") from None
 
 
-def without_channel_map(error: ResidnetError) -> ResidnetError:
-    """Return an error of a drafted reader with advice that needs no channel map.
+def rewrite_advice_for_files(error: ResidnetError) -> ResidnetError:
+    """Return an error with advice for users who give only files.
 
-    A user who gives only files has no channel map to correct, and no keys of a config.
+    They have no config, so that advice on its keys or its channel map would not help them.
     """
     message = str(error)
     for advice, advice_for_files in _ADVICE_FOR_FILES:
@@ -129,5 +129,5 @@ def describe_other_files_with_problem(file_names: Sequence[str]) -> str:
     """Return a remark on further files with the same problem; empty without such files."""
     if not file_names:
         return ""
-    names = truncate(", ".join(file_names), _MAX_FILE_NAMES)
+    names = truncate(", ".join(file_names), _MAX_FILE_NAMES_LENGTH)
     return f" (and {len(file_names)} other file{'s' * (len(file_names) > 1)}: {names})"

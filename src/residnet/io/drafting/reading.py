@@ -28,7 +28,7 @@ from residnet.io.drafting.problems import (
     UnreadableLogsError,
     name_files_in_errors,
     raise_unreadable,
-    without_channel_map,
+    rewrite_advice_for_files,
 )
 from residnet.io.drafting.questions import INPUTS_KEY, READER_KEY, DraftNotes, Key
 from residnet.io.drafting.recordings import draft_recordings
@@ -96,7 +96,7 @@ def read_drafted(
         try:
             result.reader, recordings = draft_recordings(paths, draft_notes)
         except ResidnetError as error:
-            raise without_channel_map(error) from None
+            raise rewrite_advice_for_files(error) from None
     settings = {key: value for key, value in result.reader.items() if is_gridded or key != "clock"}
     reader = validate_config(settings, ReaderConfig, "draft").build()
     names = assign_log_names(paths)
@@ -109,7 +109,7 @@ def read_drafted(
                 log = reader.read(path) if recording is None else reader.to_log(recording)
                 result.logs[path] = log.replace(name=names[path])
         except ResidnetError as error:
-            result.errors[path] = without_channel_map(error)
+            result.errors[path] = rewrite_advice_for_files(error)
     report_progress("reading logs", len(paths), len(paths))
     if not result.logs:
         raise_unreadable(result.errors)

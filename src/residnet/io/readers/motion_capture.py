@@ -103,7 +103,7 @@ def parse_mocap_header(path: Path, lines: Sequence[str]) -> MocapHeader | None:
 
 
 def _parse_motive_header(path: Path, lines: Sequence[str]) -> MocapHeader | None:
-    """Parse the header of an export of OptiTrack Motive."""
+    """Parse the header of OptiTrack Motive, a table of rigid bodies; None without its axis row."""
     rows = list(csv.reader(lines[:_MAX_HEADER_LINES]))
     axis_row = next((i for i, row in enumerate(rows) if row[:1] == ["Frame"]), None)
     if axis_row is None or axis_row < 3:

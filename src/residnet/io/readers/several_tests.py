@@ -1,4 +1,4 @@
-"""Files with several tests, each of which is a log with a path below that of its file.
+"""Files with several tests, each of which is a log with its own path below the path of the file.
 
 The path of a test is `book.xlsx/Test_3_Zigzag_10_10`. Commands and configs find the tests of a
 file by `expand_files`; the readers of tables read them like files.
@@ -30,7 +30,7 @@ from residnet.io.readers.table_sections import (
     are_similar,
     classify_cells,
     find_sections,
-    select_similar,
+    select_tests,
 )
 from residnet.io.readers.text_encoding import open_as_utf8
 
@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 
 _TEXT_ENDINGS = (".csv", ".tsv", ".txt", ".dat")
 _MAX_TEXT_BYTES = 64_000_000
-"""Size of the largest text in which several tests are searched; longer ones are one log."""
+"""Largest size of a text that is searched for several tests; a larger text is one log."""
 _SAMPLED_LINES = 300
-"""Lines by which the separator of cells is chosen."""
+"""Number of lines from which the separator of cells is determined."""
 _NUMBERS_AT_START = re.compile(r"\s*[\"']?[-+]?\.?\d")
 _WORD = re.compile(r"[^\W\d_]{3}")
 
@@ -129,7 +129,7 @@ def open_test_as_utf8(path: Path, encoding: str | None = None) -> Iterator[tuple
         encoding: see `open_as_utf8`.
 
     Yields:
-        The file with the text, and the number to add to its rows to get those of the file.
+        The file with the text, and the number to add to its rows to get the rows of the file.
 
     Raises:
         UsageError: if the test does not exist.
@@ -162,11 +162,11 @@ def read_excel_cells(path: Path, sheet: str | None, rows: int | None) -> tuple[p
 
     Args:
         path: path of a file or a test.
-        sheet: name of the sheet; None takes that of the test, or the first one.
+        sheet: name of the sheet; None takes the sheet of the test, or the first one.
         rows: largest number of rows to read; None reads all.
 
     Returns:
-        The cells, and the number to add to their rows to get those of the sheet.
+        The cells, and the number to add to their rows to get the rows of the sheet.
     """
     test = find_test(path)
     if test is None:
@@ -207,7 +207,7 @@ def _find_tests_of_version(file: Path, modified_ns: int, size: int) -> tuple[Pla
         places = [("", "", section, delimiter) for section in sections]
     else:
         return ()
-    similar, n_short = select_similar([section for _, _, section, _ in places])
+    similar, n_short = select_tests([section for _, _, section, _ in places])
     if not similar:
         return _join_sheets(places)
     vessels = {places[k][2].vessel for k in similar}

@@ -34,13 +34,16 @@ _MAX_RESTART_SHARE = 0.02
 _WRAP_LENGTHS = (2.0**16, 2.0**24, 2.0**32, 43_200.0, 86_400.0, 604_800.0)
 """Range of counters, and of times of the day and of the week in s."""
 _WRAP_UNITS = (1e-6, 1e-3, 1.0, 1e3)
+"""Factors from these ranges to the times of a file, such as 1e-6 for a counter of microseconds in s
+and 1e3 for times of the day in ms."""
 _MAX_WRAP_STEPS = 5.0
 """Largest step in median steps at the overflow of a counter."""
 _MIN_SIDE_COLUMNS = 3
-"""Fewest columns of a table that stands beside another one."""
+"""Fewest columns of a table to the right of another one."""
 _MIN_COMMON_NAMES = 0.6
-"""Smallest share of common column names (Jaccard index) of tests that are read alike."""
+"""Smallest share of common column names (Jaccard index) of tests with the same layout."""
 _MAX_TITLE_LENGTH = 60
+"""Length to which titles are truncated, since a title becomes part of the name of a log."""
 _COMMENT_SIGNS = ("#", "%", "//")
 _CLOCK_TIME = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:[.,]\d+)?)")
 
@@ -354,13 +357,13 @@ def _is_overflow(before: float, after: float, step: float) -> bool:
     )
 
 
-def select_similar(sections: Sequence[Section]) -> tuple[list[int], int]:
+def select_tests(sections: Sequence[Section]) -> tuple[list[int], int]:
     """Select the tests among sections: those with the most frequent column names.
 
     Returns:
         The indices of the tests, and the number of shorter sections with the same names. There is
-        no test if other sections are as many, which may be parts of the same tests, or if the only
-        section is the whole table.
+        no test if another group of similar sections is equally large, because its sections may be
+        parts of the same tests, or if the only section is the whole table.
     """
     long = [k for k, section in enumerate(sections) if section.is_long]
     groups = [[k for k in long if are_similar(sections[i].names, sections[k].names)] for i in long]

@@ -18,8 +18,8 @@ from residnet.io.header_vocabulary import parse_name
 _SCAN_BYTES = 1 << 20
 """Size in bytes of the blocks in which a file is searched for bytes that are not UTF-8."""
 HEAD_BYTES = 1 << 16
-"""Number of bytes at the start from which the format is detected, and at the end for the last line.
-"""
+"""Number of bytes at the start of a file in which its format is detected, and at its end in which
+the last line is read."""
 # longer marks first: the mark of UTF-32 (little endian) starts with that of UTF-16
 _BYTE_ORDER_MARKS = {
     codecs.BOM_UTF8: "utf-8",
@@ -57,6 +57,7 @@ def detect_encoding(path: Path) -> str:
     sample = b"\n".join(list(foreign_lines)[:_MAX_ENCODING_LINES])
     candidates: list[tuple[int, float, int]] = []
     for match in from_bytes(sample, cp_isolation=list(_ENCODINGS), preemptive_behaviour=False):
+        # the vocabulary of column names maps their words to concepts such as rudder or speed
         cells = {cell for line in str(match).splitlines() for cell in re.split(r"[,;|\t]", line)}
         n_concepts = sum(len(parse_name(cell).concepts) for cell in cells if not cell.isascii())
         # encodings that give the same text are one match

@@ -40,7 +40,7 @@ _CLOCK = (
     # Italian and Finnish exports write 08.30.00
     r"(?P<hour>\d{1,2})\s*(?:[:h時]|\.(?=\d\d\.\d\d))\s*(?P<minute>\d{1,2})\s*"
     r"(?:(?:[:分']|(?<=\.\d\d)\.)\s*(?P<second>\d{1,2})(?:[.,:](?P<fraction>\d+))?秒?)?"
-    r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
+    r"\s*(?P<am_pm>[AaPp]\.?[Mm]\.?)?"
 )
 _DATETIME_PATTERN = (
     rf"^\s*(?:{_DATE}(?:[T ,_;]+|$))?(?:{_CLOCK})?\s*(?P<zone>Z|UTC|GMT|[+-]\d{{2}}:?\d{{2}})?\s*$"
@@ -206,7 +206,7 @@ def _order_from_parts(cells: pd.DataFrame) -> DateOrder | None:
         return "dmy"
     if (first_part.astype(int) > 12).any():
         return "dmy"
-    if (second_part.astype(int) > 12).any() or cells["half"].notna().any():
+    if (second_part.astype(int) > 12).any() or cells["am_pm"].notna().any():
         return "mdy"
     return None
 
@@ -296,7 +296,7 @@ def _parse_digits(cells: pd.Series, default_unit: str) -> TimeStamps:
     parts = cells.str.extract(_NUMBER_PATTERN)
     is_not_number = parts["whole"].isna().to_numpy()
     if is_not_number.any():
-        # numbers with exponents: their digits are not those of a clock
+        # digits of a number with an exponent cannot be split at its decimal point
         numeric_values = pd.to_numeric(cells, errors="coerce").to_numpy(
             dtype=np.float64, na_value=np.nan
         )
@@ -323,8 +323,8 @@ def _parse_datetimes(cells: pd.Series, zone: str | None, order: DateOrder | None
     )
     # remove each column of text as soon as its numbers exist, to save memory
     hour = convert_per_text(parts.pop("hour"), int, missing="0")
-    if parts["half"].notna().any():
-        half_day = parts["half"].astype("string").fillna("").str.lower().str.slice(0, 1)
+    if parts["am_pm"].notna().any():
+        half_day = parts["am_pm"].astype("string").fillna("").str.lower().str.slice(0, 1)
         hour = np.where(half_day == "p", hour % 12 + 12, np.where(half_day == "a", hour % 12, hour))
     whole_seconds = hour * 3_600
     del hour
@@ -458,7 +458,8 @@ def _parse_fractions(
     )
     starts_with_zero = convert_per_text(column, lambda text: text.startswith("0"), missing="0")
     n_leading_zeros = int(((starts_with_zero == 1) & (digit_count > 1)).sum())
-    # where zeros are printed, one fraction in ten starts with one
+    # Where zeros are printed, about one fraction in ten starts with a zero. If none of at least a
+    # hundred does, they were not printed.
     is_undecided = n_backward_integers == n_backward_printed and (
         n_backward_printed > 0 or n_leading_zeros > 0 or whole_seconds.size < 100
     )

@@ -179,7 +179,7 @@ def commands_from_demand(specs: Sequence[CommandSpec], drive: Tensor, steer: Ten
     no_demand = torch.zeros_like(steer)
     demand = {"drive": drive, "steer": steer, "dive": no_demand, "roll": no_demand}
     shares = [
-        demand[spec.demand_axis].clamp(spec.min_share, 1.0) * spec.max_value for spec in specs
+        demand[spec.demand_axis].clamp(spec.min_demand, 1.0) * spec.max_value for spec in specs
     ]
     return torch.stack(shares, dim=-1)
 

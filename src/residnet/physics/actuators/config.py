@@ -278,14 +278,13 @@ class CommandSpec(NamedTuple):
         demand_axis: normalised demand of a manoeuvre that sets it; manoeuvres demand no roll, so
             that stabiliser fins stay amidships.
         max_value: value at a demand of 1.
-        min_share: minimum demand as a share of the maximum; 0 for actuators that act in one
-            direction only, otherwise -1.
+        min_demand: smallest demand; 0 for actuators that act in one direction only, otherwise -1.
     """
 
     name: str
     demand_axis: Literal["drive", "steer", "dive", "roll"]
     max_value: float
-    min_share: float = -1.0
+    min_demand: float = -1.0
 
 
 RUDDER_INPUTS = ("cmd_delta", "delta")

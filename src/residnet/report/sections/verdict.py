@@ -249,7 +249,7 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         f"Mean of {format_count(windows, 'free run')} on {run.report_data_name}"
         f" ({run.main_protocol})"
         + (
-            "; small: 95 % prediction interval of the mean of as many new free runs."
+            "; small print: 95 % prediction interval of the mean of equally many new free runs."
             if has_intervals
             else "."
         ),

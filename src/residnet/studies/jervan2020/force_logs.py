@@ -98,7 +98,7 @@ class MeasuredForceLogs:
     Attributes:
         names: names of the logs.
         record: motion and commanded force, smoothed according to `prepare`; NaN where masked. Its
-            folds are the segments.
+            `fold` is the segment of the inner cross-validation.
         forces: `commanded` and `actual` forces [N, 3].
         usable: samples for fit and evaluation [N] bool.
         fold_index: fold of the outer cross-validation [N].
@@ -236,14 +236,14 @@ def read_force_logs(
         n_segments_total += n_segments
         # commands hold their last value over gaps, and are zero before the first
         filled_commands = (
-            pd.DataFrame(log.rate_inputs[:, : PLANAR_LAYOUT.n_dof]).ffill().fillna(0.0)
+            pd.DataFrame(log.regression_inputs[:, : PLANAR_LAYOUT.n_dof]).ffill().fillna(0.0)
         )
         commands.append(torch.from_numpy(np.array(filled_commands)))
         shares = {reason: float(mask.mean()) for reason, mask in log.log.masks.items()}
         masked[name] = {reason: share for reason, share in shares.items() if share}
     smooth, nu_dot, measured, usable = (
         torch.from_numpy(np.concatenate([getattr(log, attribute) for log in logs]))
-        for attribute in ("smoothed", "nu_dot", "rate_inputs", "trainable")
+        for attribute in ("smoothed", "nu_dot", "regression_inputs", "trainable")
     )
     fold = torch.cat(segments)
     accelerations: dict[str, Tensor] = {}
@@ -254,16 +254,16 @@ def read_force_logs(
         acceleration = compare_accelerations(nu_dot[usable], sensed[usable], fold[usable])
     command = torch.cat(commands)
     record = ForceRecord(
-        step * torch.arange(len(fold), dtype=torch.float64),
-        smooth[:, POSE],
-        smooth[:, VELOCITIES],
-        nu_dot,
-        command,
-        command,
-        fold,
-        usable,
-        (0.0,) * 9,
-        tuple(lengths),
+        t=step * torch.arange(len(fold), dtype=torch.float64),
+        pose=smooth[:, POSE],
+        nu=smooth[:, VELOCITIES],
+        nu_dot=nu_dot,
+        command=command,
+        averaged_command=command,
+        fold=fold,
+        is_training=usable,
+        noise=(0.0,) * 9,
+        run_lengths=tuple(lengths),
     )
     return MeasuredForceLogs(
         tuple(names),
@@ -335,7 +335,7 @@ def compare_forces(measured: MeasuredForceLogs) -> dict[str, Any]:
     commanded = record.command[usable]
     lagged_force = lagged_command[usable]
     force_variance = (actual - actual.mean(0)).square().mean(0)
-    unexplained, unexplained_late = (
+    unexplained, unexplained_with_lag = (
         (actual - force).square().mean(0) / force_variance for force in (commanded, lagged_force)
     )
     gain = (lagged_force * actual).sum(0) / lagged_force.square().sum(0).clamp(min=1e-300)
@@ -343,7 +343,7 @@ def compare_forces(measured: MeasuredForceLogs) -> dict[str, Any]:
         "rms_commanded": commanded.square().mean(0).sqrt(),
         "rms_actual": actual.square().mean(0).sqrt(),
         "explained": 1 - unexplained,
-        "explained_with_lag": 1 - unexplained_late,
+        "explained_with_lag": 1 - unexplained_with_lag,
         "gain_with_lag": gain,
     }
     for axis, name in enumerate(AXES):
