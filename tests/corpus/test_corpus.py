@@ -97,7 +97,7 @@ def read_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("omit_currents", "read_once")
 @pytest.mark.parametrize("name", FOLDERS)
-def test_a_layout_is_read_and_told_for_what_it_is(name: str, tmp_path: Path) -> None:
+def test_read_logs_of_a_layout_equals_its_truth(name: str, tmp_path: Path) -> None:
     case, folder = case_in(name, tmp_path)
     said = {"told": "", "drafted": ""}
     if {"drafted", "refused"} & {*case}:
@@ -131,7 +131,7 @@ def test_a_layout_is_read_and_told_for_what_it_is(name: str, tmp_path: Path) -> 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", FOLDERS)
-def test_a_layout_is_fitted_and_judged(name: str, tmp_path: Path) -> None:
+def test_fit_and_evaluation_of_a_layout_are_finite(name: str, tmp_path: Path) -> None:
     case, folder = case_in(name, tmp_path)
     if "refused" in case and "answers" not in case:
         pytest.skip("cannot be fitted, as the test of its doors says")

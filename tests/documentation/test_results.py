@@ -13,7 +13,7 @@ import results
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_every_figure_names_a_source_that_exists() -> None:
+def test_figures_of_all_pages_name_existing_sources() -> None:
     origins = [origin for page in results.list_pages() for origin, _ in results.find_figures(page)]
     assert len(origins) > 40
     for origin in origins:
@@ -26,7 +26,7 @@ def test_every_figure_names_a_source_that_exists() -> None:
         assert (ROOT / command[0]).is_file(), command
 
 
-def test_figures_are_read_from_runs_and_put_into_pages(tmp_path: Path) -> None:
+def test_rewrite_page_inserts_figures_of_runs(tmp_path: Path) -> None:
     run = tmp_path / "quickstart"
     run.mkdir()
     rows = [{"model": "a", "value": 1}, {"model": "b", "value": [0.123456, 2.0]}]
@@ -42,7 +42,7 @@ def test_figures_are_read_from_runs_and_put_into_pages(tmp_path: Path) -> None:
         results.read_figure("quickstart metrics.json rows[model=c].value", tmp_path)
 
 
-def test_what_ran_stands_in_the_pages_and_what_did_not_is_named(
+def test_main_rewrites_figures_of_finished_runs_and_names_others(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     made = {name: (str(tmp_path / f"{name}.py"), "7") for name in ("good", "bad", "long", "other")}

@@ -66,7 +66,7 @@ def case() -> tuple[Tensor, Tensor, Tensor]:
     return x0, torch.randn(3, 300, 1, generator=random, dtype=torch.float64), x0[:, :0]
 
 
-def test_numbers_and_gradients_are_the_same_after_a_step_of_the_optimiser_too() -> None:
+def test_trace_rollout_equals_rollout_after_parameters_change() -> None:
     rollout = Rollout(Pendulum())
     run = trace_rollout(rollout, 300)
     assert run is not rollout
@@ -82,7 +82,7 @@ def test_numbers_and_gradients_are_the_same_after_a_step_of_the_optimiser_too() 
     assert not torch.equal(other, before)
 
 
-def test_models_of_one_structure_are_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compile_rollout_shares_code_of_equal_structures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(free_runs, "_COMPILED", {})
     loops = [Rollout(Pendulum()) for _ in range(2)]
     with torch.no_grad():
@@ -97,7 +97,7 @@ def test_models_of_one_structure_are_compiled_once(monkeypatch: pytest.MonkeyPat
     assert len(free_runs._COMPILED) == 2
 
 
-def test_what_is_drawn_does_not_hang_on_what_ran_before(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compile_rollout_does_not_advance_random_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first run tries to compile the step, in vain, for it draws numbers."""
     monkeypatch.setattr(free_runs, "_COMPILED", {})
     x0, w, s = case()
@@ -109,7 +109,7 @@ def test_what_is_drawn_does_not_hang_on_what_ran_before(monkeypatch: pytest.Monk
     assert torch.equal(*found)
 
 
-def test_a_step_that_cannot_be_recorded_runs_as_it_is() -> None:
+def test_trace_rollout_of_python_branches_equals_rollout() -> None:
     x0, w, s = torch.ones(1, 2), torch.ones(1, 300, 1), torch.zeros(1, 0)
     for sign in (1.0, -1.0):
         undecided = Rollout(Undecided())
@@ -117,6 +117,6 @@ def test_a_step_that_cannot_be_recorded_runs_as_it_is() -> None:
         assert torch.equal(trace_rollout(undecided, TRAINING_STEPS)(sign * x0, w, s)[0], expected)
 
 
-def test_a_short_rollout_is_not_recorded() -> None:
+def test_trace_rollout_of_few_steps_returns_the_rollout() -> None:
     short = Rollout(Pendulum())
     assert trace_rollout(short, 10) is short

@@ -85,7 +85,7 @@ def values(table: DerivativesFile) -> dict[str, float]:
     return {row.name: row.value for row in table.rows}
 
 
-def test_derivatives_of_a_known_force_are_returned() -> None:
+def test_compute_derivatives_of_a_known_force() -> None:
     found = values(derive(order=3))
     # u v contributes U to the first order
     assert found["Y_v"] == pytest.approx(-300.0 - 200.0 * SHIP.speed)
@@ -99,7 +99,7 @@ def test_derivatives_of_a_known_force_are_returned() -> None:
     assert "Y_vvr" not in found, "a coefficient of zero is not listed"
 
 
-def test_prime_values_are_forces_over_their_units() -> None:
+def test_compute_derivatives_prime_values_are_forces_over_units() -> None:
     table = derive()
     row = next(row for row in table.rows if row.name == "N_r")
     unit = 0.5 * 1000.0 * SHIP.length**4 * SHIP.speed
@@ -108,14 +108,14 @@ def test_prime_values_are_forces_over_their_units() -> None:
     assert row.unit == "kg m^2 s^-1"
 
 
-def test_operating_point_balances_the_resistance() -> None:
+def test_compute_derivatives_operating_point_balances_resistance() -> None:
     table = derive()
     assert table.operating_point["n"] == pytest.approx(60.0 * SHIP.speed / 8.0)
     assert table.operating_point["delta"] == 0.0
     assert table.surge_imbalance == pytest.approx(0.0, abs=1e-12)
 
 
-def test_full_scale_keeps_prime_values_and_scales_si_values() -> None:
+def test_compute_derivatives_scale_keeps_prime_values() -> None:
     model = derive()
     ship = derive(scale=50.0, density_ratio=1.025)
     for row, full_row in zip(model.rows, ship.rows, strict=True):
@@ -127,7 +127,7 @@ def test_full_scale_keeps_prime_values_and_scales_si_values() -> None:
     assert ship.mass_matrix[2][2] == pytest.approx(model.mass_matrix[2][2] * 1.025 * 50.0**5)
 
 
-def test_scaled_simulation_agrees_with_scaled_derivatives() -> None:
+def test_compute_derivatives_scale_follows_froude_law() -> None:
     """The full-scale forces of scaled motion are those of the model, scaled by Froude's law."""
     scale = 50.0
     model = derive(order=3)
@@ -148,7 +148,7 @@ def test_scaled_simulation_agrees_with_scaled_derivatives() -> None:
     )
 
 
-def test_without_masses_derivatives_are_those_of_accelerations() -> None:
+def test_compute_derivatives_without_masses_are_of_accelerations() -> None:
     table = derive(particulars=Particulars(length=7.0, speed=1.2))
     theta = theta_of(FORCES)
     found = values(table)
@@ -158,7 +158,7 @@ def test_without_masses_derivatives_are_those_of_accelerations() -> None:
     assert "Give mass, beam and draught" in " ".join(table.remarks)
 
 
-def test_intervals_cover_the_true_derivatives() -> None:
+def test_compute_derivatives_intervals_cover_the_truth() -> None:
     truth = values(derive())
     rng = np.random.default_rng(3)
     config = RegressorsConfig(terms=TERMS)
@@ -188,18 +188,33 @@ def test_intervals_cover_the_true_derivatives() -> None:
     assert 0.90 <= n_covered / n_intervals <= 0.99
 
 
-def test_correlation_is_that_of_the_listed_first_order_rows() -> None:
-    spec, model = model_of(theta_of(FORCES))
-    n_free = len(model.baseline.free_indices())
-    factor = np.random.default_rng(1).normal(size=(n_free, n_free)) * 1e-3
-    table = compute_derivatives(spec, model, SHIP, covariance=(factor @ factor.T).tolist())
+def test_compute_derivatives_correlation_equals_propagated_covariance() -> None:
+    theta = theta_of(FORCES)
+    spec, model = model_of(theta)
+    free = model.baseline.free_indices().tolist()
+    # a covariance of rank four, so that four differences give the covariance of the derivatives
+    factor = np.random.default_rng(1).normal(size=(len(free), 4)) * 1e-3
+    covariance = factor @ factor.T
+    table = compute_derivatives(spec, model, SHIP, covariance=covariance.tolist())
     assert table.correlation is not None
-    matrix = np.array([*table.correlation.values()])
-    np.testing.assert_allclose(np.diag(matrix), 1.0, atol=1e-4)
-    np.testing.assert_allclose(matrix, matrix.T, atol=1e-9)
+    names = [*table.correlation]
+    assert {"Y_v", "Y_r", "N_v", "N_r", "N_delta"} <= set(names)
+    # the derivatives are linear in the coefficients, so that differences are exact
+    before = values(table)
+    changes = np.zeros((len(names), factor.shape[1]))
+    for j, direction in enumerate(factor.T):
+        changed = theta.flatten().clone()
+        changed[free] += torch.from_numpy(direction)
+        after = values(derive(changed.reshape(theta.shape)))
+        changes[:, j] = [after[name] - before[name] for name in names]
+    propagated = changes @ changes.T
+    deviation = np.sqrt(np.diag(propagated))
+    expected = propagated / np.outer(deviation, deviation)
+    assert np.abs(expected - np.eye(len(names))).max() > 0.3
+    np.testing.assert_allclose([*table.correlation.values()], expected, atol=1e-4)
 
 
-def test_speed_outside_training_range_is_remarked() -> None:
+def test_compute_derivatives_remarks_speed_outside_training_range() -> None:
     table = derive(particulars=Particulars(length=7.0, speed=3.0))
     assert "outside the training range" in table.remarks[0]
 
@@ -207,18 +222,20 @@ def test_speed_outside_training_range_is_remarked() -> None:
 @pytest.mark.parametrize(
     ("key", "value"), [("order", 4), ("scale", 0.0), ("density_ratio", float("nan"))]
 )
-def test_invalid_setting_is_refused_by_name(key: str, value: float) -> None:
+def test_compute_derivatives_refuses_invalid_settings(key: str, value: float) -> None:
     settings: dict[str, Any] = {key: value}
     with pytest.raises(UsageError, match=key):
         derive(**settings)
 
 
-def test_covariance_of_another_size_is_refused() -> None:
+def test_compute_derivatives_refuses_covariance_of_another_size() -> None:
     with pytest.raises(UsageError, match="covariance"):
         derive(covariance=[[1.0]])
 
 
-def test_command_writes_derivatives_of_a_run(command: Any, tiny_run: Path, tmp_path: Path) -> None:
+def test_derivatives_command_writes_derivatives_of_a_run(
+    command: Any, tiny_run: Path, tmp_path: Path
+) -> None:
     file = tmp_path / "derivatives.json"
     words = ("--length", "4.88 m", "--speed", "1.2 m/s", "--out", file)
     result = command("derivatives", tiny_run, *words)

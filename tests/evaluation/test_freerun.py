@@ -349,7 +349,7 @@ def test_windows_run_together_as_they_run_alone(
     windows = [window(i % 2, i, i + length, past=max(i - 3, 0)) for i, length in enumerate(lengths)]
     alone = [ran(model, [one], ready)[0].states for one in windows]
     for largest in (30_000_000, 1_000):
-        monkeypatch.setattr(freerun, "_MAX_BATCH_NUMBERS", largest)
+        monkeypatch.setattr(freerun, "_MAX_BATCH_VALUES", largest)
         for one, other, length in zip(ran(model, windows, ready), alone, lengths, strict=True):
             assert one.states.shape == (length, 6)
             np.testing.assert_allclose(one.states, other, rtol=1e-9, atol=1e-9)

@@ -36,7 +36,9 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.long
-def test_a_fit_from_disk_is_the_fit_from_memory(few: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fit_models_from_disk_equals_fit_from_memory(
+    few: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     settings = settings_of(heads={"plsr": {"kind": "plsr"}, "ridge": {"kind": "ridge"}})
     read = read_split_logs(DATA)
     on_disk = {split: [log.move_to_disk() for log in logs] for split, logs in read.items()}
@@ -64,7 +66,7 @@ def test_a_fit_from_disk_is_the_fit_from_memory(few: None, monkeypatch: pytest.M
 @pytest.mark.parametrize(
     "estimator", [LeastSquares((0.0, 1e-3)), Ridge((1e-6, 1e-2)), PLSR()], ids=lambda e: type(e)
 )
-def test_pieces_give_what_the_whole_does(few: None, estimator: Estimator) -> None:
+def test_estimator_fit_in_chunks_equals_fit_at_once(few: None, estimator: Estimator) -> None:
     generator = torch.Generator().manual_seed(5)
     z = torch.randn(900, 3, generator=generator, dtype=torch.float64)
 
@@ -86,7 +88,7 @@ def test_pieces_give_what_the_whole_does(few: None, estimator: Estimator) -> Non
         )
 
 
-def test_a_very_long_log_is_prepared_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_split_long_log_returns_consecutive_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("residnet.identification.prepared._MAX_SAMPLES", 400)
     log = Log("trip", np.arange(1000.0), {"u": np.arange(1000.0)})
     parts = split_long_log(log)
@@ -95,7 +97,7 @@ def test_a_very_long_log_is_prepared_in_parts(monkeypatch: pytest.MonkeyPatch) -
     assert split_long_log(parts[0]) == [parts[0]]
 
 
-def test_arrays_on_disk_keep_their_values_when_memory_is_given_back() -> None:
+def test_release_pages_keeps_values() -> None:
     values = np.random.default_rng(0).normal(size=(1000, 3))
     kept = paged.copy_to_disk(values)
     paged.release_pages()
@@ -114,7 +116,7 @@ def pages() -> int:
 
 
 @LINUX
-def test_pages_are_given_back_while_others_work(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page_releaser_limits_resident_pages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paged, "_MAX_RESIDENT_BYTES", 1 << 24)
     before = pages()
     values = paged.allocate_on_disk((1 << 23,))
@@ -126,7 +128,7 @@ def test_pages_are_given_back_while_others_work(monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_array_equal(values[:: 1 << 18], np.arange(0, values.size, 1 << 18))
 
 
-def test_chosen_rows_of_many_lie_in_a_file(few: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_take_rows_of_many_is_memory_mapped(few: None, monkeypatch: pytest.MonkeyPatch) -> None:
     placed = Mock(wraps=paged.allocate_on_disk)
     monkeypatch.setattr(paged, "allocate_on_disk", placed)
     values = torch.arange(3000.0, dtype=torch.float64).reshape(1000, 3)
@@ -139,7 +141,7 @@ def test_chosen_rows_of_many_lie_in_a_file(few: None, monkeypatch: pytest.Monkey
 
 
 @LINUX
-def test_a_look_at_each_item_holds_the_pages_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page_releasing_list_holds_pages_of_one_item(monkeypatch: pytest.MonkeyPatch) -> None:
     def most(items: list[np.ndarray]) -> int:
         paged.release_pages()
         before = pages()

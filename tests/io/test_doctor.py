@@ -196,7 +196,7 @@ def test_inspect_log_reports_a_planted_fault_with_figures(
         assert found[0].sample_mask.shape == log.t.shape
 
 
-def test_every_check_above_a_note_is_tested() -> None:
+def test_checks_above_a_note_have_planted_faults() -> None:
     # groups of causes are named one by one
     named = {"position_causes", "yaw_causes", "contradicts", "extrapolation"}
     # tests/io/test_feedback.py
@@ -262,7 +262,7 @@ def test_estimate_position_causes_separates_clocks(boat: str, delays: tuple[floa
         (0.4 * np.sin(0.17 * T), "heading (correlation"),
     ],
 )
-def test_a_sway_velocity_that_does_not_follow_is_no_wrong_heading(
+def test_check_sway_reports_unrelated_sway_and_no_heading_offset(
     values: np.ndarray, place: str
 ) -> None:
     report = inspect_log(changed(v=values))
@@ -404,7 +404,7 @@ def test_check_rudder_sign_and_delay_of_the_response() -> None:
 
 
 @pytest.mark.parametrize("has_few_digits", [True, False])
-def test_few_printed_digits_are_neither_frozen_nor_interpolated(
+def test_frozen_and_interpolated_checks_accept_few_printed_digits(
     monkeypatch: pytest.MonkeyPatch, *, has_few_digits: bool
 ) -> None:
     random = np.random.default_rng(3)

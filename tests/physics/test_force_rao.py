@@ -96,7 +96,7 @@ def _table_error(
 
 
 @pytest.mark.parametrize("range_deg", [180.0, 345.0])
-def test_every_component_at_the_nodes_of_the_table_is_the_pressure_integral(
+def test_read_wamit_excitation_equals_pressure_integral_at_nodes(
     tmp_path: Path, range_deg: float
 ) -> None:
     """Unit length, axes, phase and the mirror of the directions, for each mode by itself."""
@@ -107,7 +107,7 @@ def test_every_component_at_the_nodes_of_the_table_is_the_pressure_integral(
     np.testing.assert_array_less(np.abs(error).max(axis=(0, 1)), 1e-8 * scale)
 
 
-def test_interpolation_converges_with_the_steps_of_the_table(tmp_path: Path) -> None:
+def test_fourier_coefficients_converge_with_the_steps_of_the_table(tmp_path: Path) -> None:
     """The error is of second order in the frequency, and in the direction it is one of aliasing:
     orders beyond half the number of directions, which occur above k L / 2 of about this order.
     """
@@ -132,9 +132,7 @@ def test_interpolation_converges_with_the_steps_of_the_table(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("range_deg", [180.0, 355.0])
-def test_table_of_a_box_gives_the_loads_of_the_closed_form(
-    tmp_path: Path, range_deg: float
-) -> None:
+def test_waves_of_a_table_equal_the_closed_form_of_a_box(tmp_path: Path, range_deg: float) -> None:
     """In steps of 15 deg, sway is wrong by 3.3 % and yaw by 2.9 %: waves shorter than a third of
     the hull need orders above 12 in the direction. In steps of 5 deg only the interpolation in
     frequency remains.
@@ -162,7 +160,7 @@ def test_table_of_a_box_gives_the_loads_of_the_closed_form(
     assert float(error.max()) < 1e-3
 
 
-def test_directions_that_do_not_resolve_the_loads_are_refused(tmp_path: Path) -> None:
+def test_waves_build_refuses_coarse_directions(tmp_path: Path) -> None:
     path = _write_table(tmp_path / "box.3", np.arange(0.0, 181.0, 30.0))
     config = ForceRaoConfig(file=path, unit_length=LENGTH)
     with pytest.raises(ConfigError, match=r"steps of 30 deg do not resolve .* in steps of 15 deg"):
@@ -186,7 +184,7 @@ def _trials(waves: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def test_trials_of_a_vessel_in_the_waves_of_a_table(tmp_path: Path) -> None:
+def test_simulate_trials_in_waves_of_a_table(tmp_path: Path) -> None:
     """The compiled plant moves in the loads of the table as in those of the box."""
     path = _write_table(tmp_path / "box.3", np.arange(0.0, 181.0, 5.0))
     logs_by_hull = []
@@ -204,7 +202,7 @@ def test_trials_of_a_vessel_in_the_waves_of_a_table(tmp_path: Path) -> None:
             assert deviation < 2e-3 * np.ptp(reference[channel])
 
 
-def test_a_run_records_the_checksum_of_the_table_and_refuses_a_changed_one(tmp_path: Path) -> None:
+def test_simulate_run_records_the_checksum_of_the_table(tmp_path: Path) -> None:
     path = _write_table(tmp_path / "box.3", np.arange(0.0, 181.0, 10.0), 80)
     waves = {"force_rao": {"file": str(path), "unit_length": LENGTH}}
     content = {"task": "simulate", "name": "waves", "data": _trials(waves)}
@@ -228,14 +226,16 @@ def test_a_run_records_the_checksum_of_the_table_and_refuses_a_changed_one(tmp_p
         ("8 0 1 1 0 1 0\n8 0 1 1 0 2 0\n", "row 2: mode 1 at period 8 s"),
     ],
 )
-def test_invalid_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_read_wamit_excitation_refuses_invalid_tables(
+    tmp_path: Path, text: str, message: str
+) -> None:
     path = tmp_path / "hull.3"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=message):
         read_wamit_excitation(path, LENGTH, SPECIFIC_WEIGHT)
 
 
-def test_uneven_directions_and_a_short_table_are_refused(tmp_path: Path) -> None:
+def test_read_wamit_excitation_refuses_uneven_and_short_tables(tmp_path: Path) -> None:
     path = _write_table(tmp_path / "uneven.3", np.array([0.0, 20.0, 90.0]))
     with pytest.raises(ConfigError, match="expected equal steps from 0 deg"):
         read_wamit_excitation(path, LENGTH, SPECIFIC_WEIGHT)

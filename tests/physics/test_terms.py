@@ -36,7 +36,7 @@ READ: dict[str, tuple[tuple[Any, ...], ...]] = {
 
 
 @pytest.mark.parametrize("term", READ)
-def test_parse(term: str) -> None:
+def test_parse_term_returns_factors(term: str) -> None:
     assert parse_term(term, NAMES) == tuple(Factor(*factor) for factor in READ[term])
 
 
@@ -62,13 +62,13 @@ def test_parse(term: str) -> None:
         ("cos(u)^-1 v", r"cannot divide by cos\(u\)"),
     ],
 )
-def test_what_cannot_be_read_is_one_line(term: str, message: str) -> None:
+def test_parse_term_refuses_invalid_terms(term: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
         parse_term(term, NAMES)
     assert "\n" not in str(caught.value)
 
 
-def test_functions_can_be_forbidden() -> None:
+def test_parse_term_without_functions_refuses_them() -> None:
     with pytest.raises(ConfigError, match="only products of channels"):
         parse_term("u sin(v)", NAMES, functions=False)
 
@@ -98,7 +98,7 @@ LIBRARIES: dict[str, tuple[list[str], list[np.ndarray]]] = {
 
 
 @pytest.mark.parametrize("name", LIBRARIES)
-def test_a_library_equals_numpy_with_its_derivatives(name: str) -> None:
+def test_term_library_equals_numpy(name: str) -> None:
     terms, truth = LIBRARIES[name]
     z = torch.from_numpy(np.stack((U, V, R, N, D), axis=-1))
     wanted = np.stack(truth, axis=-1)
@@ -111,7 +111,7 @@ def test_a_library_equals_numpy_with_its_derivatives(name: str) -> None:
     np.testing.assert_allclose(single, wanted, rtol=3e-5, atol=1e-6)
 
 
-def test_a_library_of_nothing_has_no_columns() -> None:
+def test_term_library_without_terms_has_no_columns() -> None:
     assert TermLibrary([], NAMES)(torch.randn(4, 2, 5)).shape == (4, 2, 0)
 
 
@@ -126,7 +126,7 @@ def test_a_library_of_nothing_has_no_columns() -> None:
         ([0.0] * 5, ["sqrt(u)", "ssqrt(v)", "inv(r)"], [0.0] * 3),
     ],
 )
-def test_division_and_roots_leave_gradients_finite_at_zero(
+def test_term_library_gradients_are_finite_at_zero(
     z: list[float], terms: list[str], expected: list[float]
 ) -> None:
     at = torch.tensor([z], dtype=torch.float64, requires_grad=True)
@@ -135,7 +135,7 @@ def test_division_and_roots_leave_gradients_finite_at_zero(
     assert bool(torch.isfinite(torch.autograd.grad(out.sum(), at)[0]).all())
 
 
-def test_polynomials_are_all_products_once() -> None:
+def test_make_polynomial_terms_returns_each_product_once() -> None:
     names = ("u", "v", "r")
     terms = make_polynomial_terms(names, 3, magnitudes=("u", "r"))
     # binomial(3 + 3, 3) - 1 products, then the magnitudes
@@ -156,7 +156,7 @@ def terms_of(names: Sequence[str], **config: Any) -> set[str]:
     return {c.term for c in CandidatesConfig(**config).generate_candidates(tuple(names))}
 
 
-def test_motions_with_magnitudes() -> None:
+def test_generate_candidates_of_motions_with_magnitudes() -> None:
     cubic = {"u^3", "u^2 v", "u v^2", "v^3"}
     plain = {"1", "u", "v", "u^2", "u v", "v^2"} | cubic
     assert terms_of("uv", inputs=(), magnitudes=False) == plain
@@ -167,7 +167,7 @@ def test_motions_with_magnitudes() -> None:
     assert terms_of("uv", inputs=(), input_degree=1) == (plain | sized) - cubic
 
 
-def test_jets_have_every_term_of_the_document_by_degree_then_by_effort() -> None:
+def test_generate_candidates_of_jets_are_those_of_the_document() -> None:
     found = JETS.generate_candidates(JET_NAMES)
     place = {c.term: i for i, c in enumerate(found)}
     assert len(found) == len(place) == 49
@@ -185,7 +185,7 @@ def test_jets_have_every_term_of_the_document_by_degree_then_by_effort() -> None
     assert place["u"] < place["sin(nozzle)"]
 
 
-def test_candidates_know_propellers_and_rudders_unless_told_otherwise() -> None:
+def test_generate_candidates_of_propellers_and_rudders() -> None:
     """Thrust of both directions, lift in the flow past the hull and in the propeller's."""
     assert {"tau_x", "tau_n"} <= terms_of(("u", "v", "r", "tau_x", "tau_n"))
     named = terms_of(("u", "tau_x"), inputs=(), extra=("tau_x inv(u)",))
@@ -202,7 +202,7 @@ def test_candidates_know_propellers_and_rudders_unless_told_otherwise() -> None:
     assert {"|r|", "r |r|", "delta |delta|"} <= terms_of(("r", "delta"))
 
 
-def test_nothing_divides_by_what_comes_near_zero() -> None:
+def test_find_nonsingular_terms_excludes_divisors_near_zero() -> None:
     names = ("u", "n", "delta")
     config = CandidatesConfig(extra=("u inv(delta)",))
     terms = [c.term for c in config.generate_candidates(names)]
@@ -219,7 +219,7 @@ def test_nothing_divides_by_what_comes_near_zero() -> None:
     assert kept(z) == {"u inv(delta)"}
 
 
-def test_unknown_channels_are_named() -> None:
+def test_generate_candidates_names_unknown_channels() -> None:
     with pytest.raises(ConfigError, match=r"'nozle' is not a channel.*did you mean 'nozzle'"):
         CandidatesConfig(angles=("nozle",)).generate_candidates(JET_NAMES)
     with pytest.raises(ConfigError, match="no channel 'w'"):

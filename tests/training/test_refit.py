@@ -141,7 +141,7 @@ def with_step(model: HybridDynamics, problem: Problem, place: int, step: float) 
 
 
 @pytest.mark.parametrize("integrator", get_args(Integrator))
-def test_sensitivities_are_those_of_the_rollout(integrator: Integrator) -> None:
+def test_sensitivities_equal_central_differences(integrator: Integrator) -> None:
     """Central differences of the one time loop, heading included: the wind makes it matter."""
     model, problem = windy(integrator, ROLLS)
     assert isinstance(model.baseline, RegressorBaseline)
@@ -176,7 +176,7 @@ def test_sensitivities_are_those_of_the_rollout(integrator: Integrator) -> None:
             torch.testing.assert_close(to_start[..., place], central, rtol=1e-6, atol=1e-8)
 
 
-def test_noisy_starts_teach_no_damping_where_they_are_estimated() -> None:
+def test_refit_with_estimated_starts_reduces_bias_of_noise() -> None:
     """Free runs from exact starts, of models refitted to free runs from noisy ones."""
     logs = trials(count=8, noise=0.06)
     off = {}
@@ -194,7 +194,7 @@ def normal_equations(model: HybridDynamics, problem: Problem) -> tuple[Tensor, T
     return module.normal_equations(model, problem, LEVEL, squares)
 
 
-def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:
+def test_normal_equations_gradient_is_half_that_of_the_cost() -> None:
     """With m the mean square error of a window, d sqrt(m + c^2) = dm / (2 sqrt(m + c^2)); the
     prior's d (t'Pt) = 2 P t: half of both is returned.
     """
@@ -213,7 +213,7 @@ def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:
     assert float(torch.linalg.eigvalsh(hessian)[0]) > 0
 
 
-def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
+def test_normal_equations_hessian_is_half_that_of_the_cost_at_a_perfect_fit() -> None:
     """At a perfect fit without a prior Gauss-Newton is Newton."""
     model, problem = windy()
     assert isinstance(model.baseline, RegressorBaseline)
@@ -238,7 +238,9 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
         assert 2.0 * float(hessian[i, i]) == pytest.approx(curvature, rel=2e-3)
 
 
-def test_a_symmetric_vessel_loses_what_it_cannot_have(smoothed: Sequence[PreparedLog]) -> None:
+def test_refit_with_symmetry_prior_removes_asymmetric_terms(
+    smoothed: Sequence[PreparedLog],
+) -> None:
     free, known, store = fitted(LINEAR, smoothed)
     held = copy.deepcopy(free)
     config = {"horizon": 8.0, "every": 4.0, "prior": 1e-4}
@@ -265,7 +267,7 @@ def test_a_symmetric_vessel_loses_what_it_cannot_have(smoothed: Sequence[Prepare
     ],
     ids=str,
 )
-def test_what_cannot_be_refitted_is_one_line(
+def test_refit_refuses_unusable_data_and_models(
     smoothed: Sequence[PreparedLog], change: Any, error: type[ResidnetError], told: str
 ) -> None:
     model, known, store = fitted(LINEAR, smoothed)
@@ -285,7 +287,7 @@ def test_what_cannot_be_refitted_is_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_a_start_that_diverges_is_brought_near_over_shorter_free_runs(
+def test_refit_of_a_diverging_start_begins_with_short_horizons(
     smoothed: Sequence[PreparedLog],
 ) -> None:
     model, known, store = fitted(LINEAR, smoothed)
@@ -311,7 +313,7 @@ def test_a_start_that_diverges_is_brought_near_over_shorter_free_runs(
     torch.testing.assert_close(theta_of(held).detach(), start, rtol=0, atol=1e-4)
 
 
-def test_one_step_goes_where_a_refit_without_the_logs_goes() -> None:
+def test_estimate_leave_one_out_approximates_refits() -> None:
     logs = trials()[:4]
     config = RefitConfig(horizon=4.0, every=4.0, iterations=4, prior=1e-4)
     model = model_of(LINEAR)
@@ -352,7 +354,7 @@ def test_one_step_goes_where_a_refit_without_the_logs_goes() -> None:
     assert apart < 0.25 * moved
 
 
-def test_one_step_takes_the_fold_out_of_a_strong_prior_too() -> None:
+def test_estimate_leave_one_out_uses_prior_means_of_folds() -> None:
     """The least-squares solution of all logs holds a refit near the logs that are left out."""
     logs = trials(noise=0.05)[:4]
     config = RefitConfig(horizon=4.0, every=4.0, iterations=6, prior=1.0)

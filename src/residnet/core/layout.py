@@ -523,9 +523,11 @@ def to_horizontal_plane(nu: np.ndarray) -> np.ndarray:
     return np.stack((nu[..., 0], nu[..., 1] * cos_roll, nu[..., 2] * cos_roll), axis=-1)
 
 
-ROLLING_LAYOUT = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))
-"""Surge, sway, roll and yaw, without heave and pitch (Gouletas 2020 and its corrections)."""
-SUBMERGED_LAYOUT = StateLayout(
+ROLL_PLANT_LAYOUT = StateLayout(("x", "y", "phi", "psi"), ("u", "v", "p", "r"))
+"""Plants with surge, sway, roll and yaw, in the order of states of Gouletas 2020; models have the
+order of `ROLL_LAYOUT`."""
+SIX_DOF_PLANT_LAYOUT = StateLayout(
     ("x", "y", "z", "phi", "theta", "psi"), ("u", "v", "w", "p", "q", "r")
 )
-"""Six degrees of freedom, z is the depth."""
+"""Plants in six degrees of freedom, in the order of states of Fossen; models have the order of
+`SIX_DOF_LAYOUT`."""

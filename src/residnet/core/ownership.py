@@ -309,8 +309,8 @@ class Manifest:
     def compact(self) -> None:
         """Merge the journal into the manifest, which is replaced in one step.
 
-        Files that no longer exist are left out. An edited file keeps a SHA-256 that it no longer
-        has, unless a nested manifest lists it.
+        Files that no longer exist are left out. An edited file keeps the SHA-256 of its original
+        contents, so that it is recognised as edited, unless a nested manifest lists it.
 
         Raises:
             UsageError: if the manifest is damaged or somebody else's, or cannot be written.
@@ -322,7 +322,7 @@ class Manifest:
             if not os.path.lexists(path):
                 continue
             if None in versions:
-                # a log grows after the end of the work, too
+                # a log may grow even after the command has ended
                 files[name] = None
             elif self._is_owned(path, digests):
                 files[name] = sha256(path)

@@ -215,7 +215,7 @@ class HybridDynamics(Dynamics):
         nu_dot = nu_dot * self.equation_mask.to(nu_dot.dtype)
         if self.has_roll:
             nu_dot = nu_dot + nu @ self.angle_rate_matrix.to(nu.dtype)
-        return with_depth_rate(nu_dot, nu) if self.spatial else nu_dot
+        return with_depth_rate(nu_dot, nu) if self.is_spatial else nu_dot
 
     def integrate_angles(self, x: Tensor, next_state: Tensor) -> Tensor:
         if not self.has_roll:
@@ -223,7 +223,7 @@ class HybridDynamics(Dynamics):
         nu = dynamic_states(x, self.dof)
         next_nu = dynamic_states(next_state, self.dof)
         has_equation = self.equation_mask.to(x.dtype) > 0.0
-        if not self.spatial:
+        if not self.is_spatial:
             # as with the pose, new velocities keep an undamped oscillation bounded
             angles = nu + self.dt * (next_nu @ self.angle_rate_matrix.to(x.dtype))
             return torch.cat((pose(next_state), torch.where(has_equation, next_nu, angles)), dim=-1)

@@ -291,12 +291,12 @@ def load_model(folder: Path) -> tuple[ModelSpec, HybridDynamics]:
     return spec, model.eval()
 
 
-def read_spec(folder: Path, kind: type[SpecT]) -> SpecT:
+def read_spec(folder: Path, spec_class: type[SpecT]) -> SpecT:
     """Read the description of a stored module.
 
     Args:
         folder: folder of the module.
-        kind: expected class of the description.
+        spec_class: expected class of the description.
 
     Raises:
         UsageError: if the folder has no description, or one of another kind.
@@ -305,18 +305,18 @@ def read_spec(folder: Path, kind: type[SpecT]) -> SpecT:
     content = _read_description(folder)
     content.pop("sha256", None)
     content.pop(_CHECKSUM_KEY, None)
-    expected_schema = kind.model_fields["schema_name"].default
+    expected_schema = spec_class.model_fields["schema_name"].default
     if content.get("schema") != expected_schema:
         raise UsageError(
             f"{folder / _DESCRIPTION}: holds '{content.get('schema')}', expected"
             f" '{expected_schema}'; give a folder of this kind"
         )
     _add_earlier_defaults(content)
-    return validate_config(content, kind, str(folder / _DESCRIPTION))
+    return validate_config(content, spec_class, str(folder / _DESCRIPTION))
 
 
 def _add_earlier_defaults(content: dict[str, Any]) -> None:
-    """Add keys of heads that earlier versions had no choice of, to a description and its members.
+    """Add keys that descriptions of earlier versions lack, with the values that applied then.
 
     The readout of an LSTM was always `tanh`, which is no longer the default.
     """
@@ -362,9 +362,9 @@ def read_weights(folder: Path, module: nn.Module) -> None:
     try:
         _load_state(module, tensors)
     except RuntimeError as error:
-        first = str(error).splitlines()[-1].strip()
+        last_line = str(error).splitlines()[-1].strip()
         raise UsageError(
-            f"{file}: does not belong to the module of {_DESCRIPTION} ({first}); {remedy}"
+            f"{file}: does not belong to the module of {_DESCRIPTION} ({last_line}); {remedy}"
         ) from None
 
 

@@ -34,7 +34,7 @@ from residnet.preprocessing.prepare import PreparedLog
 
 _MAX_LENGTH_RATIO = 4
 """Largest ratio of window lengths in one batch; shorter windows run on to the longest length."""
-_MAX_BATCH_NUMBERS = 30_000_000
+_MAX_BATCH_VALUES = 30_000_000
 """Largest number of values of a batch, which bounds the memory used."""
 _MEASURED_SPEED_MARGIN = 2.0
 """A run has not diverged below this multiple of the measured maximum of the window."""
@@ -235,7 +235,11 @@ def run_free_runs(
     negative limit marks every run as diverged.
     """
     names = {candidate.name for candidate in candidates}
-    ensembles = [entry for entry in candidates if entry.members and set(entry.members) <= names]
+    ensembles = [
+        candidate
+        for candidate in candidates
+        if candidate.members and set(candidate.members) <= names
+    ]
     predictions = {
         candidate.name: _run_candidate(candidate, windows, logs, dt, velocity_limits, dtype)
         for candidate in candidates
@@ -248,7 +252,7 @@ def run_free_runs(
         windows_with_divergence = [
             i
             for i, predictions_of_window in enumerate(member_predictions)
-            if any(entry.has_diverged for entry in predictions_of_window)
+            if any(prediction.has_diverged for prediction in predictions_of_window)
         ]
         rerun_predictions = iter(
             _run_candidate(
@@ -262,7 +266,7 @@ def run_free_runs(
         )
         predictions[ensemble.name] = []
         for i, predictions_of_window in enumerate(member_predictions):
-            states = [entry.states for entry in predictions_of_window]
+            states = [prediction.states for prediction in predictions_of_window]
             nu = _average_members(ensemble.model, states)
             nu = nu if logs[0].dof.is_six_dof else nu[:, logs[0].dof.dynamic_columns]
             prediction = (
@@ -272,32 +276,30 @@ def run_free_runs(
             )
             predictions[ensemble.name].append(prediction)
     spreads_by_members: dict[tuple[str, ...], list[np.ndarray]] = {}
-    for entry in candidates:
-        if len(entry.spread_members) > 1 and set(entry.spread_members) <= names:
-            if entry.spread_members not in spreads_by_members:
-                member_predictions = [
-                    *zip(*(predictions[name] for name in entry.spread_members), strict=True)
-                ]
-                spreads_by_members[entry.spread_members] = [
+    for candidate in candidates:
+        members = candidate.spread_members
+        if len(members) > 1 and set(members) <= names:
+            if members not in spreads_by_members:
+                member_predictions = [*zip(*(predictions[name] for name in members), strict=True)]
+                spreads_by_members[members] = [
                     standard_deviation_between_models(
-                        [
-                            predictions_of_window.states
-                            for predictions_of_window in window_predictions
-                        ]
+                        [prediction.states for prediction in predictions_of_window]
                     )
-                    for window_predictions in member_predictions
+                    for predictions_of_window in member_predictions
                 ]
-            predictions_and_spreads = zip(
-                predictions[entry.name], spreads_by_members[entry.spread_members], strict=True
-            )
-            predictions[entry.name] = [
-                replace(prediction, spread=spread) for prediction, spread in predictions_and_spreads
+            predictions[candidate.name] = [
+                replace(prediction, spread=spread)
+                for prediction, spread in zip(
+                    predictions[candidate.name], spreads_by_members[members], strict=True
+                )
             ]
-    for entry in candidates:
-        if entry.domain is not None:
-            predictions[entry.name] = [
-                replace(prediction, distance=_mean_log_distance(entry, window, prediction, logs))
-                for window, prediction in zip(windows, predictions[entry.name], strict=True)
+    for candidate in candidates:
+        if candidate.domain is not None:
+            predictions[candidate.name] = [
+                replace(
+                    prediction, distance=_mean_log_distance(candidate, window, prediction, logs)
+                )
+                for window, prediction in zip(windows, predictions[candidate.name], strict=True)
             ]
     return {candidate.name: predictions[candidate.name] for candidate in candidates}
 
@@ -360,16 +362,16 @@ def _run_candidate(
     model = copy.deepcopy(candidate.model).to("cpu", dtype).eval()
     # In the plane the pose does not affect the velocities and is integrated afterwards, for all
     # models in the same way. In six degrees of freedom the attitude does, by restoring forces.
-    model.has_position = model.spatial
+    model.has_position = model.is_spatial
     dof = logs[0].dof
     state_names = candidate.state_names or dof.state_names
-    simulated_states = dof.state_names if model.spatial else dof.dynamic_states
+    simulated_states = dof.state_names if model.is_spatial else dof.dynamic_states
     columns = [state_names.index(name) for name in simulated_states]
     predictions: dict[int, Prediction] = {}
-    numbers_per_step = len(state_names) + sum(
+    values_per_step = len(state_names) + sum(
         table.shape[1] for table in list(input_tables.values())[:1]
     )
-    for batch in _batch_windows(windows, numbers_per_step):
+    for batch in _batch_windows(windows, values_per_step):
         batch_windows = [windows[window_index] for window_index in batch]
         x0 = np.stack(
             [_initial_state(candidate, window, logs[window.log_index]) for window in batch_windows]
@@ -392,7 +394,7 @@ def _window_length(window: Window) -> int:
     return window.stop - window.start
 
 
-def _batch_windows(windows: Sequence[Window], numbers_per_step: int) -> Iterator[list[int]]:
+def _batch_windows(windows: Sequence[Window], values_per_step: int) -> Iterator[list[int]]:
     """Yield the indices of windows that are run in one batch.
 
     A step takes about the same time for one row and for many. Windows of different lengths are
@@ -401,7 +403,7 @@ def _batch_windows(windows: Sequence[Window], numbers_per_step: int) -> Iterator
 
     Args:
         windows: windows to run.
-        numbers_per_step: number of values stored per row and step.
+        values_per_step: number of values stored per row and step.
     """
     # descending length, so that the first window of a batch determines its length
     indices_by_length = sorted(range(len(windows)), key=lambda row: -_window_length(windows[row]))
@@ -410,7 +412,7 @@ def _batch_windows(windows: Sequence[Window], numbers_per_step: int) -> Iterator
         longest_window = _window_length(windows[batch[0]]) if batch else 0
         if batch and (
             _MAX_LENGTH_RATIO * _window_length(windows[window_index]) < longest_window
-            or (len(batch) + 1) * longest_window * numbers_per_step > _MAX_BATCH_NUMBERS
+            or (len(batch) + 1) * longest_window * values_per_step > _MAX_BATCH_VALUES
         ):
             yield batch
             batch = []

@@ -122,7 +122,7 @@ class GuardedDynamics(Dynamics):
         self.dof = model.dof
         self.has_roll = model.has_roll
         self.set_attitude_columns(
-            ATTITUDE if model.spatial else (), len(spec.signals.dof.state_names) + 1
+            ATTITUDE if model.is_spatial else (), len(spec.signals.dof.state_names) + 1
         )
         lower, upper, margin = (
             torch.tensor(values, dtype=torch.float64)
@@ -130,7 +130,7 @@ class GuardedDynamics(Dynamics):
         )
         pose_limit = torch.full((len(PLANAR_LAYOUT.pose),), _MAX_POSITION, dtype=torch.float64)
         pose_limit[POSITION.stop :] = _MAX_HEADING
-        if model.spatial:
+        if model.is_spatial:
             # the depth does not affect the motion, so that its training range is no limit
             depth_index = spec.signals.dof.dynamic_states.index("z")
             lower[depth_index], upper[depth_index], margin[depth_index] = (

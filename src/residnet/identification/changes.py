@@ -234,7 +234,7 @@ class PerturbedDynamics(Dynamics):
         )
         # the angles follow the changed velocities; in six degrees of freedom as a rotation
         changed_next_state = nominal_next_state.clone()
-        if self.model.spatial:
+        if self.model.is_spatial:
             changed_velocities = torch.where(
                 self.model.equation_mask > 0.0,
                 changed_velocities,

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from residnet.core import columns
 from residnet.core.errors import ConfigError
-from residnet.core.layout import ROLLING_LAYOUT, SUBMERGED_LAYOUT
+from residnet.core.layout import ROLL_PLANT_LAYOUT, SIX_DOF_PLANT_LAYOUT
 from residnet.core.names import suggest_name
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
@@ -78,7 +78,7 @@ class PlantActuators(Actuators):
         self.columns = [
             i
             for i, name in enumerate(plant.state_names)
-            if name not in (*ROLLING_LAYOUT.state_names, *SUBMERGED_LAYOUT.state_names)
+            if name not in (*ROLL_PLANT_LAYOUT.state_names, *SIX_DOF_PLANT_LAYOUT.state_names)
         ]
         self.state_names = tuple(plant.state_names[i] for i in self.columns)
         self.dynamics = RecordedPlantDynamics(plant, dt, substeps) if self.columns else None

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from residnet.core.config import Config, MetresPerSecond
-from residnet.core.layout import PLANAR_LAYOUT, ROLLING_LAYOUT, SUBMERGED_LAYOUT, StateLayout
+from residnet.core.layout import PLANAR_LAYOUT, ROLL_PLANT_LAYOUT, SIX_DOF_PLANT_LAYOUT, StateLayout
 from residnet.core.names import VELOCITY_NAMES
 from residnet.physics.actuators import (
     ActuatorsConfig,
@@ -130,14 +130,14 @@ AccelerationRows = Annotated[
     dict[Literal["u", "v", "r"], AxisTerms], _axis_terms_validator("uvr", VELOCITY_NAMES, 0)
 ]
 """Accelerations as terms of (u, v, r)."""
-ROLLING_CHANNELS = (*ROLLING_LAYOUT.velocities, "phi")
+ROLLING_CHANNELS = (*ROLL_PLANT_LAYOUT.velocities, "phi")
 RollingRows = Annotated[
     dict[Literal["X", "Y", "K", "N"], AxisTerms], _axis_terms_validator("XYKN", ROLLING_CHANNELS)
 ]
 """Forces as terms of (u, v, p, r, phi)."""
 SubmergedRows = Annotated[
     dict[Literal["X", "Y", "Z", "K", "M", "N"], AxisTerms],
-    _axis_terms_validator("XYZKMN", SUBMERGED_LAYOUT.velocities),
+    _axis_terms_validator("XYZKMN", SIX_DOF_PLANT_LAYOUT.velocities),
 ]
 """Forces as terms of (u, v, w, p, q, r)."""
 
@@ -474,7 +474,7 @@ class RollingHullConfig(HullVessel):
         forces: terms of the hydrodynamic forces; coefficients of damping are negative.
     """
 
-    layout: ClassVar[StateLayout] = ROLLING_LAYOUT
+    layout: ClassVar[StateLayout] = ROLL_PLANT_LAYOUT
     kind: Literal["patrol"]
     speed: MetresPerSecond = Field(gt=0)
     hydrostatics: Hydrostatics
@@ -595,7 +595,7 @@ class SubmergedHullConfig(HullVessel):
         speed: initial speed of trials.
     """
 
-    layout: ClassVar[StateLayout] = SUBMERGED_LAYOUT
+    layout: ClassVar[StateLayout] = SIX_DOF_PLANT_LAYOUT
     kind: Literal["submerged"]
     speed: MetresPerSecond = Field(default=0.0, ge=0)
     buoyancy: Buoyancy
@@ -636,11 +636,11 @@ class SubmergedHullConfig(HullVessel):
         axis_cycles = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
         # momenta are linear in the velocities: column k of M multiplies velocity k, so that each
         # cross product becomes a sum of products of two velocities
-        for k, name in enumerate(SUBMERGED_LAYOUT.velocities):
+        for k, name in enumerate(SIX_DOF_PLANT_LAYOUT.velocities):
             momentum = mass[:3, k].tolist()
             angular_momentum = mass[3:, k].tolist()
-            v = SUBMERGED_LAYOUT.velocities[:3]
-            w = SUBMERGED_LAYOUT.velocities[3:]
+            v = SIX_DOF_PLANT_LAYOUT.velocities[:3]
+            w = SIX_DOF_PLANT_LAYOUT.velocities[3:]
             for axis, a, b in axis_cycles:
                 for sign, i, j in ((-1.0, a, b), (1.0, b, a)):
                     add_term(axis, _format_velocity_product(w[i], name), sign * momentum[j])
@@ -665,10 +665,12 @@ class SubmergedHullConfig(HullVessel):
             add_term(axis, vertical_direction[axis], signs[axis] * net_weight)
             add_term(3 + axis, vertical_direction[b], signs[b] * levers[a])
             add_term(3 + axis, vertical_direction[a], -signs[a] * levers[b])
-        channels = (*SUBMERGED_LAYOUT.velocities, "phi", "theta")
+        channels = (*SIX_DOF_PLANT_LAYOUT.velocities, "phi", "theta")
         return HullCoefficients(mass.tolist(), coefficients, channels)
 
 
 def _format_velocity_product(a: str, b: str) -> str:
     """Format the product of two velocities in a fixed order."""
-    return f"{a}^2" if a == b else " ".join(sorted((a, b), key=SUBMERGED_LAYOUT.velocities.index))
+    return (
+        f"{a}^2" if a == b else " ".join(sorted((a, b), key=SIX_DOF_PLANT_LAYOUT.velocities.index))
+    )

@@ -10,14 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.frames import cross_product, horizontal_to_body, to_body, to_earth, to_level_axes
-from residnet.core.layout import PLANAR_LAYOUT, ROLLING_LAYOUT, SUBMERGED_LAYOUT
+from residnet.core.layout import PLANAR_LAYOUT, ROLL_PLANT_LAYOUT, SIX_DOF_PLANT_LAYOUT
 from residnet.physics.actuators.base import ActuatorSystem
 from residnet.physics.environment_config import WindLoadConfig
 from residnet.physics.plant_channels import list_exogenous_inputs, require_invertible_mass
 from residnet.physics.term_library import TermLibrary
 
 _LAYOUT_OF_DOF = {
-    layout.n_dof: layout for layout in (PLANAR_LAYOUT, ROLLING_LAYOUT, SUBMERGED_LAYOUT)
+    layout.n_dof: layout for layout in (PLANAR_LAYOUT, ROLL_PLANT_LAYOUT, SIX_DOF_PLANT_LAYOUT)
 }
 
 
@@ -168,7 +168,7 @@ class HullPlant(Plant):
 
     The state x [B, 2 n + k] is pose, velocities over ground and states of the actuators. In 3
     degrees of freedom pose and velocities are x, y, psi and u, v, r; in 4 they are x, y, phi, psi
-    and u, v, p, r; in 6 they are those of `SUBMERGED_LAYOUT`.
+    and u, v, p, r; in 6 they are those of `SIX_DOF_PLANT_LAYOUT`.
 
     The inputs are commands; force_x, force_y, (force_z, force_k, force_m,) force_n in body axes
     [N, N m]; current_north, current_east [m/s]; force_north, force_east [N], constant in earth
@@ -194,8 +194,8 @@ class HullPlant(Plant):
         self.actuators = actuators
         self.wind = wind
         self.n_dof = len(hull.mass)
-        self.has_roll_without_pitch = self.n_dof == ROLLING_LAYOUT.n_dof
-        self.is_submerged = self.n_dof == SUBMERGED_LAYOUT.n_dof
+        self.has_roll_without_pitch = self.n_dof == ROLL_PLANT_LAYOUT.n_dof
+        self.is_submerged = self.n_dof == SIX_DOF_PLANT_LAYOUT.n_dof
         self.has_environment = True
         self.state_names = (*_LAYOUT_OF_DOF[self.n_dof].state_names, *actuators.state_names)
         self.attitude_columns = (

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from residnet.core.errors import ConfigError
-from residnet.core.layout import PLANAR_LAYOUT, ROLLING_LAYOUT, SUBMERGED_LAYOUT, StateLayout
+from residnet.core.layout import PLANAR_LAYOUT, ROLL_PLANT_LAYOUT, SIX_DOF_PLANT_LAYOUT, StateLayout
 from residnet.core.names import WIND_INPUTS
 
 _FORCE_AXES_OF_DOF = {
     PLANAR_LAYOUT.n_dof: ("x", "y", "n"),
-    ROLLING_LAYOUT.n_dof: ("x", "y", "k", "n"),
-    SUBMERGED_LAYOUT.n_dof: ("x", "y", "z", "k", "m", "n"),
+    ROLL_PLANT_LAYOUT.n_dof: ("x", "y", "k", "n"),
+    SIX_DOF_PLANT_LAYOUT.n_dof: ("x", "y", "z", "k", "m", "n"),
 }
 _MAX_CONDITION = 1e8
 """Condition number, after scaling, from which a mass matrix counts as singular."""

@@ -383,7 +383,10 @@ def _annotate(annotation: Any, metadata: Sequence[Any]) -> Any:
 
 
 def _list_alternatives(annotation: Any) -> list[Any]:
-    """Return the members of nested unions without wrappers, and the markers of their quantities."""
+    """Return the types of nested unions and `Annotated` types, and their unit markers, as one list.
+
+    `Metres | None`, for example, gives float, `Quantity("m")` and NoneType.
+    """
     if get_origin(annotation) is Annotated:
         wrapped_type, *metadata = get_args(annotation)
         markers = [marker for marker in metadata if isinstance(marker, Quantity | PolynomialOf)]
@@ -400,8 +403,8 @@ def _list_alternatives(annotation: Any) -> list[Any]:
 def _dimension_of_parameter(unit: str) -> Dimension:
     """Return the dimension of an SI unit of a vessel file, such as kg m/s; dimensionless if none.
 
-    `parse_dimension` needs the exponent of the mass, since a newton contains a kilogram. It is 0
-    or 1 in vessel files.
+    `parse_dimension` accepts only units with a given exponent of the mass, which is 0 or 1 in
+    vessel files.
     """
     for mass_power in (0, 1):
         powers = parse_dimension(unit, mass_power)

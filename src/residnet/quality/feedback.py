@@ -65,7 +65,7 @@ class InputFeedback:
     Attributes:
         name: name of the input.
         source: quantity that is fed back, a key of `FEEDBACK_SOURCES`.
-        share: share of the variance not explained by effects that the source explains, by
+        share: share that the source explains of the variance which the effects do not explain, by
             leave-one-log-out cross-validation; at most about 0 in open loop.
         effect_share: share of the variance that velocities before and after the input explain.
         relay_share: share of the samples of a log near either end of its range, the smaller of both
@@ -187,10 +187,10 @@ def detect_feedback(
     if len(logs) == 1:
         parts = np.array_split(np.arange(len(logs[0]["r"])), _N_PARTS)
         logs = [{name: values[part] for name, values in logs[0].items()} for part in parts]
-    unit = response_time([log["r"] for log in logs], step)
-    unit = float(np.clip(unit, _SAMPLES_PER_RESPONSE * step, 60.0))
-    stride = max(round(unit / _SAMPLES_PER_RESPONSE / step), 1)
-    lags = [round(lag * unit / step / stride) for lag in _LAGS]
+    time_scale = response_time([log["r"] for log in logs], step)
+    time_scale = float(np.clip(time_scale, _SAMPLES_PER_RESPONSE * step, 60.0))
+    stride = max(round(time_scale / _SAMPLES_PER_RESPONSE / step), 1)
+    lags = [round(lag * time_scale / step / stride) for lag in _LAGS]
     tables = [
         table
         for log in logs
@@ -210,11 +210,11 @@ def detect_feedback(
         for source, keys in FEEDBACK_SOURCES.items():
             if not all(key in table for key in keys for table in tables):
                 continue
-            both = [
+            effects_and_source = [
                 np.column_stack((effect, *(table[key] for key in keys)))
                 for effect, table in zip(effects, tables, strict=True)
             ]
-            unexplained = 1.0 - cross_validated_r2(both, responses)
+            unexplained = 1.0 - cross_validated_r2(effects_and_source, responses)
             # effects that predict worse than the mean of the other logs are no reference: feedback
             # must then explain a share of the variance itself
             share = 1.0 - unexplained / max(1.0 - max(effect_share, 0.0), 1e-12)

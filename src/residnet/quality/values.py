@@ -366,7 +366,7 @@ def _find_frozen_samples(log: LogStatistics, names: tuple[str, ...]) -> np.ndarr
             min_run, int(np.ceil(np.log(1e-4 / is_repeated.size) / np.log(repeat_probability)))
         )
     # the last digits of a noisy channel change at every sample, even at rest
-    is_rare = repeat_probability < (0.15 if is_multi_channel else 1e-3)
+    is_repeat_rare = repeat_probability < (0.15 if is_multi_channel else 1e-3)
     is_long = stops - starts >= min_run
     if not is_long.any():
         return is_frozen_sample
@@ -374,7 +374,7 @@ def _find_frozen_samples(log: LogStatistics, names: tuple[str, ...]) -> np.ndarr
     stops = stops[is_long]
     # noise contributes to the increments; without noise, only a change after the run proves motion
     is_noisy = log.noise_std(names[0]) > 0.05 * nan_std(np.diff(log[names[0]]))
-    is_noisy &= is_rare or names[0] not in POSE_NAMES
+    is_noisy &= is_repeat_rare or names[0] not in POSE_NAMES
     vessel_moves = np.full(starts.size, is_noisy)
     for name in () if is_noisy else names:
         vessel_moves |= _moves_after_run(log[name], stops)
@@ -530,8 +530,9 @@ def _find_straight_samples(log: LogStatistics, name: str) -> np.ndarray:
     return mask_from_ranges(is_straight_sample.size, starts[is_long], stops[is_long] + 2)
 
 
-_MIN_STEPS_OF_PRINT = 5.0
-"""Median increment in units of the last printed digit below which equal increments are chance."""
+_MIN_INCREMENT_IN_DIGITS = 5.0
+"""Equal increments are chance if the median increment is less than this number of units of the last
+printed digit."""
 
 
 def _is_coarsely_printed(values: np.ndarray) -> np.ndarray:
@@ -543,7 +544,7 @@ def _is_coarsely_printed(values: np.ndarray) -> np.ndarray:
     if resolution is None:
         return np.zeros(values.size - 1, dtype=bool)
     increment = nan_median(np.abs(np.diff(values)))
-    is_coarse: np.ndarray = _MIN_STEPS_OF_PRINT * resolution[1:] >= increment
+    is_coarse: np.ndarray = _MIN_INCREMENT_IN_DIGITS * resolution[1:] >= increment
     return is_coarse
 
 
@@ -645,7 +646,8 @@ def check_clipping(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
 
 # smallest number of levels between the 5th and the 95th percentile for a sufficient resolution
 _MIN_LEVELS = 50
-# a channel with a smaller range carries no information: .05 deg/s to both sides, 3 deg in a minute
+# a channel with a smaller range carries no information; yaw rates of +-0.05 deg/s turn a vessel by
+# 3 deg in a minute
 _NEGLIGIBLE_RANGES = {"rad": math.radians(3.0), "rad/s": math.radians(0.1)}
 
 
@@ -752,7 +754,8 @@ _MAX_SPEED = 75.0
 _MAX_TURN_RATE = 2.0 * math.pi
 """Largest yaw rate of a vessel in rad/s, one turn per second."""
 _RATE_INTERVAL = 1.0
-"""Shortest time in s over which rates are implied, so that noise of dense samples counts less."""
+"""Shortest time in s over which rates are computed from the pose, whose noise at shorter intervals
+would give large rates."""
 
 
 @check("values", "impossible_rate", fix="check units and times, or whether rows are of two vessels")

@@ -90,7 +90,7 @@ class LinearLaw(AnglePolicy):
         gains: kp, kd [s], ki [1/s] and time constant of the filter [s]; [B] or scalar each.
     """
 
-    PARAMETERS: ClassVar[tuple[str, ...]] = ("kp", "kd", "ki", "lag")
+    PARAMETERS: ClassVar[tuple[str, ...]] = ("kp", "kd", "ki", "filter_time")
 
     def __init__(self, task: ControlTask, gains: Sequence[Tensor]) -> None:
         super().__init__()
@@ -102,7 +102,7 @@ class LinearLaw(AnglePolicy):
         self.kp: Tensor
         self.kd: Tensor
         self.ki: Tensor
-        self.lag: Tensor
+        self.filter_time: Tensor
         self.n_state = 3
 
     def initial_state(self, x: Tensor) -> Tensor:
@@ -112,7 +112,7 @@ class LinearLaw(AnglePolicy):
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         # exact step of the filter; a time constant of zero gives the factor 1, no filter
-        filter_factor = 1.0 - torch.exp(-self.dt / self.lag.clamp(min=1e-6))
+        filter_factor = 1.0 - torch.exp(-self.dt / self.filter_time.clamp(min=1e-6))
         # the difference is wrapped, so that the filter does not turn the long way round at +-pi
         measured_heading = x[:, self.psi_column : self.psi_column + 1]
         measured_rate = x[:, self.r_column : self.r_column + 1]
@@ -207,11 +207,10 @@ class LinearLawConfig(TunableConfig, ABC):
     @final
     def parameter_values(self) -> dict[str, float | None]:
         parameters = super().parameter_values()
-        lag = self.filter_time
-        has_open_gain = None in [
-            value for name, value in parameters.items() if name != "filter_time"
-        ]
-        return {**parameters, "filter_time": 0.0 if lag is None and not has_open_gain else lag}
+        filter_time = parameters.pop("filter_time")
+        if filter_time is None and None not in parameters.values():
+            filter_time = 0.0
+        return {**parameters, "filter_time": filter_time}
 
     def build(self, task: ControlTask) -> LinearLaw:
         """Build the law with these parameters."""

@@ -33,7 +33,7 @@ _ALIGNMENT_BYTES = 64
 _MAX_RESIDENT_BYTES = 1 << 28
 """Resident bytes of file pages above which the pages of arrays are released."""
 _CHECK_INTERVAL = 0.02
-"""Interval of the check in s; cached pages return at gigabytes per second."""
+"""Interval of the check in s; reading files from the cache adds gigabytes of pages per second."""
 
 _mapped_files: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 _lock = Lock()

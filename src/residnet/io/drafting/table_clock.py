@@ -41,7 +41,7 @@ _DOTTED_TIME_PATTERN = r"^\d\d?\.\d\d\.\d\d[.,]"
 def detect_or_ask_clock(
     previews: Sequence[TablePreview], draft_notes: DraftNotes
 ) -> tuple[TableClock, str | None]:
-    """Return the clock of tables, and the time between rows that the user gives for others.
+    """Return the clock of the first table, and the answer of the user if the tables have none.
 
     Raises:
         DataError: if the tables have no clock, and nobody gives the time between rows.
@@ -55,7 +55,7 @@ def detect_or_ask_clock(
         except MissingClockError as missing_clock:
             message = strip_file_name([main_preview.path], str(missing_clock))
         error = UnreadableLogsError(
-            {sheet.path: DataError(f"{sheet.path}: {message}") for sheet in previews}
+            {preview.path: DataError(f"{preview.path}: {message}") for preview in previews}
         )
     step = draft_notes.require_answer(
         key,

@@ -25,8 +25,8 @@ from residnet.preprocessing.compatibility.sensors import (
 
 _STUDENT_DOF = 5.0
 """Degrees of freedom of the Student distribution of the measurement noise."""
-_MIN_FREE_SHARE = 0.05
-"""Lower bound of the ratio of residual to noise variance of a sensor, in a denominator."""
+_MIN_RESIDUAL_NOISE_RATIO = 0.05
+"""Smallest assumed ratio of the variance of a sensor's residuals to its noise variance."""
 
 
 @dataclass
@@ -38,7 +38,7 @@ class ResidualGroup:
         nodes: node before each residual [N].
         values: whitened residuals [N].
         by_state: state -> derivative [N]; states 0 to 8 are of the node, 9 to 17 of the next node.
-        by_error: index of an error -> derivative [N].
+        by_error: index of an instrument error -> derivative [N].
         sensor: sensor of a measurement; None for a dynamic equation.
         squares: squared norm [N] over all columns of the sensor, so that the weights of a position
             do not depend on its axes; None for a dynamic equation.
@@ -106,9 +106,10 @@ def linearize_score(group: ResidualGroup) -> ResidualGroup:
     numerator = _STUDENT_DOF + dimension
     weights = numerator / (_STUDENT_DOF + group.squares)
     score = weights * group.values
-    # residuals are smaller than the noise, whose weighted mean square is one by its estimate
-    free_share = float((weights * group.squares).mean()) / dimension
-    noise_squares = group.squares / max(free_share, _MIN_FREE_SHARE)
+    # Residuals of a fit are smaller than the noise. The noise level is estimated such that the
+    # weighted mean square of the noise is one.
+    residual_noise_ratio = float((weights * group.squares).mean()) / dimension
+    noise_squares = group.squares / max(residual_noise_ratio, _MIN_RESIDUAL_NOISE_RATIO)
     denominator = _STUDENT_DOF + noise_squares
     # means over all columns of a sensor
     slope = numerator / denominator - 2.0 * numerator * noise_squares / (dimension * denominator**2)

@@ -175,8 +175,8 @@ def scale_fit_config(
     scaled = scaling.scale_config(config)
     root = folder.resolve()
     files = {
-        name: [_log_file(name, index, log) for index, log in enumerate(members)]
-        for name, members in logs.items()
+        split: [_log_file(split, index, log) for index, log in enumerate(logs_of_split)]
+        for split, logs_of_split in logs.items()
     }
     text = f"scaled by Froude's law with ratio {scaling.scale:g}"
     update = {
@@ -216,6 +216,7 @@ def scale_booklet(config: BookletConfig, scaling: FroudeScaling) -> BookletConfi
     scaled = scaling.scale_config(config)
 
     def scale_share(name: str, share: InputShare) -> InputShare:
+        # values of the input at full propulsion and full steering command, and without both
         drive, steer, centre, limit, rate = share.to_si(name)
         factor = scaling.channel_factor(name)
         # lag and delay have units in the config and are scaled already

@@ -193,17 +193,17 @@ def compare_variants(errors: pd.DataFrame, reference: str) -> list[VariantRow]:
     rows: list[VariantRow] = []
     for (variant, protocol), variant_errors in errors.groupby(["variant", "protocol"], sort=False):
         reference_errors = errors.loc[reference]
-        differences_mean, reference_mean = (
+        mean_errors, reference_mean = (
             error_table.groupby(["log", "window"], sort=False)["nrmse"].mean()
             for error_table in (
                 variant_errors,
                 reference_errors[reference_errors["protocol"] == protocol],
             )
         )
-        differences_mean -= reference_mean
-        logs = pd.factorize(differences_mean.index.get_level_values("log"))[0]
+        differences = mean_errors - reference_mean
+        logs = pd.factorize(mean_errors.index.get_level_values("log"))[0]
         (interval,) = bootstrap_intervals(
-            differences_mean.to_numpy()[:, None], make_resampling_blocks(logs)
+            differences.to_numpy()[:, None], make_resampling_blocks(logs)
         )
         by_seed = variant_errors.groupby("seed")["nrmse"].mean()
         rows.append(
@@ -211,12 +211,12 @@ def compare_variants(errors: pd.DataFrame, reference: str) -> list[VariantRow]:
                 variant=str(variant),
                 protocol=str(protocol),
                 seeds=len(by_seed),
-                windows=len(differences_mean),
+                windows=len(mean_errors),
                 diverged=int(variant_errors["diverged"].sum()),
                 nrmse_mean=float(by_seed.mean()),
                 nrmse_sd=float(by_seed.std()) if len(by_seed) > 1 else None,
                 nrmse_range=(float(by_seed.min()), float(by_seed.max())),
-                difference=float(differences_mean.mean()),
+                difference=float(differences.mean()),
                 difference_ci95=None if variant == reference else interval,
             )
         )

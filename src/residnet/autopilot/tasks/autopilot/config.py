@@ -272,7 +272,7 @@ class AutopilotConfig(PackageTask, ComputingTask):
         except FitError as error:
             raise ConfigError(f"vessel '{self.vessel}' cannot be steered: {error}") from error
         config = self.with_scaled_times()
-        # the minimum time below is that of a turn; a change of depth also needs a path
+        # `minimum_turn_time` is a lower bound for turns only: a change of depth also needs a path
         heading_changes = (
             {} if config.test.depth else {"test": (config.test.heading, config.test.duration)}
         )
@@ -284,7 +284,7 @@ class AutopilotConfig(PackageTask, ComputingTask):
                     main_conditions.duration,
                 )
             for name, conditions in config.conditions.all_conditions.items():
-                if conditions.bias + _PUSH_STD_FACTOR * conditions.push >= config.rudder:
+                if conditions.bias + _DISTURBANCE_STD_FACTOR * conditions.push >= config.rudder:
                     raise ConfigError(
                         f"conditions.{name}: a bias of {math.degrees(conditions.bias):.3g} deg and"
                         f" a push of {math.degrees(conditions.push):.3g} deg need all of the"
@@ -333,8 +333,8 @@ class AutopilotConfig(PackageTask, ComputingTask):
     def with_scaled_times(self) -> AutopilotConfig:
         """Return the config with its times multiplied by its pace, the pace itself being one.
 
-        Delays of the electronics are not scaled. The cost of a degree is scaled like
-        the times.
+        Delays of the electronics are not scaled. `overshoot_weight` and `travel_weight` are scaled,
+        because they are costs of a degree in s.
 
         Raises:
             FitError: if the vessel does not turn steadily.
@@ -395,7 +395,7 @@ class AutopilotConfig(PackageTask, ComputingTask):
         return file
 
 
-_PUSH_STD_FACTOR = 2.0
+_DISTURBANCE_STD_FACTOR = 2.0
 """Number of standard deviations of the slow disturbance that the rudder must compensate."""
 _REFERENCE_STEP = math.radians(30.0)
 """Change of heading in rad whose minimum time defines the pace of a vessel."""
