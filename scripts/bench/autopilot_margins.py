@@ -3,13 +3,15 @@
     python scripts/bench/autopilot_margins.py RUN [RUN...] [--policy learned]
     python scripts/bench/autopilot_margins.py --config autopilot_conditions --seeds 10 --seed 43
     python scripts/bench/autopilot_margins.py --draw 10 --logs 3 --seed 43 --out runs/drawn
+    python scripts/bench/autopilot_margins.py --draw 4 --first 4 --seed 43   # vessel 4 only
 
 Runs may have different seeds; the last columns are mean, standard deviation and range. With
 `--seeds`, a config is run first with this number of seeds from `--seed` on. The constants of its
 peers are tuned with the first seed and used for the others; of its policies `--policy` is trained
 and compared. With `--draw`, vessels are drawn and trained first, as `residnet autopilot` does:
 random K, T, rate of the rudder and largest delay. `--logs` draws further vessels of which only
-simulated zigzags with noise are available.
+simulated zigzags with noise are available. With `--first`, the vessels before it are drawn, but
+not trained. Finished runs in `--out` are used again.
 """
 
 from __future__ import annotations
@@ -209,14 +211,16 @@ def run_seeds(config: str, policy: str, seeds: Sequence[int], out: Path) -> list
 def main() -> None:
     """Print the figures of all runs with their statistics, and costs under further conditions."""
     options = bench.options(
-        __doc__, runs=(), policy="learned", draw=0, logs=0, config="autopilot_conditions",
-        seeds=0, seed=0, out="runs/drawn",
+        __doc__, runs=(), policy="learned", draw=0, logs=0, first=1,
+        config="autopilot_conditions", seeds=0, seed=0, out="runs/drawn",
     )  # fmt: skip
     runs = [Path(run) for run in options.runs]
     out = Path(options.out)
     rng = np.random.default_rng(options.seed)
     for k in range(options.draw + options.logs):
         vessel = DrawnVessel(rng)
+        if k + 1 < options.first:
+            continue
         logs = k >= options.draw
         name = f"{'logs' if logs else 'vessel'}_{k + 1}"
         print(f"{name}: {vessel}", flush=True)
