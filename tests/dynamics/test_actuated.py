@@ -16,7 +16,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.engine.rollout import Rollout
 from residnet.heads.base import ResidualHead, ZeroHead
-from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators, PlantActuators
+from residnet.manoeuvres.actuated import ActuatedDynamics, ConfiguredActuators, PlantActuators
 from residnet.manoeuvres.input_shares import InputShare
 from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.vessel import load_vessel
@@ -66,7 +66,7 @@ def test_given_gear_by_hand() -> None:
         "n": InputShare(drive="600 rpm", limit="480 rpm"),
         "delta": InputShare(steer="35 deg", rate="5 deg/s"),
     }
-    gear = GivenActuators(shares, ("wind_speed", "wind_dir"), 0.5)
+    gear = ConfiguredActuators(shares, ("wind_speed", "wind_dir"), 0.5)
     assert gear.input_names == ("cmd_n", "cmd_delta", "wind_speed", "wind_dir")
     assert gear.state_names == ("delta",)
     command = gear.commands_for_demand(torch.tensor([1.0, 0.5]), torch.tensor([-1.0, 2.0]))
@@ -93,7 +93,7 @@ def test_given_gear_by_hand() -> None:
 )
 def test_a_wrong_share_is_named(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=r"inputs\.delta"):
-        GivenActuators({"delta": InputShare(**wrong)}, (), 0.1)
+        ConfiguredActuators({"delta": InputShare(**wrong)}, (), 0.1)
 
 
 class Take(ResidualHead):
@@ -108,7 +108,7 @@ class Take(ResidualHead):
 )
 def test_inputs_are_held_as_in_the_fit(hold: Any, expected: list[float]) -> None:
     """An input that moves by 1 per second: from each step's start, or its mean over the step."""
-    gear = GivenActuators({"n": InputShare(drive=9.0, rate=1.0)}, (), 1.0)
+    gear = ConfiguredActuators({"n": InputShare(drive=9.0, rate=1.0)}, (), 1.0)
     hybrid = still(("n",), 1.0)
     model = ActuatedDynamics(
         HybridDynamics(hybrid.signals, hybrid.baseline, Take(), 1.0), ("n",), hold, gear
@@ -120,7 +120,7 @@ def test_inputs_are_held_as_in_the_fit(hold: Any, expected: list[float]) -> None
 
 
 def test_a_gear_with_lag_and_delay_follows_its_command() -> None:
-    gear = GivenActuators({"delta": InputShare(steer=0.5, lag=2.0, delay=0.3)}, (), 0.1)
+    gear = ConfiguredActuators({"delta": InputShare(steer=0.5, lag=2.0, delay=0.3)}, (), 0.1)
     assert gear.state_names == ("delta", "_delta_delay1", "_delta_delay2", "_delta_delay3")
     a = gear.make_initial_state(1, ())
     angles = []

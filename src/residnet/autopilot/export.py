@@ -465,7 +465,7 @@ class ExportedController(Exportable, Generic[GuardedT]):
 
     @property
     def measured_units(self) -> Mapping[str, str]:
-        """Names of the measurements with their units."""
+        """SI unit of each measurement that the exported policy reads, by name."""
         return self.policy.measured
 
     @abstractmethod

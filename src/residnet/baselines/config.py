@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class IdentifiedConfig(Config, ABC):
-    """Configuration of a baseline and of its identification."""
+    """Base of the configs of all baselines: what to build, and how it is fitted to samples."""
 
     kind: str
 

@@ -26,7 +26,7 @@ TermCoefficients = dict[str, float]
 
 
 class FixedBaselineConfig(IdentifiedConfig, ABC):
-    """Configuration of a baseline with fixed coefficients."""
+    """Base of the configs of baselines whose coefficients are given and not fitted."""
 
     @final
     def is_parametric(self, names: Sequence[str]) -> bool:

@@ -268,7 +268,7 @@ class DegreesOfFreedom:
 
     @property
     def derivative_names(self) -> tuple[str, ...]:
-        """Names of the derivatives of the dynamic states."""
+        """Names of the derivatives such as `u_dot`, in the order of the dynamic states."""
         return tuple(f"{name}_dot" for name in self.dynamic_states)
 
     @property
@@ -278,7 +278,7 @@ class DegreesOfFreedom:
 
     @property
     def n_dynamic(self) -> int:
-        """Number of dynamic states."""
+        """Number of dynamic states: 3, 5 with roll, 9 in six degrees of freedom."""
         return len(self.dynamic_states)
 
     @property

@@ -65,7 +65,7 @@ class Samples:
         return replace(self, target=target)
 
     def running_moments(self) -> tuple[RunningMoments, RunningMoments]:
-        """Return the moments of the channels and of the target."""
+        """Accumulate the moments of z [N, nz] and of the target [N, n], chunk by chunk."""
         channel_moments = RunningMoments(self.z.shape[1])
         target_moments = RunningMoments(self.target.shape[1])
         for rows in iterate_row_chunks(len(self)):

@@ -169,6 +169,7 @@ class HybridDynamics(Dynamics):
         dof = get_dof(signals.names)
         self.dof = dof.n_dynamic
         self.is_complete = dof.is_complete
+        # whether every dynamic state is an active velocity, so that no derivative is prescribed
         self.is_fully_regressed = len(dof.active_velocity_indices) == dof.n_dynamic
         self.has_roll = dof.has_roll
         self.set_attitude_columns(ATTITUDE if dof.is_six_dof else (), len(dof.state_names))
@@ -427,7 +428,7 @@ class MeasuredPast(Dynamics):
 
     @property
     def head(self) -> ResidualHead:
-        """Head of the model."""
+        """Residual model, whose memory the measured states update."""
         return self.model.head
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:

@@ -466,7 +466,7 @@ def _choose_mass_matrix(
 ) -> tuple[MassFunction, MassSource]:
     """Return a function from theta to the mass matrix [3, 3], and where it comes from.
 
-    The identity stands for unknown masses.
+    Unknown masses are replaced by the identity.
     """
     if isinstance(baseline, MMGBaseline):
         return baseline.force_model.mass_matrix, "identified"

@@ -326,6 +326,7 @@ class ProtocolEvaluation:
             return self._horizon_errors
         from residnet.evaluation.freerun import compute_integration_errors
 
+        # windows and usable samples are the same for all models
         any_errors = next(iter(self.errors.values()))
         mean_speeds = self._mean_speeds()
         max_steps = int(any_errors.window_lengths.max()) - 1
@@ -487,9 +488,7 @@ class ProtocolEvaluation:
         ]
 
     def compare_with_references(self) -> dict[str, dict[str, PairedDifference | None]]:
-        """Return paired differences of each model from constant velocity and to the first
-        baseline.
-        """
+        """Return the paired differences of each model to constant velocity and first baseline."""
         all_windows = np.ones(len(self.log_indices), dtype=bool)
         reference_names = [CONSTANT_VELOCITY] if CONSTANT_VELOCITY in self.errors else []
         reference_names += [

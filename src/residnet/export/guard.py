@@ -81,7 +81,7 @@ class GuardRanges(nn.Module):
         self.accepted_upper = nn.Buffer((upper + margin).to(dtype))
         self.midpoint = nn.Buffer((0.5 * (lower + upper)).to(dtype))
         flag_margin = torch.zeros_like(margin) if flag_margin is None else flag_margin
-        # an accepted value without a flag needs no replacement
+        # a value beyond the accepted range is replaced, and is therefore always flagged
         flag_margin = torch.minimum(flag_margin, margin)
         self.unflagged_lower = nn.Buffer((lower - flag_margin).to(dtype))
         self.unflagged_upper = nn.Buffer((upper + flag_margin).to(dtype))
@@ -97,10 +97,10 @@ class GuardRanges(nn.Module):
 
     def replace_unaccepted(self, values: Tensor) -> Tensor:
         """Return values [..., k] with unaccepted ones replaced, see the rules of this module."""
-        is_measurement = (values >= self.accepted_lower) & (values <= self.accepted_upper)
+        is_entry_accepted = (values >= self.accepted_lower) & (values <= self.accepted_upper)
         clamped = torch.minimum(torch.maximum(values, self.lower), self.upper)
         return torch.where(
-            is_measurement, values, torch.where(torch.isnan(values), self.midpoint, clamped)
+            is_entry_accepted, values, torch.where(torch.isnan(values), self.midpoint, clamped)
         )
 
 

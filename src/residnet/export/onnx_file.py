@@ -178,7 +178,7 @@ def _write_graph(exported: Exportable, file: Path, dtype: torch.dtype) -> None:
                 _NonEmptyStep(exported, dtype).eval(),
                 tuple(torch.zeros(2, n_entries, dtype=dtype) for _, n_entries in inputs),
                 dynamo=True,
-                # torch's own folding changes what a step in six degrees of freedom answers
+                # constant folding by torch changes the results of steps in six degrees of freedom
                 optimize=False,
                 verbose=False,
                 input_names=[name for name, _ in inputs],
@@ -221,7 +221,7 @@ def _translate_arctangent(y: Any, x: Any = None) -> Any:
     zero = make_constant(0.0)
     pi = make_constant(math.pi)
     x = make_constant(1.0) if x is None else x
-    # nothing points ahead, as in torch
+    # the angle of the zero vector is zero, as in torch
     x = op.Where(op.Equal(op.Add(op.Abs(x), op.Abs(y)), zero), make_constant(1.0), x)
     single_precision_angle = op.Cast(
         op.Atan(op.Cast(op.Div(y, x), to=ir.DataType.FLOAT)), to=double_type

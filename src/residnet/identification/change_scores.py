@@ -276,7 +276,7 @@ class ScoreDistribution:
         )
 
     def select_changes(self, change_indices: Sequence[int]) -> ScoreDistribution:
-        """Return the distribution of selected changes, by index."""
+        """Return the distribution of the changes with these indices only."""
         indices = list(change_indices)
         selected_fields = {
             name: getattr(self, name)[indices]

@@ -30,7 +30,7 @@ from residnet.core.layout import (
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.fitter import FittedModel
-from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators, command_name_for
+from residnet.manoeuvres.actuated import ActuatedDynamics, ConfiguredActuators, command_name_for
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
 from residnet.manoeuvres.input_shares import InputShare
@@ -450,7 +450,7 @@ def _simulate_manoeuvres(
     """Simulate the manoeuvres whose prediction is to be improved, with the fitted model."""
     spec = fitted_model.spec
     model = fitted_model.model.double()
-    actuators = GivenActuators(input_shares, spec.signals.exogenous, spec.dt)
+    actuators = ConfiguredActuators(input_shares, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.regressor_columns, spec.hold, actuators)
     initial_state = actuated.make_initial_state(1)
     # trials start at the middle of the training range of the speed, where the model is reliable

@@ -411,7 +411,7 @@ def compute_network_step(data_summary: TrainingDataSummary) -> float:
 
 
 def count_networks(data_summary: TrainingDataSummary) -> int:
-    """Return the number of networks in an ensemble."""
+    """Return the number of networks in an ensemble, which short logs need to be larger."""
     return 4 if has_long_logs(data_summary) else 6
 
 

@@ -104,7 +104,7 @@ class PlantActuators(Actuators):
 
 
 @final
-class GivenActuators(Actuators):
+class ConfiguredActuators(Actuators):
     """Actuators with limits, rates, lags and delays from a config instead of a plant.
 
     A command takes effect after its delay. The position then follows it with a first-order lag,

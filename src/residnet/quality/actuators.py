@@ -37,7 +37,7 @@ _REVERSE_SIGN_AND_CHECK_FIX = f"{_REVERSE_SIGN_FIX}, and check the sign of r and
 
 
 def find_propellers(log: LogStatistics) -> list[str]:
-    """Return the inputs that are propeller revolutions."""
+    """Return the inputs in revolutions per second that are not always zero."""
     revolution_inputs = [
         name
         for name in log.inputs

@@ -881,7 +881,7 @@ def _partition_logs(fleet: Fleet, start: Sequence[int]) -> Consensus:
 
 
 def replace_channels(log: LogStatistics, channels: Mapping[str, np.ndarray]) -> LogStatistics:
-    """Return a record with some channels replaced."""
+    """Return the log with new or replaced channels [T]; its statistics are computed again."""
     return LogStatistics(log.log.replace(channels={**log.log.channels, **channels}), log.inputs)
 
 

@@ -403,7 +403,7 @@ class RunFiles:
         return next((split for split in _SPLIT_PRIORITY if split in self.splits), self.splits[0])
 
     @cached_property
-    def logs_of_fit(self) -> tuple[int, int]:
+    def n_logs_of_fit_and_all(self) -> tuple[int, int]:
         """Number of evaluated logs that are among the data of the fit, and number of all logs.
 
         Both are 0 for the run of a fit; they are known for `residnet evaluate` on further logs.
@@ -419,7 +419,7 @@ class RunFiles:
     @property
     def report_data_name(self) -> str:
         """Name of the data of the report; logs that trained the model are not external."""
-        n_logs_of_fit, n_logs = self.logs_of_fit
+        n_logs_of_fit, n_logs = self.n_logs_of_fit_and_all
         is_data_of_fit = n_logs_of_fit > 0 and n_logs_of_fit == n_logs
         return "data of the fit" if is_data_of_fit else f"{self.report_split} data"
 

@@ -3,9 +3,9 @@
 In a closed loop the rudder is correlated with the disturbances that it counteracts, and a fit of
 the yaw rate to the rudder is biased. Steps of the set point are not correlated with disturbances.
 The two-stage method first explains rudder and yaw rate by the set point alone, a finite impulse
-response by least squares, and then fits the response of the one to the other: what the set point
-does not explain, and with it the disturbances, is removed from both. Both stages together are an
-estimate by instrumental variables with the set point as the instrument. Sources: P. M. J. Van den
+response by least squares. It then fits the explained yaw rate to the explained rudder, from both of
+which the disturbances are removed. Both stages together are an estimate by instrumental variables
+with the set point as the instrument. Sources: P. M. J. Van den
 Hof and R. J. P. Schrama, An indirect method for transfer function estimation from closed loop data,
 Automatica 29 (1993); U. Forssell and L. Ljung, Closed-loop identification revisited, Automatica 35
 (1999).

@@ -1,7 +1,7 @@
 """Sections of a sheet or a text: the rows of each of several tests in one table.
 
 Tests follow each other below a title, below the column names, behind blank rows, or where the time
-restarts; or they stand side by side with the same column names.
+restarts; or they are side by side with the same column names.
 """
 
 from __future__ import annotations

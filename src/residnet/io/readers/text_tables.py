@@ -60,8 +60,8 @@ class HeaderlessTableError(DataError):
 
     Attributes:
         n_columns: number of columns.
-        proposed_names: words of a line above the numbers that are as many as the columns and mostly
-            names of channels; empty if there is no such line.
+        proposed_names: one word for each column from a line above the numbers, most of them names
+            of channels; empty without such a line.
     """
 
     def __init__(self, path: Path, first_row: Sequence[str], proposed_names: Sequence[str]) -> None:
@@ -519,7 +519,7 @@ def _detect_values(
 def _propose_names(lines: Sequence[str], n_columns: int) -> list[str]:
     """Return the last words of a line of prose above the numbers that look like column names.
 
-    They are as many as the columns, all different, and at least half of them name the time or a
+    There is one different word for each column, and at least half of the words name the time or a
     channel. Empty if no line has such words.
     """
     for line in reversed(lines):

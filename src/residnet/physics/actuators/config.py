@@ -205,7 +205,7 @@ class ServoSpec:
 
     @property
     def n_delay_steps(self) -> int:
-        """Number of steps of the delay line."""
+        """Dead time in steps of the plant, rounded; 0 without a delay."""
         delay_step = self.config.delay_step
         return round(self.config.dead_time / delay_step) if delay_step else 0
 

@@ -54,8 +54,8 @@ def compare(hypotheses: Mapping[str, Hypothesis], step: float) -> list[RankedHyp
     """Rank hypotheses about the channels of a log by their evidence, the best first.
 
     Successive residuals of filtered channels are not independent. The differences of the BIC are
-    therefore multiplied by the share of independent samples of the best hypothesis, for which the
-    residuals are an autoregressive process of first order.
+    therefore multiplied by the share of independent samples, (1 - a) / (1 + a) for the largest
+    autocorrelation a of the residuals of the best hypothesis (autoregression of first order).
 
     Args:
         hypotheses: name -> hypothesis.

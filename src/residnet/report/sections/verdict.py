@@ -102,7 +102,7 @@ def collect_evidence(run: RunFiles, selected: str) -> VerdictEvidence:
         for finding in (() if inspection is None else inspection.together)
         if finding.code == "one_side" and finding.level != "note"
     )
-    n_logs_of_fit, n_logs = run.logs_of_fit
+    n_logs_of_fit, n_logs = run.n_logs_of_fit_and_all
     return VerdictEvidence(
         selected,
         split,
@@ -254,7 +254,7 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
             else "."
         ),
         ""
-        if run.report_split in UNSEEN_SPLITS and not run.logs_of_fit[0]
+        if run.report_split in UNSEEN_SPLITS and not run.n_logs_of_fit_and_all[0]
         else "Fit or selection used these data: errors on new data are larger.",
         "Predictor: the model that is rated and exported by default. Selected: the best single"
         " model."

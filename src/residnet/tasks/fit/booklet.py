@@ -25,7 +25,7 @@ from residnet.evaluation.booklet import (
 from residnet.identification.fitter import FitStore, FittedModel, Fitter
 from residnet.identification.prepared import PreparedSplits
 from residnet.identification.settings import FitSettings
-from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators
+from residnet.manoeuvres.actuated import ActuatedDynamics, ConfiguredActuators
 from residnet.manoeuvres.base import Helm, Manoeuvre
 from residnet.manoeuvres.closed_loop import TurningCircle, Zigzag
 from residnet.manoeuvres.indices import SteeredZigzag, identify_zigzag
@@ -186,7 +186,7 @@ def build_booklet_vessel(
     """Return the model with its actuators as a simulated vessel; batch rows are draws."""
     spec = fitted_model.spec
     model = fitted_model.model.double()
-    gear = GivenActuators(inputs, spec.signals.exogenous, spec.dt)
+    gear = ConfiguredActuators(inputs, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.regressor_columns, spec.hold, gear)
     start = actuated.make_initial_state(1)
     for name, value in config.initial.items():

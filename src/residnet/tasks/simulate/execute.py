@@ -14,7 +14,7 @@ from residnet.core.progress import log_message
 from residnet.dynamics.store import load_model
 from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.evaluation.booklet import build_index_rows, build_indices_file
-from residnet.manoeuvres.actuated import ActuatedDynamics, GivenActuators, PlantActuators
+from residnet.manoeuvres.actuated import ActuatedDynamics, ConfiguredActuators, PlantActuators
 from residnet.manoeuvres.base import Helm
 from residnet.manoeuvres.trials import (
     ManoeuvreRun,
@@ -200,10 +200,10 @@ def _build_model_craft(
         )
     vessel = choice.actuators or programme.vessel
     plant = None
-    actuators: GivenActuators | PlantActuators
+    actuators: ConfiguredActuators | PlantActuators
     forces: Callable[[Tensor], Tensor] | None = None
     if choice.inputs:
-        actuators = GivenActuators(choice.inputs, spec.signals.exogenous, step)
+        actuators = ConfiguredActuators(choice.inputs, spec.signals.exogenous, step)
     elif vessel is not None:
         plant = load_vessel(vessel).build()
         actuators = PlantActuators(plant, step, programme.substeps)
