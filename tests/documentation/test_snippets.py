@@ -10,7 +10,6 @@ import ast
 import json
 import os
 import re
-import runpy
 import shlex
 import shutil
 import subprocess
@@ -22,6 +21,7 @@ from typing import Any
 import pandas as pd
 import pytest
 import readability
+import short_configs
 import yaml
 from tiny import call
 from typer.main import get_command
@@ -300,10 +300,11 @@ residnet(*words)
 
 def short_runs() -> dict[str, tuple[str, ...]]:
     """Return the overrides with which the stage `configs` shortens runs, by a config's name."""
-    rows = runpy.run_path(str(ROOT / "scripts" / "ci" / "short_configs.py"), run_name="")["SHORT"]
     short = {
-        name.split("/")[-1]: tuple(key.replace("{runs}", "runs") for key in row.overrides)
-        for name, row in rows.items()
+        name.split("/")[-1]: tuple(
+            key.replace("{runs}", "runs") for key in short_configs.shorten_config(name).overrides
+        )
+        for name in short_configs.list_shipped_configs()
     }
     own = [key for key in short["autopilot_ship"] if not key.startswith("policies.constants")]
     return {
