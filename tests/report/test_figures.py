@@ -383,3 +383,25 @@ def test_tick_labels_of_low_panels_do_not_overlap(amplitude: float) -> None:
         )
         assert len(extents) >= 2
         assert all(below[1] < above[0] for below, above in pairwise(extents))
+
+
+@pytest.mark.parametrize(("lowest", "highest"), [(0.02, 0.61), (0.9, 12.0), (0.003, 40.0)])
+def test_a_logarithmic_axis_has_two_labels_or_more(lowest: float, highest: float) -> None:
+    curve = (T, np.geomspace(lowest, highest, len(T)))
+    panels = [Panel("error [m]", "t [s]", y_log=True, height=140)]
+    figure = Figure(
+        "log", "Log", "", {"a": GlyphStyle("a", BLUE)}, panels, [Case("", [{"a": curve}])]
+    )
+    canvas = render_matplotlib(figure)
+    canvas.draw_without_rendering()
+    (axes,) = canvas.axes
+    lower, upper = axes.get_ylim()
+    ticks = [*axes.yaxis.get_major_ticks(), *axes.yaxis.get_minor_ticks()]
+    shown = [tick.label1 for tick in ticks if lower <= tick.get_loc() <= upper]
+    extents = sorted(
+        (label.get_window_extent().y0, label.get_window_extent().y1)
+        for label in shown
+        if label.get_text()
+    )
+    assert len(extents) >= 2
+    assert all(below[1] < above[0] for below, above in pairwise(extents))

@@ -92,6 +92,25 @@ def test_every_block_is_drawn_and_nothing_is_loaded_or_run(tmp_path: Path) -> No
     assert not list(tmp_path.glob("*.partial"))
 
 
+@pytest.mark.parametrize(("height", "is_tall"), [(632, False), (800, True), (1556, True)])
+def test_wide_pictures_share_a_printed_page(height: int, is_tall: bool, tmp_path: Path) -> None:
+    Image.new("RGB", (840, height), "white").save(tmp_path / "track.png")
+    figure = Figure(
+        "track",
+        "Track",
+        "",
+        {},
+        [Panel("u")],
+        [Case("", [{}])],
+        static_images=[tmp_path / "track.png"],
+    )
+    text = write_page(tmp_path, "made", "", ["Done."], [Section("Pictures", [figure])]).read_text()
+    (attributes,) = re.findall(r'<img src="[^"]*"([^>]*)>', text)
+    assert f'width="840" height="{height}"' in attributes
+    assert ('class="tall"' in attributes) == is_tall
+    assert "figure img.tall" in text
+
+
 def test_provenance_and_configuration_come_last_and_folded(tmp_path: Path) -> None:
     record = provenance(inputs={"a.csv": "f00d"})
     (tmp_path / "provenance.json").write_text(json.dumps(record))

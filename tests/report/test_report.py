@@ -195,7 +195,7 @@ def test_five_questions_are_answered_before_the_first_section(level: str, tmp_pa
 
 
 NEXT_STEPS = {
-    "good": "test your controller",
+    "good": "Test your controller in simulation",
     "limited": "Record more logs",
     "do not use": "Record more logs",
     "too few windows": "Record more test logs",

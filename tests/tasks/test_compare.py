@@ -49,7 +49,10 @@ def test_two_runs_side_by_side(two: list[Path], tmp_path: Path) -> None:
     entry = compare_paired(open_fit_runs(two))["whole"]["second"]
     assert (entry.nrmse, entry.difference.nrmse_mean) == pytest.approx((0.04, -0.04))
     assert entry.difference.ci95 == pytest.approx((-0.04, -0.04))
-    assert "second (plsr) has the lowest error: -0.040 against first (significant)." in text
+    assert (
+        "second (plsr) has the lowest error: NRMSE 0.0400 instead of 0.0800 of first (plsr);"
+        " the difference is significant." in text
+    )
     assert "seed" in text
     assert "same" not in text
     assert "Where the runs differ" in plain(page)

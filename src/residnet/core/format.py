@@ -92,6 +92,11 @@ def format_integer(value: float) -> str:
     return f"{round(value):,}".replace(",", "\u2009")
 
 
+def format_seconds(seconds: float) -> str:
+    """Format a duration with its unit, rounded to a tenth of a second."""
+    return f"{round(seconds, 1):g} s"
+
+
 def format_percent_change(value: float) -> str:
     """Format a change given in percent with its sign, rounded to 1 %."""
     return f"{value:+.0f} %".replace("-", "−") if abs(value) >= 0.5 else "0 %"

@@ -12,6 +12,7 @@ from residnet.core.format import (
     format_count,
     format_interval,
     format_number,
+    format_seconds,
     join_list,
 )
 from residnet.core.model_names import CONSTANT_VELOCITY, PLANT
@@ -333,7 +334,7 @@ def list_shortfalls_of_good(evidence: VerdictEvidence, row: HorizonRow) -> list[
         floor = row.floor.position or 0.0
         shortfalls.append(
             "the measured velocities do not reproduce the measured track: integrated over"
-            f" {format_number(row.seconds, 2)} s they deviate by {format_number(floor, 2)} m"
+            f" {format_seconds(row.seconds)} they deviate by {format_number(floor, 2)} m"
             f" ({100.0 * floor / row.sailed:.0f} % of the distance travelled;"
             f" good: at most {100.0 * _MAX_DISTANCE_SHARE:.0f} %); check frames, units and clocks"
         )
@@ -456,7 +457,7 @@ def describe_main_horizon(evidence: VerdictEvidence, main: ProtocolHorizon) -> l
     """
     row = main.row
     errors_text = (
-        f"After a {format_number(row.seconds, 2)} s free run"
+        f"After a {format_seconds(row.seconds)} free run"
         f" {_describe_errors(evidence.selected, row)}."
     )
     error_names = list(row.models[evidence.selected].by_name)
@@ -510,11 +511,11 @@ def _describe_shorter_horizons(evidence: VerdictEvidence, row: HorizonRow) -> st
         n_holding = next((i for i, (_, other) in enumerate(ranks) if other > rank), len(ranks))
         seconds = ranks[n_holding - 1][0] if n_holding else 0.0
         if seconds > previous_seconds:
-            texts.append(f"{levels[rank]} up to {format_number(seconds, 2)} s")
+            texts.append(f"{levels[rank]} up to {format_seconds(seconds)}")
             previous_seconds = seconds
     if not texts:
         return ""
-    return f" for {format_number(row.seconds, 2)} s, {join_list(texts)}"
+    return f" for {format_seconds(row.seconds)}, {join_list(texts)}"
 
 
 def _describe_errors(model: str, row: HorizonRow) -> str:
@@ -562,7 +563,7 @@ def describe_references(evidence: VerdictEvidence, main: ProtocolHorizon) -> lis
         )
     other_horizons = [
         f"{_format_pose_errors(horizon.row.models[evidence.selected])} after"
-        f" {horizon.row.seconds:.4g} s ({rate_horizon(evidence, horizon.row)})"
+        f" {format_seconds(horizon.row.seconds)} ({rate_horizon(evidence, horizon.row)})"
         for horizon in known_horizons(evidence)
         if horizon.row.seconds != row.seconds
     ]
@@ -633,7 +634,7 @@ def list_model_objections(evidence: VerdictEvidence) -> list[str]:
     main = main_horizon(evidence)
     if main is not None and _is_sufficient(main.row, evidence.selected):
         objections += [
-            f"in free runs of {format_number(main.row.seconds, 2)} s on {evidence.data_name}"
+            f"in free runs of {format_seconds(main.row.seconds)} on {evidence.data_name}"
             f" {shortfall}"
             for shortfall in list_shortfalls_of_limited(evidence, main.row)
         ]
@@ -705,7 +706,7 @@ def compare_velocity_errors(evidence: VerdictEvidence) -> str:
             if reference_row.mean_nrmse > 0
             else 0.0
         )
-        direction = "lower" if percent_change <= 0.0 else "HIGHER"
+        direction = "lower" if percent_change <= 0.0 else "higher"
         comparisons.append(
             f"{abs(percent_change):.0f} % {direction} than those of {label}"
             f"{_format_paired_interval(evidence, reference_name)}"

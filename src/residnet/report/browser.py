@@ -165,7 +165,10 @@ def _build_canvas(
         if names:
             axis.ticker = models.FixedTicker(ticks=[float(tick) for tick in names])
             axis.major_label_overrides = {float(tick): text for tick, text in names.items()}
-        elif not log:
+            continue
+        # in a low panel, and between powers of ten, labels would lie on each other
+        axis.major_label_policy = models.NoOverlap(min_distance=2)
+        if not log:
             step = 1.0 if count == 5 and figure.has_integer_axis(number) else 0.0
             axis.ticker = models.BasicTicker(desired_num_ticks=count, min_interval=step)
     lines = [line for name in panel.x_names.values() for line in name.splitlines() or [""]]

@@ -228,7 +228,11 @@ def _break_long_names(text: str) -> Markup:
 
 
 def _image_size_attributes(path: Path) -> Markup:
-    """Return the width and height attributes of an image, which reserve its space while loading."""
+    """Return the width and height attributes of an image, which reserve its space while loading.
+
+    An image that is nearly as high as wide or higher has the class `tall`, which allows it most of
+    a printed page.
+    """
     from PIL import Image
 
     try:
@@ -238,7 +242,8 @@ def _image_size_attributes(path: Path) -> Markup:
         raise UsageError(
             f"{path}: not readable as a picture ({error}); restore the folder or run it again"
         ) from None
-    return Markup(f' width="{width}" height="{height}"')
+    tall = ' class="tall"' if height > 0.8 * width else ""
+    return Markup(f' width="{width}" height="{height}"{tall}')
 
 
 _GLOSSARY_ENTRY = re.compile(r"^(?P<terms>\S.*)\n:\s+(?P<text>.*)$", re.MULTILINE)

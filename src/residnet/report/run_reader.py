@@ -14,7 +14,13 @@ import numpy as np
 from residnet.core.config import load_mapping
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import make_file_stem, read_table
-from residnet.core.format import DISPLAY_UNITS, DisplayUnit, display_unit, format_range
+from residnet.core.format import (
+    DISPLAY_UNITS,
+    DisplayUnit,
+    display_unit,
+    format_range,
+    format_seconds,
+)
 from residnet.core.frames import wrap_angle_array
 from residnet.core.layout import SIX_DOF_LAYOUT, SURGE_SWAY_YAW, DegreesOfFreedom
 from residnet.core.model_names import BASELINE, CONSTANT_VELOCITY, PLANT
@@ -473,7 +479,7 @@ class RunFiles:
         length = self._window_length(self.main_protocol)
         if self.main_horizon is not None:
             length = self.main_horizon.seconds
-        return f"after {length:g} s" if length else "at the end"
+        return f"after {format_seconds(length)}" if length else "at the end"
 
     @property
     def evaluation(self) -> EvaluationSettings:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -302,7 +303,10 @@ def _format_axis(
 
         def format_minor_tick(value: float, _: int) -> str:
             lower, upper = sorted(axis.get_view_interval())
-            return f"{value:g}" if upper < _MAX_LABELLED_RATIO * lower else ""
+            n_powers = math.floor(math.log10(upper)) - math.ceil(math.log10(lower)) + 1
+            # a single label has no scale
+            is_labelled = upper < _MAX_LABELLED_RATIO * lower or n_powers < 2
+            return f"{value:g}" if is_labelled else ""
 
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from residnet.core.errors import UsageError
-from residnet.core.format import format_number, format_signed
+from residnet.core.format import format_count, format_number, format_signed
 from residnet.core.ownership import record_folder
 from residnet.evaluation.intervals import make_resampling_blocks, paired_difference
 from residnet.evaluation.records import PairedDifference
@@ -111,7 +111,10 @@ def compare_runs(paths: Sequence[Path], output_folder: Path) -> tuple[str, Path]
             first_protocol = {protocol: comparisons[protocol] for protocol in list(comparisons)[:1]}
             # the first screen has space for NRMSE, difference and interval of each run only
             summary_table = _build_paired_table(runs, first_protocol).select_columns(3, 6)
-            summary_table.caption = f"Models of the verdicts, {next(iter(first_protocol))}."
+            summary_table.caption = (
+                f"The model of each run's verdict, {next(iter(first_protocol))}. NRMSE: velocity"
+                f" errors divided by the scales of {runs[0].name}; difference from {runs[0].name}."
+            )
             figure = _plot_error_growth(runs, output_folder)
             # the first picture of a page needs no JavaScript
             sections.append(Section("", [figure.preview(), summary_table]))
@@ -317,15 +320,21 @@ def _write_conclusion(
     if not comparisons:
         return "The runs have no common window: their errors cannot be compared in pairs."
     protocol, entries = next(iter(comparisons.items()))
+    reference = runs[0]
+    reference_error = entries[reference.name].nrmse
     best_run = min(runs, key=lambda run: entries[run.name].nrmse)
-    if best_run is runs[0]:
-        return f"Over the common windows of {protocol}, no run is better than {best_run.name}."
+    windows_text = f"Over {format_count(entries[best_run.name].windows, 'common window')} of"
+    if best_run is reference:
+        return (
+            f"{windows_text} {protocol}, no run has a lower error than {reference.name}"
+            f" ({reference.model}, NRMSE {format_number(reference_error)})."
+        )
     entry = entries[best_run.name]
-    certainty = " (significant)." if entry.difference.excludes_zero else " (not significant)."
+    certainty = "significant" if entry.difference.excludes_zero else "not significant"
     return (
-        f"Over {entry.windows} common windows of {protocol}, {best_run.name}"
-        f" ({best_run.model}) has"
-        f" the lowest error: {entry.difference.nrmse_mean:+.3f} against {runs[0].name}{certainty}"
+        f"{windows_text} {protocol}, {best_run.name} ({best_run.model}) has the lowest error:"
+        f" NRMSE {format_number(entry.nrmse)} instead of {format_number(reference_error)} of"
+        f" {reference.name} ({reference.model}); the difference is {certainty}."
     )
 
 

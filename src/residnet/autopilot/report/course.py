@@ -85,7 +85,7 @@ def _iterate_course_figures(
     styles = _run_styles(tracks, "controller")
     yield Figure(
         "courses",
-        "Flights past the buoys",
+        "Tracks past the buoys",
         f"{' '.join(PROTOCOL_RULES[name] for name in settings.protocols)} North is"
         " up, and scales of"
         " the track are equal. S and P name the side on which a buoy is left, dotted circles are"
@@ -132,7 +132,7 @@ def _run_styles(runs: pd.DataFrame, column: str) -> dict[str, GlyphStyle]:
             f"{name}{_GUIDANCE_SUFFIXES[guidance]}",
             COLORS[controllers.index(name) % len(COLORS)],
             _DASHES[guidance],
-            # flights that coincide show beside each other
+            # tracks that coincide show beside each other
             max(2.6 - 0.7 * controllers.index(name), 1.0),
         )
         for name, guidance in model_pairs.itertuples(index=False, name=None)
@@ -250,7 +250,7 @@ def _spread_figure(spread_runs: pd.DataFrame) -> Figure:
         panel["median"] = join_with_gaps(medians)
         n_unfinished = len(runs) - int(runs["finished"].sum())
         note = (
-            f"{n_unfinished} of {len(runs)} flights did not finish and are left out."
+            f"{n_unfinished} of {len(runs)} simulations did not finish and are left out."
             if n_unfinished
             else ""
         )
@@ -265,8 +265,8 @@ def _spread_figure(spread_runs: pd.DataFrame) -> Figure:
         "spread",
         "Spread of vessels and currents",
         "Each point is one vessel in one current. It is filled where all buoys were passed as"
-        " demanded, and a ring elsewhere; the bar is the median. Flights that did not finish are"
-        " left out.",
+        " demanded, and a ring elsewhere; the bar is the median. Simulations that did"
+        " not finish are left out.",
         point_styles | {"median": GlyphStyle("median", width=1.2, z_order=4)},
         [
             Panel(
@@ -299,7 +299,9 @@ def sections(run: RunFiles) -> list[Section]:
             previews = [
                 figure.preview() for figure in read_figures(run.path / "figures", "courses")
             ]
-            sections_written.append(Section("", [*previews, nominal_results.select_columns(0, 4)]))
+            summary_table = nominal_results.select_columns(0, 4)
+            summary_table.caption = _summary_caption(nominal_rows)
+            sections_written.append(Section("", [*previews, summary_table]))
         if spread_rows:
             blocks.append(Section("Spread of vessels and currents", [spread_table(spread_rows)]))
         sections_written.append(Section(f"Protocol {protocol}", blocks))
@@ -324,6 +326,16 @@ def _rows_by_protocol(
 def _rule_text(rows: Sequence[CourseRow]) -> str:
     reference_text = f"The reference takes {rows[0].reference_time:.2f} s."
     return f"{PROTOCOL_RULES[rows[0].protocol]} {reference_text}"
+
+
+def _summary_caption(rows: Sequence[CourseRow]) -> str:
+    """Return what the columns of the table on the first screen mean."""
+    if rows[0].protocol != "enter":
+        return f"{PROTOCOL_RULES[rows[0].protocol]} Clear: passed outside the circle."
+    return (
+        f"{PROTOCOL_RULES[rows[0].protocol]} Ratio: course time divided by"
+        f" {rows[0].reference_time:.2f} s, the time for the shortest computed course."
+    )
 
 
 def tables_text(rows: Sequence[AnyCourseRow]) -> str:
@@ -435,5 +447,5 @@ def _spread_text(spread_config: CourseSpreadConfig | None) -> str:
         f" {lower_time:g} to {upper_time:g} times the time constants{bias}, in currents of"
         f" {spread_config.current:g} m/s from all directions. Ratios of course times do not"
         " allow for"
-        " the current. Passed: share of the flights that passed all buoys as demanded."
+        " the current. Passed: share of the simulations that passed all buoys as demanded."
     )

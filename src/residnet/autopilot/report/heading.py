@@ -385,8 +385,8 @@ def _distribution_figure(
         "distributions",
         f"Random vessels of {name}",
         f"Share of {len(plants) // len(kinds)} random vessels of the spread that stay below a"
-        " value. A change that had not settled at the end of its flight counts with the flight's"
-        " length. Controllers that seldom settle may lie beyond the axes.",
+        " value. A change that had not settled at the end of its simulation counts with the"
+        " duration of the simulation. Controllers that seldom settle may lie beyond the axes.",
         styles,
         _share_panels(quantities, limits, "vessels"),
         [Case("", _cumulative_shares(plants, styles, quantities))],
@@ -413,12 +413,12 @@ def _cost_figure(
     styles = _controller_styles(kinds)
     return Figure(
         "conditions",
-        f"Flights of {name} under the stated conditions",
-        f"Share of {conditioned_runs['flight'].nunique()} flights under the stated conditions that"
-        " stay below"
-        " a value. The two per cent of all flights with the largest values may lie beyond an axis.",
+        f"Simulations of {name} under the stated conditions",
+        f"Share of {conditioned_runs['flight'].nunique()} simulations under the stated conditions"
+        " that stay below a value. The two per cent with the largest values may lie beyond an"
+        " axis.",
         styles,
-        _share_panels(quantities, limits, "flights"),
+        _share_panels(quantities, limits, "simulations"),
         [Case("", _cumulative_shares(conditioned_runs, styles, quantities))],
         columns=2,
     )
@@ -774,10 +774,9 @@ def _conditions_text(evaluation: EvaluationConditions) -> list[str]:
         f" {'decimetre' if depth else 'deg'} of overshoot and {conditions.travel_weight:g} s"
         " per deg"
         f" of {axis_labels.rudder} travel. Swing: largest movement, peak to"
-        f" peak, from {settled_time(conditions.duration):.3g} s after a change on in flights"
-        " without"
-        " noise and disturbance. Classical controllers are tuned by the same cost, by differential"
-        " evolution.",
+        f" peak, from {settled_time(conditions.duration):.3g} s after a change on in"
+        " simulations without noise and disturbance. Classical controllers are"
+        " tuned by the same cost, by differential evolution.",
     ]
     if conditions.wind or conditions.current:
         wind = (

@@ -6,7 +6,13 @@ from collections import Counter
 from pathlib import PurePosixPath
 from typing import NamedTuple
 
-from residnet.core.format import format_count, format_interval, format_number, join_list
+from residnet.core.format import (
+    format_count,
+    format_interval,
+    format_number,
+    format_seconds,
+    join_list,
+)
 from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.core.run_records import ExportsFile
 from residnet.evaluation.limits_records import HorizonRow
@@ -114,7 +120,7 @@ def _describe_evaluation_data(run: RunFiles) -> str:
     row = run.find_row(run.main_model, run.report_split, run.main_protocol)
     assert row is not None, "checked by the caller"
     n_windows = row.windows if horizon is None else horizon.windows
-    length = "" if horizon is None else f" of {format_number(horizon.seconds, 2)} s"
+    length = "" if horizon is None else f" of {format_seconds(horizon.seconds)}"
     text = f"{format_count(n_windows, 'free run')}{length}"
     text += (
         f" on {format_count(len(logs), f'{run.report_split} log')}"
@@ -186,7 +192,7 @@ def _recommend_next_step(run: RunFiles, evidence: VerdictEvidence) -> str:
             " this folder)."
         )
     if level == GOOD_LEVEL:
-        return "Export the model, and test your controller with it in simulation."
+        return "Test your controller in simulation with the exported model."
     if level == DO_NOT_USE:
         return (
             "Record more logs of such manoeuvres and run the fit again; a training set of other"

@@ -13,6 +13,7 @@ from residnet.core.format import (
     format_minus_signs,
     format_number,
     format_percent_change,
+    format_seconds,
 )
 from residnet.core.model_names import CONSTANT_VELOCITY
 from residnet.evaluation.data_records import ExcitationFile
@@ -260,7 +261,9 @@ def opening_section(run: RunFiles, figures: Sequence[Figure]) -> Section | None:
         " model."
         if run.predictor != run.selected
         else "",
+        "Baseline: the identified physics without a learned part." if run.baseline in rows else "",
         "constant_velocity: the initial velocities are held." if CONSTANT_VELOCITY in rows else "",
+        "Plant: the simulator that made the logs." if run.plant in rows else "",
         "Noise floor: the error of the integrated measured velocities."
         if any(line.model is None for line in lines)
         else "",
@@ -315,7 +318,7 @@ def _build_horizon_table(run: RunFiles) -> Table | None:
     return build_table(
         horizons,
         [
-            (f"{run.main_model} after", lambda horizon: f"{horizon.row.seconds:.4g} s"),
+            (f"{run.main_model} after", lambda horizon: format_seconds(horizon.row.seconds)),
             *(
                 (
                     f"{name} [{unit}]",
