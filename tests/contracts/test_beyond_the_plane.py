@@ -80,7 +80,7 @@ HULL = RegressorsConfig(sets=("fossen",), ridge=1e-4)
 HEADS = [RidgeConfig(), GRUEnsembleConfig(hidden_size=6)]
 
 
-def test_an_angle_has_no_equation_of_its_own_and_restores() -> None:
+def test_regressors_fit_of_roll_has_restoring_and_damping() -> None:
     samples = make_example_samples(signals=ROLLING_SIGNALS)
     config = RegressorsConfig(bounded=True, dissipative=True)
     baseline = config.build(samples.names)
@@ -109,7 +109,7 @@ def started(
 
 
 @pytest.mark.parametrize(("scheme", "head"), [*zip(get_args(Integrator), 2 * HEADS, strict=True)])
-def test_the_roll_angle_moves_by_the_roll_rate(scheme: Integrator, head: Any) -> None:
+def test_rollout_roll_angle_follows_the_roll_rate(scheme: Integrator, head: Any) -> None:
     model, x, w, s = started(head, ROLLING_SIGNALS, scheme, 60)
     states = trace_rollout(Rollout(model), 10_000)(x, w, s)[0]
     alone = [x]
@@ -135,7 +135,7 @@ def test_the_roll_angle_moves_by_the_roll_rate(scheme: Integrator, head: Any) ->
     np.testing.assert_array_equal(to_horizontal_plane(nu[:, :3]), nu[:, :3])
 
 
-def test_rotations_are_those_of_quaternions() -> None:
+def test_compose_rotation_equals_quaternions() -> None:
     random = torch.Generator().manual_seed(0)
     angles, turn, vector = torch.randn(3, 40, 3, generator=random, dtype=torch.float64)
     angles[0] = torch.tensor([0.4, np.pi / 2, -0.3])
@@ -166,7 +166,7 @@ def test_rotations_are_those_of_quaternions() -> None:
 
 
 @pytest.mark.parametrize(("scheme", "head"), [*zip(get_args(Integrator), 2 * HEADS, strict=True)])
-def test_attitude_depth_and_place_follow_the_velocities(scheme: Integrator, head: Any) -> None:
+def test_rollout_in_six_dof_follows_the_velocities(scheme: Integrator, head: Any) -> None:
     model, x, w, s = started(head, SUBMERGED_SIGNALS, scheme, 40)
     deep = x.clone()
     deep[:, DEPTH] += 50.0
@@ -196,7 +196,7 @@ def test_attitude_depth_and_place_follow_the_velocities(scheme: Integrator, head
         for scheme in get_args(Integrator)
     ],
 )
-def test_sensitivities_are_the_derivatives_of_the_step(scheme: Integrator) -> None:
+def test_step_jacobian_equals_central_differences(scheme: Integrator) -> None:
     spec = make_example_spec(None, SUBMERGED_SIGNALS)
     spec = spec.model_copy(update={"integrator": scheme, "baseline": HULL})
     model = spec.build().double()
@@ -227,7 +227,7 @@ def test_sensitivities_are_the_derivatives_of_the_step(scheme: Integrator) -> No
         torch.testing.assert_close(found[:, :, j].detach(), wanted, rtol=1e-6, atol=1e-6)
 
 
-def test_a_drafted_model_swings_as_its_vessel() -> None:
+def test_chosen_integrator_keeps_the_amplitude_of_roll() -> None:
     """The roll of a torpedo has a period of ten steps of its logs."""
     rate = 6.3
     none = ("u v",)
@@ -246,7 +246,7 @@ def test_a_drafted_model_swings_as_its_vessel() -> None:
     np.testing.assert_allclose(run[0, :, ATTITUDE[0]].numpy(), wanted, atol=0.1 * 0.05)
 
 
-def test_what_logs_tell() -> None:
+def test_degrees_of_freedom_from_channels() -> None:
     def told(*names: str, moving: bool = True) -> DegreesOfFreedom:
         return DegreesOfFreedom.from_channels({name: moving * np.arange(99.0) for name in names})
 
@@ -293,7 +293,7 @@ def trials(count: int, duration: float) -> SimulatedTrials:
     return SimulatedTrials.model_validate(content)
 
 
-def test_what_logs_of_a_torpedo_tell_and_lack() -> None:
+def test_degrees_of_freedom_of_torpedo_logs() -> None:
     config = trials(2, 15.0)
     log = simulate_trials(config.draw_manoeuvres(), config)[0].measured_log
     live = DegreesOfFreedom.from_channels(log.channels)
@@ -324,7 +324,7 @@ def flown() -> list[Log]:
     return [flight.measured_log for flight in simulate_trials(config.draw_manoeuvres(), config)]
 
 
-def test_measured_velocities_lead_to_the_measured_pose() -> None:
+def test_compute_integration_errors_of_measured_velocities() -> None:
     y = np.stack([log.stack(SIX_DOF_LAYOUT.state_names) for log in flown()])
     off = compute_integration_errors(y, SUBMERGED_SIGNALS.dof, EXAMPLE_TIME_STEP)
     assert (
@@ -339,7 +339,7 @@ def test_measured_velocities_lead_to_the_measured_pose() -> None:
 
 
 @pytest.mark.parametrize("beside", ["samples", "means"])
-def test_least_squares_find_the_vessel(beside: str) -> None:
+def test_regressors_fit_finds_coefficients_of_the_vessel(beside: str) -> None:
     """Of noiseless trials: what the trials determine is that of the vessel's file."""
     signals = SUBMERGED_SIGNALS.build()
     # means are right by a smoother that softens the swing in roll
@@ -377,7 +377,7 @@ def test_least_squares_find_the_vessel(beside: str) -> None:
         assert found == pytest.approx(true[axis, term], rel=0.05)
 
 
-def test_a_draft_sets_the_rates_of_a_roll_beside_means() -> None:
+def test_preparation_plan_with_roll_uses_means() -> None:
     t = np.arange(0.0, 60.0, 0.1)
     log = Log("swing", t, dict.fromkeys(("u", "v", "r", "p", "phi", "delta"), np.sin(t)))
     for live, beside in (
@@ -398,7 +398,7 @@ def test_a_draft_sets_the_rates_of_a_roll_beside_means() -> None:
     ],
     ids=["roll", "six"],
 )
-def test_a_monitor_tells_stiffness_from_damping(
+def test_monitor_distinguishes_stiffness_from_damping(
     signals: SignalsConfig, names: tuple[str, ...]
 ) -> None:
     spec = make_example_spec(None, signals)
@@ -439,7 +439,7 @@ def test_a_monitor_tells_stiffness_from_damping(
         assert first.estimated_size == pytest.approx(-0.3, rel=0.3)
 
 
-def test_a_model_that_rolls_flies_behind_the_gear_of_its_vessel() -> None:
+def test_actuated_dynamics_with_roll_equals_rollout() -> None:
     spec = make_example_spec(RidgeConfig(), ROLLING_SIGNALS)
     plant = load_vessel("patrol_p06_linear").build()
     model = make_example_model(spec).double()
@@ -475,7 +475,7 @@ def test_a_model_that_rolls_flies_behind_the_gear_of_its_vessel() -> None:
     torch.testing.assert_close(moved[:, :8], wanted)
 
 
-def test_a_simulator_shows_the_roll(tmp_path: Path) -> None:
+def test_ardupilot_backend_reports_the_roll(tmp_path: Path) -> None:
     spec = make_example_spec(RidgeConfig(), ROLLING_SIGNALS)
     save_model(tmp_path / "models" / "example", spec, make_example_model(spec))
     accept_run(tmp_path)
@@ -498,7 +498,7 @@ def test_a_simulator_shows_the_roll(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("gain", [1.0, -1.0, 57.3])
-def test_the_doctor_sets_the_roll_rate_against_the_roll_angle(gain: float) -> None:
+def test_inspect_log_compares_roll_rate_with_roll_angle(gain: float) -> None:
     random = np.random.default_rng(2)
     t = np.arange(0.0, 120.0, 0.1)
     phi = 0.05 * np.sin(0.9 * t) + 0.001 * random.normal(size=t.size)

@@ -47,7 +47,7 @@ def samples(log: dict[str, np.ndarray]) -> Samples:
     return sampled(z, target, FORCES, t=log["t"])
 
 
-def test_force_equations_of_odin() -> None:
+def test_genetic_head_finds_force_equations_of_odin() -> None:
     """Document 000 eqs. (6.6)-(6.8)."""
     head = GeneticConfig.model_validate({"evolution": {"population": 1000}}).build(FORCES)
     data = samples({name: values[::10] for name, values in force_logs(1)[0].items()})
@@ -65,7 +65,7 @@ def test_force_equations_of_odin() -> None:
 
 
 @pytest.mark.parametrize("final", [True, False])
-def test_noise_hides_no_equation_that_a_sparse_search_finds(final: bool) -> None:
+def test_genetic_head_adopts_sparse_search_in_noise(final: bool) -> None:
     design = draw_ship(3, noise=0.1)
     config = GeneticConfig.model_validate(
         {"evolution": {"population": 20, "generations": 1}} | ({} if final else {"final": None})
@@ -86,7 +86,7 @@ def test_noise_hides_no_equation_that_a_sparse_search_finds(final: bool) -> None
             assert found == pytest.approx(wanted, rel=0.1)
 
 
-def test_saved_and_loaded_with_functions_of_sums(tmp_path: Path) -> None:
+def test_genetic_head_saved_and_loaded_is_equal(tmp_path: Path) -> None:
     evolution = {"population": 80, "generations": 3}
     config = GeneticConfig.model_validate(
         {"evolution": evolution | {"operators": ["+", "*", "abs", "sin", "/", "sqrt"]}}
@@ -122,7 +122,7 @@ def truth(u: np.ndarray, v: np.ndarray, r: np.ndarray) -> np.ndarray:
     )
 
 
-def test_tables_and_writing_say_the_same() -> None:
+def test_expression_library_equals_written_equation() -> None:
     algebra = Algebra(("u", "v", "r"), ExpressionLimits(nesting=3))
     meant = expression(algebra)
     products = list(meant)
@@ -144,7 +144,7 @@ def test_tables_and_writing_say_the_same() -> None:
     assert r"\sqrt{\left|{v}\right|}" in written["latex"]
 
 
-def test_terms_are_written_as_the_term_language_reads_them() -> None:
+def test_format_product_is_read_by_term_library() -> None:
     algebra = Algebra(("u", "rpm", "nozzle"))
     u, rpm, nozzle = (algebra.make_channel(name) for name in algebra.channels)
     multiply = algebra.multiply

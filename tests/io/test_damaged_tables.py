@@ -88,7 +88,7 @@ ONCE: dict[str, Any] = {
     which=st.lists(st.sampled_from(DAMAGES), min_size=1, max_size=2),
     end=st.booleans(),
 )
-def test_damaged_text_gives_the_samples_as_written_or_one_clear_line(
+def test_read_of_damaged_text_returns_written_samples_or_one_error(
     folder: Path, seed: int, which: list[Damage], end: bool
 ) -> None:
     rng = random.Random(seed)
@@ -126,7 +126,7 @@ OTHER: dict[str, Callable[[pa.Table], pa.Table]] = {
 
 
 @pytest.mark.parametrize("how", OTHER)
-def test_another_parquet_gives_the_samples_as_written_or_one_clear_line(
+def test_read_of_unusual_parquet_returns_written_samples_or_one_error(
     how: str, folder: Path
 ) -> None:
     path = folder / "table.parquet"
@@ -136,7 +136,7 @@ def test_another_parquet_gives_the_samples_as_written_or_one_clear_line(
     assert log is None or foreign(log) == []
 
 
-def test_damaged_parquet_gives_the_samples_as_written_or_one_clear_line(folder: Path) -> None:
+def test_read_of_damaged_parquet_returns_written_samples_or_one_error(folder: Path) -> None:
     table = pa.Table.from_pandas(TABLE)
     path = folder / "table.parquet"
     rng = random.Random(1)
@@ -148,7 +148,7 @@ def test_damaged_parquet_gives_the_samples_as_written_or_one_clear_line(folder: 
         assert log is None or foreign(log) == []
 
 
-def test_undamaged_tables_come_out_whole(folder: Path) -> None:
+def test_read_of_undamaged_tables_returns_all_samples(folder: Path) -> None:
     """What the two tests above compare with, and that the check sees a slipped cell."""
     for end in ("", "\n", "\r\n"):
         path = folder / "whole.csv"
@@ -162,7 +162,7 @@ def test_undamaged_tables_come_out_whole(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("cut", [1, 3, 8, 20])
-def test_a_file_that_ends_within_its_last_line_loses_that_line(folder: Path, cut: int) -> None:
+def test_read_of_a_cut_last_line_drops_it(folder: Path, cut: int) -> None:
     path = folder / "cut.csv"
     path.write_bytes("\n".join(LINES).encode()[:-cut])
     log = outcome(path, "csv")

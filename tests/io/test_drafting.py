@@ -70,7 +70,9 @@ def logs(ship_logs: list[Log]) -> list[Log]:
 
 
 @pytest.mark.parametrize("style", STYLES.values(), ids=STYLES.keys())
-def test_a_table_is_read_as_it_was(style: Style, logs: list[Log], tmp_path: Path) -> None:
+def test_draft_tables_reads_a_table_as_written(
+    style: Style, logs: list[Log], tmp_path: Path
+) -> None:
     files = foreign_tables.write(logs, tmp_path, style)
     marks = DraftNotes()
     content, _ = draft_tables(files, marks)
@@ -84,9 +86,7 @@ def test_a_table_is_read_as_it_was(style: Style, logs: list[Log], tmp_path: Path
         assert {f"data.reader.channels.{name}" for name in ("psi", "u", "r", "delta")} <= told
 
 
-def test_a_heading_that_is_not_wrapped_may_be_large_in_radians(
-    logs: list[Log], tmp_path: Path
-) -> None:
+def test_draft_tables_accepts_large_headings_in_radians(logs: list[Log], tmp_path: Path) -> None:
     """Its size says degrees, and only the motion tells that it is not."""
     turning = logs[1]
     assert float(np.ptp(turning["psi"])) > 7.0
@@ -97,7 +97,7 @@ def test_a_heading_that_is_not_wrapped_may_be_large_in_radians(
 
 
 @pytest.mark.parametrize("language", NAMES)
-def test_words_of_a_language(language: str) -> None:
+def test_parse_name_of_a_language(language: str) -> None:
     time, *columns = NAMES[language]
     assert parse_name(time).has_all("time")
     found = [
@@ -144,7 +144,7 @@ CALLED: dict[str | None, str] = {
 
 
 @pytest.mark.parametrize("channel", CALLED)
-def test_what_a_name_is_about(channel: str | None) -> None:
+def test_match_channel_of_names(channel: str | None) -> None:
     about = {name: parse_name(name) for name in CALLED[channel].split("|")}
     found = {name: match_state_channel(w) or match_input_channel(w) for name, w in about.items()}
     assert found == dict.fromkeys(about, channel)
@@ -154,7 +154,7 @@ def test_what_a_name_is_about(channel: str | None) -> None:
     ("name", "channel"),
     [("v_z", "w"), ("wx", "p"), ("ang_vel_y", "q"), ("mocap_z", "z"), ("Z_CG [m]", "z")],
 )
-def test_names_of_vertical_motion(name: str, channel: str) -> None:
+def test_match_depth_channel_of_names(name: str, channel: str) -> None:
     assert match_depth_channel(parse_name(name)) == channel
 
 
@@ -187,11 +187,11 @@ def test_names_of_vertical_motion(name: str, channel: str) -> None:
         ("tau_n", "N m", None),
     ],
 )
-def test_the_unit_in_a_header(column: str, expected: str, unit: str | None) -> None:
+def test_parse_header_unit_of_names(column: str, expected: str, unit: str | None) -> None:
     assert parse_header_unit(column, expected) == unit
 
 
-def test_axes_that_are_called_by_letters(logs: list[Log], tmp_path: Path) -> None:
+def test_draft_tables_recognises_exchanged_axis_letters(logs: list[Log], tmp_path: Path) -> None:
     # x east, y north, heading counter-clockwise from east, velocities forward and to port
     log = logs[0]
     new = {"x": log["y"], "y": log["x"], "psi": np.pi / 2 - log["psi"]}
@@ -211,7 +211,7 @@ def test_axes_that_are_called_by_letters(logs: list[Log], tmp_path: Path) -> Non
     assert "data.reader.channels.x" in {".".join(key) for key, _ in marks.guessed_values}
 
 
-def test_a_header_that_is_wrong_is_asked_about(logs: list[Log], tmp_path: Path) -> None:
+def test_draft_tables_asks_about_a_wrong_header_unit(logs: list[Log], tmp_path: Path) -> None:
     files = foreign_tables.write(logs, tmp_path, Style(units={"r": "°/min"}))
     for file in files:
         file.write_text(file.read_text().replace("[°/min]", "[deg/s]"))
@@ -249,9 +249,9 @@ def _doors(files: Sequence[Path]) -> dict[str, dict[str, Any]]:
     }
 
 
-# dates and German names are read by `test_a_table_is_read_as_it_was` among the fast tests
+# `test_draft_tables_reads_a_table_as_written` reads dates and German names among the fast tests
 @pytest.mark.parametrize("dated", [pytest.param(True, marks=pytest.mark.long), False])
-def test_one_map_from_every_door(dated: bool, logs: list[Log], tmp_path: Path) -> None:
+def test_channel_map_is_equal_in_all_commands(dated: bool, logs: list[Log], tmp_path: Path) -> None:
     degrees = {"psi": "deg", "r": "deg/s", "delta": "deg", "n": "rpm"}
     style = GERMAN if dated else Style(units=degrees, signs=("delta",))
     files = foreign_tables.write(logs, tmp_path, style)
@@ -266,7 +266,7 @@ def test_one_map_from_every_door(dated: bool, logs: list[Log], tmp_path: Path) -
         np.testing.assert_allclose(log.t - log.t[0], truth.t - truth.t[0], atol=1e-3)
 
 
-def test_no_log_is_lost_for_a_roll_that_not_all_of_them_hold(tmp_path: Path) -> None:
+def test_read_logs_keeps_logs_without_roll(tmp_path: Path) -> None:
     t = np.arange(0.0, 20.0, 0.1)
     for number in range(3):
         table = pd.DataFrame({"t": t, "surge [m/s]": 1.0 + 0.1 * np.sin(t), "rudder [deg]": t % 7})
@@ -283,7 +283,7 @@ def test_no_log_is_lost_for_a_roll_that_not_all_of_them_hold(tmp_path: Path) -> 
     ("volts", "thrusters"),
     [("batt_v", ("Schub BB [%]", "Schub StB [%]")), ("xx_v", ("left_pct", "right_pct"))],
 )
-def test_volts_are_no_sway_and_per_cents_neither_force_nor_revolutions(
+def test_draft_tables_excludes_volts_and_per_cents(
     logs: list[Log], tmp_path: Path, volts: str, thrusters: tuple[str, str]
 ) -> None:
     """By the name where it says so, else by what position and heading tell."""
@@ -304,7 +304,7 @@ def test_volts_are_no_sway_and_per_cents_neither_force_nor_revolutions(
     assert channels["throttle_port"] == {"column": thrusters[0], "unit": "%"}
 
 
-def test_sides_of_thrusters_tell_a_frame_from_its_mirror_image(tmp_path: Path) -> None:
+def test_draft_tables_resolves_mirror_image_by_thrusters(tmp_path: Path) -> None:
     """A camera's x ahead and y to the left, headings anticlockwise, as in a laboratory."""
     (fleet,) = drawn("twin", 14, 1, fewest=3, most=3)
     files = [tmp_path / f"{log.name}.csv" for log in fleet.logs]
@@ -317,7 +317,7 @@ def test_sides_of_thrusters_tell_a_frame_from_its_mirror_image(tmp_path: Path) -
     assert channels["psi"]["frame"] == "enu"
 
 
-def test_the_unit_of_a_gyro_is_told_where_some_logs_have_it_upside_down(tmp_path: Path) -> None:
+def test_draft_tables_finds_gyro_unit_with_a_reversed_log(tmp_path: Path) -> None:
     """A slow ship, in deg/s without a unit: by their size alone they would be rad/s."""
     (fleet,) = drawn("twin", 14, 1, fewest=3, most=3)
     for log, way in zip(fleet.logs, (1.0, 1.0, -1.0), strict=True):

@@ -45,7 +45,7 @@ def assert_same(read: Log, expected: Log) -> None:
 
 
 @pytest.mark.parametrize("write", [written_logs.csv, written_logs.parquet])
-def test_tables(write: Writer, tmp_path: Path) -> None:
+def test_read_of_tables_returns_the_trial(write: Writer, tmp_path: Path) -> None:
     log = trial()
     channels = {name: {"column": name, "unit": CHANNEL_UNITS[name]} for name in log.channels}
     path = write(log, tmp_path)
@@ -53,7 +53,7 @@ def test_tables(write: Writer, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("write", [*TREES, written_logs.hdf5_table, *BAGS])
-def test_recordings_that_describe_themselves(write: Writer, tmp_path: Path) -> None:
+def test_read_of_self_describing_recordings(write: Writer, tmp_path: Path) -> None:
     log = trial()
     got = read(write(log, tmp_path), kind="auto")
     assert_same(got, log)
@@ -68,7 +68,7 @@ def test_recordings_that_describe_themselves(write: Writer, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("write", "kind"), [(written_logs.bag2_mcap, "rosbag"), (written_logs.topics, "csv_topics")]
 )
-def test_channel_maps_of_topics(write: Writer, kind: str, tmp_path: Path) -> None:
+def test_read_with_channel_maps_of_topics(write: Writer, kind: str, tmp_path: Path) -> None:
     """The same bag with every part declared, read field by field, and one part of it alone."""
     log = trial()
     path = write(log, tmp_path)
@@ -99,7 +99,7 @@ def test_channel_maps_of_topics(write: Writer, kind: str, tmp_path: Path) -> Non
     assert_same(got, log)
 
 
-def test_everything_that_a_bag_holds(tmp_path: Path) -> None:
+def test_load_of_a_bag_returns_all_series(tmp_path: Path) -> None:
     recording = recording_for(written_logs.bag2(trial(2.0), tmp_path))
     assert sorted(recording.series) == ["/cmd_port", "/cmd_stbd", "/odometry"]
     assert recording["odometry"].message_type == "nav_msgs/msg/Odometry"
@@ -107,7 +107,7 @@ def test_everything_that_a_bag_holds(tmp_path: Path) -> None:
     assert len(recording["cmd_port"]) == 21
 
 
-def test_matlab_matrix_datenum_and_nested_struct(tmp_path: Path) -> None:
+def test_read_of_matlab_datenum_and_nested_struct(tmp_path: Path) -> None:
     values = np.stack((np.arange(50.0), 2 * np.arange(50.0)), axis=1)
     nested = {"time": 739352.25 + np.arange(50) / 86400.0, "signals": {"values": values}}
     savemat(path := tmp_path / "a.mat", {"log": nested})
@@ -120,7 +120,7 @@ def test_matlab_matrix_datenum_and_nested_struct(tmp_path: Path) -> None:
     assert log.meta["start_utc"].startswith("2024-04-10T06:00:00.0")
 
 
-def test_several_experiments_in_one_file(tmp_path: Path) -> None:
+def test_read_of_several_experiments_in_one_file(tmp_path: Path) -> None:
     logs = {"first": trial(20.0), "second": trial(12.5)}
     path = tmp_path / "trial.mat"
     savemat(path, {name: {"t": log.t, **log.channels} for name, log in logs.items()})
@@ -130,7 +130,7 @@ def test_several_experiments_in_one_file(tmp_path: Path) -> None:
     assert "several_tables" in {finding["code"] for finding in both.meta["findings"]}
 
 
-def test_vectors_beside_a_struct_with_the_time(tmp_path: Path) -> None:
+def test_load_of_vectors_next_to_a_struct_with_time(tmp_path: Path) -> None:
     """One struct has the time, its neighbours do not; two times that differ leave it open."""
     t = np.arange(0.0, 30.0, 0.1)
     nav, act = {"t": t, "pos": {"N": 2.0 * t}}, {"rudder": np.sin(t), "gains": np.ones(3)}
@@ -149,7 +149,7 @@ def test_vectors_beside_a_struct_with_the_time(tmp_path: Path) -> None:
     ("write", "package", "extra"),
     [(written_logs.bag1, "rosbags", "ros"), (written_logs.mat73, "h5py", "hdf5")],
 )
-def test_a_missing_package_is_named_with_its_extra(
+def test_read_without_package_names_its_extra(
     write: Writer, package: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write(trial(), tmp_path)
@@ -171,7 +171,7 @@ def test_a_missing_package_is_named_with_its_extra(
         (written_recorders.nmea2000, "NMEA 2000"),
     ],
 )
-def test_formats_by_content(write: Writer, name: str, tmp_path: Path) -> None:
+def test_detect_recording_format_by_content(write: Writer, name: str, tmp_path: Path) -> None:
     found = detect_recording_format(write(trial(2.0), tmp_path).rename(tmp_path / "recording"))
     assert found is not None
     assert found.name == name

@@ -93,7 +93,7 @@ def times(steps: int, dt: float = 0.1) -> Tensor:
     return torch.arange(steps, dtype=torch.float64) * dt
 
 
-def test_each_row_stops_on_its_own_and_the_loop_when_all_have() -> None:
+def test_stop_recorder_stops_each_row_and_the_loop() -> None:
     circles = [
         TurningCircle(drive=1, steer=1.0, start=1),
         TurningCircle(drive=1, steer=-0.5, start=1, until=math.pi),
@@ -119,7 +119,7 @@ def test_each_row_stops_on_its_own_and_the_loop_when_all_have() -> None:
     assert (torch.sign(w[2, : k + 1, 0]).diff() != 0).sum() == 4
 
 
-def test_pull_out_ends_when_the_yaw_rate_is_steady() -> None:
+def test_turning_circle_pull_out_ends_at_steady_yaw_rate() -> None:
     """After the turn r decays with T = 3 s; the running mean with the window's time constant
     follows until both are calm.
     """
@@ -141,7 +141,7 @@ def test_pull_out_ends_when_the_yaw_rate_is_steady() -> None:
     assert float(x[0, k, 5].abs()) < 0.03 * float(x[0, :, 5].abs().max())
 
 
-def test_steady_by_hand() -> None:
+def test_update_steadiness_equals_calculation_by_hand() -> None:
     given = {"window": 1.0, "tolerance": 0.1, "dt": 0.5}
     numbers = {name: torch.tensor([value]) for name, value in given.items()}
     memory = initial_steadiness(torch.tensor([0.0]))
@@ -180,7 +180,7 @@ def test_spiral_of_a_linear_vessel_has_no_loop() -> None:
 
 
 @pytest.mark.parametrize("kind", [MultiSine, RandomSteps])
-def test_excitation_keeps_to_its_band_and_amplitude(kind: Any) -> None:
+def test_multi_sine_and_random_steps_keep_band_and_amplitude(kind: Any) -> None:
     dt, t = 0.1, times(40000)
     wave = kind(
         drive=0.5, drive_amplitude=0.2, steer_amplitude=0.6, band=(0.02, 0.2), seed=3, start=10.0
@@ -209,7 +209,7 @@ def test_excitation_keeps_to_its_band_and_amplitude(kind: Any) -> None:
         assert holds.max() <= 0.5 / 0.02 + dt + 1e-3
 
 
-def test_rudder_angles_and_vessels_that_cannot() -> None:
+def test_manoeuvres_refuse_impossible_rudder_angles_and_vessels() -> None:
     circle = TurningCircle(drive=1, rudder=-15 * DEG)
     assert circle.steer_share(HELM) == pytest.approx(-0.5)
     assert circle.side == -1

@@ -49,7 +49,7 @@ REFUSED: tuple[tuple[str, tuple[str, ...], str], ...] = (
 
 
 @pytest.mark.parametrize(("study", "overrides", "said"), REFUSED, ids=lambda value: str(value)[:60])
-def test_a_study_that_cannot_be_is_refused_in_one_line(
+def test_load_task_refuses_impossible_studies(
     study: str,
     overrides: tuple[str, ...],
     said: str,
@@ -62,7 +62,7 @@ def test_a_study_that_cannot_be_is_refused_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_a_study_may_be_left_out_with_its_models(
+def test_load_task_without_study_and_its_models(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))

@@ -60,7 +60,7 @@ def _quick_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(soundness, "_LONG_RUN_DURATION", 30.0)
 
 
-def test_the_plain_head_runs_to_its_end(command: Command, tmp_path: Path) -> None:
+def test_run_with_sklearn_head_completes(command: Command, tmp_path: Path) -> None:
     """TorchScript accepted it, and failed in the check of bounded free runs."""
     config = write_yaml(tmp_path / "plain.yaml", _config(PLAIN))
     run = tmp_path / "run"
@@ -75,9 +75,9 @@ def test_the_plain_head_runs_to_its_end(command: Command, tmp_path: Path) -> Non
     assert "scikit-learn need Python" in ended.err
 
 
-# 5 s; test_the_plain_head_runs_to_its_end carries out a run, too
+# 5 s; test_run_with_sklearn_head_completes carries out a run, too
 @pytest.mark.long
-def test_other_classes_need_trust(command: Command, tmp_path: Path) -> None:
+def test_run_with_other_classes_needs_trust(command: Command, tmp_path: Path) -> None:
     config = write_yaml(tmp_path / "bagging.yaml", _config(BAGGING))
     run = tmp_path / "run"
     ended = command("run", config, "--out", run, "--quiet")
@@ -94,7 +94,7 @@ def test_other_classes_need_trust(command: Command, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("trust", [(), ("--trust",)])
-def test_no_command_opens_a_store_of_pickles(
+def test_run_and_export_refuse_a_store_of_pickles(
     trust: tuple[str, ...], command: Command, tiny_run: Path, tmp_path: Path
 ) -> None:
     """A model that names a joblib store in its description: `export` ran what lay there."""
