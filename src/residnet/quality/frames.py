@@ -30,13 +30,8 @@ from residnet.quality.findings import (
     describe_unit_confusion,
     make_correction,
 )
-from residnet.quality.kinematics import (
-    POSITION_LIMITS,
-    YAW_LIMITS,
-    estimate_position_causes,
-    estimate_yaw_causes,
-    make_cause_findings,
-)
+from residnet.quality.kinematic_findings import POSITION_LIMITS, YAW_LIMITS, make_cause_findings
+from residnet.quality.kinematics import estimate_position_causes, estimate_yaw_causes
 from residnet.quality.statistics import LogStatistics, interpolate_gaps
 
 # (reversed channel, constant angle in deg) -> description; reversals of psi, y and v are complete,

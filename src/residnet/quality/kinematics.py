@@ -17,25 +17,16 @@ filter. Terms of second and third order are selected beside a lag as nuisances.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-from residnet.core.log import Log
 from residnet.preprocessing.channel_values import SIGMA_OF_MAD, nan_median, nan_std
 from residnet.preprocessing.derivatives import fit_local_polynomials
 from residnet.preprocessing.statistics import MIN_SAMPLES
-from residnet.quality.findings import (
-    Check,
-    Finding,
-    Level,
-    describe_unit_confusion,
-    make_correction,
-    with_channels,
-)
 from residnet.quality.statistics import (
     N_SECTIONS,
     SMOOTHING_SAMPLES,
@@ -44,8 +35,6 @@ from residnet.quality.statistics import (
     interpolate_gaps,
 )
 
-MIN_LAG = 0.2
-"""Smallest lag in s that affects a rollout of a vessel."""
 _LAG_OF_CURVATURE = {
     name.replace("lag", "curvature"): name
     for name in ("lag", "lag_u", "lag_v", "lag_psi", "lag_xy")
@@ -101,8 +90,6 @@ _LEAVE_OUT_WEIGHTS = np.zeros(SMOOTHING_SAMPLES)
 _LEAVE_OUT_WEIGHTS[_IS_DISTANT] = np.linalg.pinv(
     np.vander(np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)[_IS_DISTANT], 3)
 )[-1]
-_MIN_SWAY_RATIO_OF_COURSE = 3.0
-"""Smallest ratio of the sway velocity to that of the positions if the heading is the course."""
 _MIN_TRUE_SHARE = 1e-3
 """Smallest share of measured values that is true, in the conversion of a coefficient to a gain."""
 _COLLINEARITY_TOLERANCE = 1e-9
@@ -448,7 +435,12 @@ def _search_shifts(
     names: Sequence[str],
     clocks: Mapping[str, tuple[str, ...]],
 ) -> dict[str, int]:
-    """Return lag -> number of samples for the clocks of the likeliest hypothesis; see above."""
+    """Return lag -> number of samples for the clocks of the likeliest hypothesis; see above.
+
+    The likeliest of many delays fits noise and errors of the model better than one delay that is
+    known beforehand. The extended BIC counts the hypotheses with as many shifts (Chen and Chen
+    2008, Biometrika 95, 759-771, eq. 1 with gamma = 1).
+    """
     channels = _select_channels(log, *names)
     model = make_model(log, channels)
     candidates = [name for name in clocks if name in model.columns]
@@ -466,6 +458,8 @@ def _search_shifts(
         continued = [trials[k] for k in order[:_N_CONTINUED_HYPOTHESES]]
         hypotheses = [*hypotheses, *trials]
     bics = _compute_bics([hypothesis.explanation for hypothesis in hypotheses])
+    n_alternatives = len(candidates) * (2 * _count_shift_steps(log) + 1)
+    bics += [2.0 * math.log(math.comb(n_alternatives, len(h.shifts))) for h in hypotheses]
     # among hypotheses that the data do not distinguish the simplest one counts
     likely = np.flatnonzero(bics < bics.min() + _MIN_CLOCK_ADVANTAGE)
     best = min(
@@ -533,6 +527,16 @@ def _shift_channels(
     return shifted
 
 
+def _shift_stride(log: LogStatistics) -> int:
+    """Return the number of samples between delays that are tried."""
+    return max(round(_SHIFT_STEP / log.sampling_interval), 1)
+
+
+def _count_shift_steps(log: LogStatistics) -> int:
+    """Return the number of delays that are tried to either side."""
+    return max(int(_MAX_SHIFT / (_shift_stride(log) * log.sampling_interval)), 1)
+
+
 def _find_most_likely_shift(
     log: LogStatistics,
     make_model: Callable[..., _IncrementModel],
@@ -540,8 +544,8 @@ def _find_most_likely_shift(
     names: Sequence[str],
 ) -> int:
     """Return the shift in samples under which all causes but lags explain the increments best."""
-    stride = max(round(_SHIFT_STEP / log.sampling_interval), 1)
-    n_steps = max(int(_MAX_SHIFT / (stride * log.sampling_interval)), 1)
+    stride = _shift_stride(log)
+    n_steps = _count_shift_steps(log)
     block = max(round(_MISFIT_BLOCK / log.sampling_interval), 1)
 
     def compute_misfit(n_samples: int) -> float:
@@ -825,181 +829,3 @@ def _orthogonal_matching_pursuit(
         if name not in _LAG_OF_CURVATURE
     }
     return causes, coefficients
-
-
-@dataclass(frozen=True)
-class CauseLimit:
-    """Description of a cause, and the size from which it misleads a fit.
-
-    Attributes:
-        text: text before the size.
-        unit: display unit of the size.
-        min_size: size from which the cause misleads, SI.
-        fix: recommended action.
-        min_time_steps: lower bound on that size in time steps.
-        min_speed_share: lower bound on that size as a share of the RMS speed.
-        si_unit: SI unit of the channel.
-    """
-
-    text: str
-    unit: str
-    min_size: float
-    fix: str
-    min_time_steps: float = 0.0
-    min_speed_share: float = 0.0
-    si_unit: str = "m/s"
-
-
-def _lag_limit(text: str, min_size: float = MIN_LAG) -> CauseLimit:
-    fix = "shift it in time, or let the reader estimate the lag"
-    return CauseLimit(text, "s", min_size, fix, min_time_steps=1.0)
-
-
-def _gain_limit(
-    text: str, min_size: float, fix: str = "correct its unit or scale", si_unit: str = "m/s"
-) -> CauseLimit:
-    return CauseLimit(f"{text} by a share of", "", min_size, fix, si_unit=si_unit)
-
-
-YAW_LIMITS = {
-    "gain": _gain_limit("r is too large against psi", 0.06, si_unit="rad/s"),
-    "lag": _lag_limit("r trails psi by"),
-}
-POSITION_LIMITS = {
-    "gain_u": _gain_limit("u is too large against the position", 0.04),
-    "gain_v": _gain_limit("v is too large against the position", 0.25),
-    "gain": _gain_limit(
-        "u, v are too large against the position", 0.04, "correct their unit or scale"
-    ),
-    "heading": CauseLimit(
-        "psi is off against course and drift by",
-        "deg",
-        math.radians(3.0),
-        "subtract the offset from psi",
-    ),
-    "lag_u": _lag_limit("u trails the position by"),
-    "lag_v": _lag_limit("v trails the position by"),
-    "lag": _lag_limit("u, v trail the position by"),
-    "lag_psi": _lag_limit("psi trails position and velocities by", 2.0 * MIN_LAG),
-    "lag_xy": _lag_limit("x, y trail heading and velocities by"),
-    "lever_arm": CauseLimit(
-        "x, y refer to a point forward and to starboard of that of u, v by",
-        "m",
-        0.3,
-        "move it to the vessel's centre (lever arm)",
-        min_speed_share=0.05,
-    ),
-    "current": CauseLimit(
-        "u, v are relative to water that moves north and east by",
-        "m/s",
-        0.02,
-        "provide the current as an input",
-        min_speed_share=0.1,
-    ),
-    "bias": CauseLimit(
-        "u, v are too large against the position by",
-        "m/s",
-        0.02,
-        "subtract the bias",
-        min_speed_share=0.1,
-    ),
-}
-
-
-def make_cause_findings(
-    causes: Mapping[str, KinematicCause],
-    limits: Mapping[str, CauseLimit],
-    log: LogStatistics,
-    make_finding: Check,
-) -> Iterator[Finding]:
-    """Yield findings for significant causes that are large enough.
-
-    Args:
-        causes: estimated causes.
-        limits: descriptions and limits of the causes to report.
-        log: statistics of the log.
-        make_finding: the check that reports.
-    """
-    for name, cause in causes.items():
-        limit = limits.get(name)
-        if limit is None or not cause.is_significant:
-            continue
-        magnitude = float(np.hypot.reduce(cause.estimates))
-        min_size = max(
-            limit.min_size,
-            limit.min_time_steps * log.sampling_interval,
-            limit.min_speed_share * log.rms_speed,
-        )
-        if magnitude < 0.3 * min_size:
-            continue
-        is_leading = "trail" in limit.text and cause.estimates[0] < 0.0
-        text = limit.text.replace("trail", "lead") if is_leading else limit.text
-        display_factor = (math.degrees(1.0) if limit.unit == "deg" else 1.0) * (
-            -1.0 if is_leading else 1.0
-        )
-        values_and_errors = zip(
-            display_factor * cause.estimates,
-            np.abs(2.0 * display_factor * cause.standard_errors),
-            strict=True,
-        )
-        sizes_text = ", ".join(
-            f"{estimate:+.3g} +- {interval_half_width:.2g}"
-            for estimate, interval_half_width in values_and_errors
-        )
-        level: Level = "will mislead" if magnitude > min_size else "note"
-        fix = limit.fix
-        unit_text = ""
-        is_gross = name.startswith("gain") and cause.is_gross
-        ratio = 1.0 + float(cause.estimates[0])
-        if is_gross and name == "gain_v" and abs(ratio) > _MIN_SWAY_RATIO_OF_COURSE:
-            text = f"psi is the course over ground, so that {text}"
-            fix = "take psi from the compass"
-        elif is_gross and ratio < 0.0:
-            text = f"the sign is wrong: {text}"
-            fix = "turn it in the channel map (sign: -1)"
-        elif is_gross:
-            unit_text = describe_unit_confusion(ratio, limit.si_unit)
-        figures = {f"value_{i + 1}": float(estimate) for i, estimate in enumerate(cause.estimates)}
-        yield make_finding(
-            f"{text}: {sizes_text} {limit.unit}".rstrip() + unit_text,
-            {"size": magnitude, **figures, "error": cause.standard_errors.max()},
-            code=name,
-            level=level,
-            fix=fix if level != "note" else "",
-            # a wrong sign or unit must be corrected regardless of its effect on a fit
-            repair=None
-            if is_gross
-            else _make_repair(
-                name, cause.estimates, ("r",) if limits is YAW_LIMITS else ("u", "v")
-            ),
-        )
-
-
-def _make_repair(
-    name: str, estimates: np.ndarray, velocity_names: tuple[str, ...]
-) -> Callable[[Log], Log] | None:
-    """Create a function that corrects a cause in a log; None if there is no correction.
-
-    Args:
-        name: name of the cause.
-        estimates: estimated size of the cause.
-        velocity_names: velocities that are compared with the pose.
-    """
-    cause_kind, _, channel_suffix = name.partition("_")
-    channel_names = {"": velocity_names, "xy": ("x", "y")}.get(channel_suffix, (channel_suffix,))
-    if cause_kind == "gain":
-        return make_correction(channel_names, factor=1.0 + estimates[0])
-    if cause_kind == "lag":
-        return make_correction(channel_names, delay=estimates[0])
-    if name == "heading":
-        return make_correction(("psi",), offset=estimates[0])
-    if name == "bias":
-        return lambda log: with_channels(log, u=log["u"] - estimates[0], v=log["v"] - estimates[1])
-    if name == "lever_arm":
-
-        def move_to_centre(log: Log) -> Log:
-            lever_arm = (estimates[0] + 1j * estimates[1]) * np.exp(1j * log["psi"])
-            return with_channels(log, x=log["x"] - lever_arm.real, y=log["y"] - lever_arm.imag)
-
-        return move_to_centre
-    return None
