@@ -63,10 +63,12 @@ _MIN_CLOCK_ADVANTAGE = 20.0
 """Smallest difference of the BIC by which the data distinguish two hypotheses."""
 _MAX_SHIFT = 3.0
 """Largest delay in s that is tried."""
-_SHIFT_STEP = 0.3
-"""Step in s between delays that are tried."""
-_MISFIT_BLOCK = 0.2
-"""Length in s of the blocks of samples in which shifts are compared."""
+_SHIFT_STEPS = (0.3, 0.6)
+"""Smallest and largest step in s between delays that are tried."""
+_SHIFT_STEP_SHARE = 0.3
+"""Step between delays over the time scale of the motion; a period has 20 steps."""
+_MISFIT_BLOCK_SHARE = 2.0 / 3.0
+"""Length of the blocks of samples in which shifts are compared over the step between delays."""
 _MAX_ROUNDING_SHARE = 1e-3
 """Unexplained share of the squared differences below which no delay is searched."""
 _MIN_COMMON_SHARE = 0.7
@@ -157,16 +159,20 @@ class _IncrementModel:
             for column in columns
         ]
         n_blocks = self.dt.size // n_samples
-        blocks = np.array(table)[:, : n_blocks * n_samples]
-        blocks = blocks.reshape(len(table), n_blocks, n_samples).sum(axis=2).T
+        # sums of strided samples, because a sum over a short last axis takes ten times as long
+        steps = np.array(table)[:, : n_blocks * n_samples]
+        blocks = sum((steps[:, k::n_samples] for k in range(n_samples)), np.zeros(1)).T
         blocks = blocks[np.isfinite(blocks).all(axis=1)]
         if len(blocks) < 2 * len(table):
             return math.inf
         if np.iscomplexobj(blocks):
             blocks = np.concatenate((blocks.real, blocks.imag))
-        norms = np.maximum(np.linalg.norm(blocks, axis=0), 1e-300)
-        basis = np.linalg.qr(blocks[:, 1:] / norms[1:])[0]
-        residuals = blocks[:, 0] - basis @ (basis.T @ blocks[:, 0])
+        # normal equations, because this is computed for each delay that is tried
+        gram = blocks.T @ blocks
+        norms = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        gram = gram / np.outer(norms, norms)
+        coefficients = np.linalg.lstsq(gram[1:, 1:], gram[1:, 0], rcond=_COLLINEARITY_TOLERANCE)[0]
+        residuals = blocks[:, 0] - blocks[:, 1:] @ (norms[0] * coefficients / norms[1:])
         scale = SIGMA_OF_MAD * float(np.median(np.abs(residuals)))
         return float(np.mean(np.minimum(residuals**2, (3.0 * scale) ** 2)))
 
@@ -300,21 +306,24 @@ def _model_positions(
     u = channels["u smoothed"]
     v = channels["v smoothed"]
     surge_increments = _integrate_steps(dt, heading_rotation * u)
-    sway_increments = _integrate_steps(dt, 1j * heading_rotation * v)
+    sway_increments = 1j * _integrate_steps(dt, heading_rotation * v)
+    both_increments = surge_increments + sway_increments
+    rotation_increments = np.diff(heading_rotation)
+    integrated_rotation = _integrate_steps(dt, heading_rotation)
     columns: dict[str, list[np.ndarray]] = {
         "gain_u": [-surge_increments],
         "gain_v": [-sway_increments],
-        "gain": [-(surge_increments + sway_increments)],
-        "heading": [-1j * (surge_increments + sway_increments)],
+        "gain": [-both_increments],
+        "heading": [-1j * both_increments],
     }
     if with_lags:
         columns |= _differentiate_by_lags(log.t, channels)
     columns |= {
-        "lever_arm": [np.diff(heading_rotation), 1j * np.diff(heading_rotation)],
+        "lever_arm": [rotation_increments, 1j * rotation_increments],
         "current": [dt + 0j, 1j * dt],
         "bias": [
-            -_integrate_steps(dt, heading_rotation),
-            -1j * _integrate_steps(dt, heading_rotation),
+            -integrated_rotation,
+            -1j * integrated_rotation,
         ],
     }
     noise_only_channels = {name for name in ("u", "v") if not log.cached(_is_significant, name)}
@@ -454,9 +463,13 @@ def _search_shifts(
             if name not in hypothesis.shifts
             and (trial := _shift_clock(log, make_model, hypothesis, name, clocks)) is not None
         ]
-        order = np.argsort(_compute_bics([trial.explanation for trial in trials])).tolist()
-        continued = [trials[k] for k in order[:_N_CONTINUED_HYPOTHESES]]
+        bics = _compute_bics([h.explanation for h in (hypotheses[0], *trials)])
         hypotheses = [*hypotheses, *trials]
+        # two delays of which neither explains anything alone are not searched
+        if bics[0] <= bics[1:].min(initial=math.inf):
+            break
+        order = np.argsort(bics[1:]).tolist()
+        continued = [trials[k] for k in order[:_N_CONTINUED_HYPOTHESES]]
     bics = _compute_bics([hypothesis.explanation for hypothesis in hypotheses])
     n_alternatives = len(candidates) * (2 * _count_shift_steps(log) + 1)
     bics += [2.0 * math.log(math.comb(n_alternatives, len(h.shifts))) for h in hypotheses]
@@ -479,9 +492,14 @@ def _shift_clock(
 ) -> _ClockHypothesis | None:
     """Return a hypothesis with the most likely delay of one more clock; None without a delay."""
     n_samples = _find_most_likely_shift(log, make_model, hypothesis.channels, clocks[name])
-    min_deviation = hypothesis.explanation.min_deviation
+    if n_samples == 0 and name in hypothesis.explanation.causes:
+        # in noise, the regression shows delays of slow motions that single steps do not show
+        lag = _clock_sign(name) * float(hypothesis.explanation.causes[name].estimates[0])
+        n_samples = round(lag / log.sampling_interval)
+        n_samples *= 2 * abs(n_samples) > log.cached(_shift_stride)
     if n_samples == 0:
         return None
+    min_deviation = hypothesis.explanation.min_deviation
     channels = _shift_channels(log, hypothesis.channels, clocks[name], n_samples)
     shifts = {**hypothesis.shifts, name: n_samples}
     explanation = _explain_increments(make_model(log, channels), [*shifts], min_deviation)
@@ -528,13 +546,20 @@ def _shift_channels(
 
 
 def _shift_stride(log: LogStatistics) -> int:
-    """Return the number of samples between delays that are tried."""
-    return max(round(_SHIFT_STEP / log.sampling_interval), 1)
+    """Return the number of samples between delays that are tried, fewer for faster motions."""
+    time_scales = []
+    for name in ("u", "v", "r"):
+        if name in log:
+            smoothed = log.cached(_smooth_leaving_out_centre, name)
+            rate_std = nan_std(np.diff(smoothed)) / log.sampling_interval
+            time_scales.append(nan_std(smoothed) / max(rate_std, 1e-300))
+    step = _SHIFT_STEP_SHARE * min(time_scales, default=0.0)
+    return max(round(float(np.clip(step, *_SHIFT_STEPS)) / log.sampling_interval), 1)
 
 
 def _count_shift_steps(log: LogStatistics) -> int:
     """Return the number of delays that are tried to either side."""
-    return max(int(_MAX_SHIFT / (_shift_stride(log) * log.sampling_interval)), 1)
+    return max(int(_MAX_SHIFT / (log.cached(_shift_stride) * log.sampling_interval)), 1)
 
 
 def _find_most_likely_shift(
@@ -544,24 +569,31 @@ def _find_most_likely_shift(
     names: Sequence[str],
 ) -> int:
     """Return the shift in samples under which all causes but lags explain the increments best."""
-    stride = _shift_stride(log)
+    stride = log.cached(_shift_stride)
     n_steps = _count_shift_steps(log)
-    block = max(round(_MISFIT_BLOCK / log.sampling_interval), 1)
+    block = max(round(_MISFIT_BLOCK_SHARE * stride), 1)
 
     def compute_misfit(n_samples: int) -> float:
         shifted = _shift_channels(log, channels, names, n_samples)
         return make_model(log, shifted, with_lags=False).compute_block_misfit(block)
 
-    shifts = stride * np.arange(-n_steps, n_steps + 1)
-    misfits = np.array([compute_misfit(n_samples) for n_samples in shifts.tolist()])
-    k = int(np.argmin(misfits))
-    if k in (0, misfits.size - 1):
+    # every other delay, then the neighbours of the best one
+    misfits = {k: compute_misfit(stride * k) for k in range(-n_steps, n_steps + 1, 2)}
+    best = min(misfits, key=misfits.__getitem__)
+    misfits |= {k: compute_misfit(stride * k) for k in (best - 1, best + 1) if abs(k) <= n_steps}
+    best = min(misfits, key=misfits.__getitem__)
+    # delays of less than half a step are left to the lags of the regression
+    if best == 0 or abs(best) == n_steps:
+        return 0
+    before, lowest, after = (
+        misfits[k] if k in misfits else compute_misfit(stride * k)
+        for k in (best - 1, best, best + 1)
+    )
+    curvature = before - 2.0 * lowest + after
+    if not math.isfinite(curvature):
         return 0
     # vertex of the parabola through the three lowest points
-    slope = 0.5 * (misfits[k + 1] - misfits[k - 1])
-    curvature = misfits[k + 1] - 2.0 * misfits[k] + misfits[k - 1]
-    vertex = float(shifts[k] - stride * slope / max(curvature, 1e-300))
-    return round(vertex)
+    return round(stride * (best - 0.5 * (after - before) / max(curvature, 1e-300)))
 
 
 # channel -> causes that are not identifiable if it holds noise only, because of the shared noise

@@ -214,7 +214,9 @@ class LogStatistics:
 
     def near_seam(self, n_samples: int) -> np.ndarray:
         """Return [T] bool: samples within a distance in samples from a seam of two stretches."""
-        seam_indices = np.searchsorted(self.t, np.zeros(0) if self._seams is None else self._seams)
+        if self._seams is None:
+            return np.zeros(len(self), dtype=bool)
+        seam_indices = np.searchsorted(self.t, self._seams)
         return mask_from_ranges(
             len(self), seam_indices - n_samples - _SEAM_STEPS, seam_indices + n_samples
         )
