@@ -10,7 +10,9 @@ from torch import Tensor, nn
 
 from residnet.dynamics.base import Dynamics
 from residnet.engine import free_runs
+from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.engine.rollout import TRAINING_STEPS, Rollout, trace_rollout
+from residnet.physics.vessel import load_vessel
 
 DT = 0.1
 
@@ -115,6 +117,19 @@ def test_trace_rollout_of_python_branches_equals_rollout() -> None:
         undecided = Rollout(Undecided())
         expected = undecided(sign * x0, w, s)[0]
         assert torch.equal(trace_rollout(undecided, TRAINING_STEPS)(sign * x0, w, s)[0], expected)
+
+
+def test_trace_rollout_of_a_recorded_plant_equals_the_rollout() -> None:
+    plant = load_vessel("wam_v_cal").build()
+    x0 = plant.make_initial_state(2)
+    w = torch.full((2, 300, len(plant.input_names)), 0.5, dtype=torch.float64)
+    rollouts = [Rollout(RecordedPlantDynamics(plant, DT)) for _ in range(3)]
+    with torch.no_grad():
+        # the first two trace the plant and store the trace, with which its step has no operations
+        expected, stored = (rollout(x0, w, x0[:, :0])[0] for rollout in rollouts[:2])
+        found = trace_rollout(rollouts[2], TRAINING_STEPS)(x0, w, x0[:, :0])[0]
+    assert torch.equal(found, expected)
+    assert torch.equal(stored, expected)
 
 
 def test_trace_rollout_of_few_steps_returns_the_rollout() -> None:

@@ -30,6 +30,8 @@ class RecordedPlantDynamics(Dynamics):
 
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
         super().__init__(dt, "rk4")
+        # torch sees no operation of CasADi: a trace would contain the results of the examples
+        self.export_error = "its step is evaluated by CasADi"
         self.plant = plant
         self.substeps = substeps
         self._torch_plant: PlantDynamics | None = None

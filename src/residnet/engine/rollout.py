@@ -146,9 +146,10 @@ TRAINING_STEPS = 1_000_000
 def has_untraceable_part(rollout: Rollout) -> bool:
     """Return whether a part of the model runs in Python only, such as an estimator of scikit-learn.
 
-    A trace would contain its results at the examples as constants.
+    Such a part has an `export_error`. A trace would contain its results at the examples as
+    constants.
     """
-    return any(bool(getattr(part, "refusal", "")) for part in rollout.modules())
+    return any(bool(getattr(part, "export_error", "")) for part in rollout.modules())
 
 
 def trace_rollout(rollout: Rollout, steps: int) -> FreeRun:
