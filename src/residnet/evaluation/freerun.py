@@ -34,6 +34,12 @@ from residnet.preprocessing.prepare import PreparedLog
 
 _MAX_LENGTH_RATIO = 4
 """Largest ratio of window lengths in one batch; shorter windows run on to the longest length."""
+_RUNS_PER_STRUCTURE = 8
+"""Nominal number of batches of free runs of models with one structure, which are compiled once.
+
+A fit runs them to select settings, without each fold and kind for prediction intervals, and to
+evaluate them.
+"""
 _MAX_BATCH_VALUES = 30_000_000
 """Largest number of values of a batch, which bounds the memory used."""
 _MEASURED_SPEED_MARGIN = 2.0
@@ -466,7 +472,7 @@ def _simulate_batch(
                 memory[torch.from_numpy(same_history)] = model.warmup(
                     torch.from_numpy(y_history).to(dtype), torch.from_numpy(w_history).to(dtype)
                 )
-        states, _, _ = compile_rollout(Rollout(model), longest_window)(
+        states, _, _ = compile_rollout(Rollout(model), _RUNS_PER_STRUCTURE * longest_window)(
             torch.from_numpy(x0).to(dtype), torch.from_numpy(future_inputs).to(dtype), memory
         )
     result: torch.Tensor = states
