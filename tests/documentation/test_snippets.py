@@ -70,6 +70,19 @@ def test_pages_show_what_they_should() -> None:
     assert all(re.search(rf"^{re.escape(line)}", TEXT, re.M) for line in NOT_RUN)
 
 
+def test_the_data_flow_lies_within_its_picture() -> None:
+    text = (ROOT / "docs" / "chain.svg").read_text()
+    size = re.search(r'viewBox="0 0 (\d+) (\d+)"', text)
+    assert size is not None
+    width, height = map(float, size.groups())
+    boxes = re.findall(r'<rect x="(\d+)" y="(\d+)" width="(\d+)" height="(\d+)"', text)
+    assert len(boxes) == 6
+    for x, y, box_width, box_height in (map(float, box) for box in boxes):
+        # half the width of the outline, and the same margin on both sides
+        assert 20 <= x <= width - box_width - 20
+        assert 20 <= y <= height - box_height - 20
+
+
 MAX_DOCUMENTATION_WORDS = 30_000
 """Of the pages written by hand: those of `docs/reference` are generated from code."""
 

@@ -318,7 +318,7 @@ def _build_horizon_table(run: RunFiles) -> Table | None:
     return build_table(
         horizons,
         [
-            (f"{run.main_model} after", lambda horizon: format_seconds(horizon.row.seconds)),
+            ("after", lambda horizon: format_seconds(horizon.row.seconds)),
             *(
                 (
                     f"{name} [{unit}]",
@@ -336,6 +336,8 @@ def _build_horizon_table(run: RunFiles) -> Table | None:
                 lambda horizon: _HORIZON_LEVELS[rate_horizon(evidence, horizon.row)],
             ),
         ],
+        # a long name of the model in the table would be wider than a phone
+        caption=f"Errors of {run.main_model} by the length of the free run.",
         is_selected=lambda horizon: horizon.row.seconds == main_seconds,
     )
 
