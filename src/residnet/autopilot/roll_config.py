@@ -135,8 +135,8 @@ class RollTraining(OneStage):
 
     Attributes:
         heading_excess: penalty in deg^2/m^2 of a relative increase of 1 of the RMS heading error
-            above that of the law from which a network starts, in the same waves; the sum over sea
-            states. It is zero without an increase, so that the network reduces the roll at the
+            above the error of the law from which a network starts, in the same waves; the sum over
+            sea states. It is zero without an increase, so that the network reduces the roll at the
             heading error of the law. It does not apply to the constants of the law.
         steps: number of batches per epoch.
         rows_per_sea: number of realisations of each sea in a batch.

@@ -126,7 +126,7 @@ class MMGConfig(MMGParticularsConfig):
         correlation: number of successive acceleration samples with the information of one
             independent sample.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
-        prior_weight: `fixed` takes the standard deviations of the priors as they are; `evidence`
+        prior_weight: `fixed` takes the standard deviations of the priors unchanged; `evidence`
             multiplies them by the factor of at least 1 with the largest marginal likelihood, which
             reduces the weight of regressions that the logs contradict.
     """
@@ -161,7 +161,7 @@ class SemiEmpiricalConfig(MMGParticularsConfig):
 
     The parameters are the prior means: usual values of a merchant ship, and added masses and linear
     hull derivatives by `formulas`. Their standard errors are the standard deviations of the priors.
-    It is a reference for identified models, and a start where there are no logs of a manoeuvre.
+    It is a reference for identified models, and a start without logs of manoeuvres.
 
     Attributes:
         kind: name of this baseline in a config.

@@ -110,7 +110,7 @@ class ParameterPrior(NamedTuple):
 def default_priors(hull: MMGHull) -> dict[str, ParameterPrior]:
     """Return the default prior of every parameter, for a merchant ship with this hull.
 
-    The means of the linear hull derivatives are those of the formulas of Kijima. The means of most
+    The means of the linear hull derivatives follow from the formulas of Kijima. The means of most
     higher-order derivatives are zero, so that the trials determine them.
     """
     # aspect ratio k of the hull as a low-aspect-ratio wing, with its mirror image at the surface
@@ -244,7 +244,7 @@ def brix_rudder_means(hull: MMGHull) -> dict[str, float]:
     """Return prior means of the flow straightening by Brix (1993), Manoeuvring Technical Manual.
 
     The transverse inflow of the rudder is -0.364 v plus a share of the yaw rate that corresponds to
-    the position 2 * 0.907 x_R, with x_R = -L/2; the constants are those of Kose (1982), On a new
+    the position 2 * 0.907 x_R, with x_R = -L/2; the constants are from Kose (1982), On a new
     mathematical model of maneuvering motions of a ship, International Shipbuilding Progress 29,
     from Series 60 models. They do not depend on the hull.
     """

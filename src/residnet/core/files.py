@@ -47,7 +47,7 @@ def atomic_write(path: Path, manifest: Manifest | None = None) -> Iterator[Path]
 
     Args:
         path: path of the file.
-        manifest: manifest that records the file; None uses that of the surrounding run folder.
+        manifest: manifest that records the file; None uses the one of the surrounding run folder.
 
     Raises:
         UsageError: if the file cannot be written, or is not owned by residnet.

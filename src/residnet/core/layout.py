@@ -1,6 +1,6 @@
 """States and degrees of freedom of a model, and their columns in its tensors.
 
-The column constants are those of the planar model with three degrees of freedom. A model with roll
+The column constants belong to the planar model with three degrees of freedom. A model with roll
 has p and phi behind these columns; a model with six degrees of freedom has w, p, q, the depth z,
 roll and pitch there.
 """
@@ -243,7 +243,7 @@ class DegreesOfFreedom:
 
     @classmethod
     def intersection(cls, dofs: Iterable[DegreesOfFreedom]) -> DegreesOfFreedom:
-        """Return the velocities that are active in all of `dofs`; u, v and r if there are none."""
+        """Return the velocities that are active in all of `dofs`; u, v and r without any."""
         dofs = list(dofs)
         velocity_sets = [dof.velocities for dof in dofs]
         if dofs and all(dof.is_six_dof and dof == dofs[0] for dof in dofs):

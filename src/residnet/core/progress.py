@@ -22,7 +22,7 @@ class Progress:
         done: completed amount in any unit; None if it cannot be counted.
         total: total amount in the same unit; None if unknown.
         message: line for the log; empty for a pure count.
-        score: best validation error in free run of a training so far; None if there is none.
+        score: best validation error in free run of a training so far; None before the first.
     """
 
     stage: str
@@ -59,7 +59,7 @@ def report_progress(
 
 
 def get_callback() -> ProgressCallback | None:
-    """Return the installed callback, to install it in a new thread; None if there is none."""
+    """Return the installed callback, to install it in a new thread; None without a callback."""
     return _callback.get()
 
 

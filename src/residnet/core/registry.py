@@ -222,7 +222,7 @@ class PluginUnion:
 
     @functools.cached_property
     def builtin(self) -> Mapping[str, str]:
-        """The kinds that come with residnet, those of the core first, each as `module:Class`."""
+        """The kinds that come with residnet, the core first, each as `module:Class`."""
         return {**self.core_kinds, **read_wing_entry_points().get(self.group, {})}
 
     def entry_point_parts(self) -> list[EntryPointPart]:

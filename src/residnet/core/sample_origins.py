@@ -43,7 +43,7 @@ class SampleOrigins:
         """Check that there are samples of some kinds of manoeuvre; any sample if `kinds` is empty.
 
         Raises:
-            FitError: if there are none.
+            FitError: if no sample is of these kinds.
         """
         if len(self.select_manoeuvres(kinds)) == 0:
             raise FitError(

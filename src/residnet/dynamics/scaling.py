@@ -52,7 +52,7 @@ class ScaleEffects(Config):
     """Factors on full-scale forces that Froude's law does not contain, with their source.
 
     Attributes:
-        resistance: total resistance coefficient at full scale divided by that of the model.
+        resistance: ratio of the total resistance coefficients of ship and model.
         propeller: thrust at full scale divided by the scaled thrust, at the same advance ratio.
         rudder: rudder force at full scale divided by the scaled force.
         source: reference of the factors, such as "towing test 2047, ITTC 1978".
@@ -89,7 +89,7 @@ def ittc_resistance_ratio(
     model_viscosity: float = 1.1386e-6,
     ship_viscosity: float = 1.1883e-6,
 ) -> float:
-    """Return the total resistance coefficient of the ship divided by that of the model.
+    """Return the ratio of the total resistance coefficients of ship and model.
 
     The wave resistance coefficient is equal at equal Froude number; the friction follows the
     ITTC 1957 line, C_F = 0.075 / (log10 Re - 2)^2, with the form factor k:
@@ -99,12 +99,12 @@ def ittc_resistance_ratio(
     Args:
         length: length of the model, m.
         speed: speed of the model, m/s.
-        scale: length of the ship divided by that of the model.
+        scale: ratio of the lengths of ship and model.
         form_factor: k.
         total_coefficient: C_TM of the model at this speed, from a towing test.
         allowance: C_A, correlation allowance with roughness.
         model_viscosity: kinematic viscosity of the model's water, m^2/s; fresh water at 15 deg C.
-        ship_viscosity: that of the ship's water; sea water at 15 deg C.
+        ship_viscosity: viscosity of the ship's water; sea water at 15 deg C.
 
     Raises:
         UsageError: if an argument is not plausible, or the coefficient is smaller than friction.

@@ -18,7 +18,7 @@ class CardFinding(Record):
         level: severity.
         code: kind of finding.
         text: one line with figures.
-        action: recommended action; empty if there is none.
+        action: recommended action; empty without one.
     """
 
     log: str | None

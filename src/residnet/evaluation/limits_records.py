@@ -57,7 +57,7 @@ class HorizonRow(Record):
             would have.
         models: errors by model.
         change_from_constant_velocity: by model and pose error, the paired 95 % confidence interval
-            of its mean error minus that of the constant-velocity model, SI; None if there are too
+            of its mean error minus the error of the constant-velocity model, SI; None with too
             few logs. Empty without a constant-velocity model, and in runs of earlier versions.
     """
 

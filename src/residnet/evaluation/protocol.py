@@ -26,7 +26,7 @@ class Window:
     Attributes:
         log_index: index of the log.
         start: index of the sample of the initial state.
-        stop: index after that of the last sample.
+        stop: index after the last sample.
         history_start: first sample of the measured past that may warm up a memory.
         initial_velocities: initial values of the dynamic states [n].
     """

@@ -4,10 +4,10 @@
 | --- | --- |
 | `json`, `csv`, `matlab` | the table with standard errors |
 | `vessel` | a vessel file of kind `abkowitz`, which residnet simulates |
-| `mss` | a MATLAB function [xdot, U] = vessel(x, ui) like those of the MSS toolbox (Fossen) |
+| `mss` | a MATLAB function [xdot, U] = vessel(x, ui) as in the MSS toolbox (Fossen) |
 | `sdf` | the hydrodynamics plugins of Gazebo and of VRX |
 
-The simulators' names are those of gz-sim (systems/hydrodynamics/Hydrodynamics.cc, SNAME 1950) and
+The simulators' names follow gz-sim (systems/hydrodynamics/Hydrodynamics.cc, SNAME 1950) and
 of VRX (vrx_gz/src/SimpleHydrodynamics.cc).
 """
 

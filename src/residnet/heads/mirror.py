@@ -108,7 +108,7 @@ class MirroredHead(RenamedStateModule, ResidualHead):
         return torch.cat((s[:batch_size], s[batch_size:]), dim=-1)
 
     def memory_bounds(self) -> tuple[Tensor, Tensor]:
-        """Return the bounds of the memory [n_state], those of the inner head twice."""
+        """Return the bounds of the memory [n_state]: the bounds of the inner head twice."""
         lower, upper = self.inner_head.memory_bounds()
         return lower.repeat(2), upper.repeat(2)
 

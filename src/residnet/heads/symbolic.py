@@ -114,7 +114,7 @@ class DelayLine(nn.Module):
         return torch.cat((buffered, torch.ones_like(buffered[:, :1])), dim=-1)
 
     def memory_bounds(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the bounds of the memory [n_state] from those of the channels [nz]."""
+        """Return the bounds of the memory [n_state] from the bounds of the channels [nz]."""
         if self.n_delayed == 0:
             return lower[:0], upper[:0]
         lower_memory, upper_memory = (
@@ -257,7 +257,7 @@ class SymbolicHead(EquationHead):
         return self.line.warmup(self.features.select_clamped(z))
 
     def memory_bounds(self) -> tuple[Tensor, Tensor]:
-        """Return the bounds of the delay line, those of the clamped features."""
+        """Return the bounds of the delay line, which are the bounds of the clamped features."""
         return self.line.memory_bounds(self.features.low, self.features.high)
 
     def format_terms(self) -> list[str]:

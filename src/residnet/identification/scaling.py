@@ -28,8 +28,8 @@ def scale_fitted_model(
 ) -> FittedModel:
     """Return a fitted model at another scale, with its covariance and prediction intervals.
 
-    The relative uncertainty of a coefficient does not change: that of the scale effects, and of
-    Froude's law itself, is not part of it.
+    The relative uncertainty of a coefficient does not change: the uncertainty of the scale effects,
+    and of Froude's law itself, is not part of it.
 
     Args:
         fitted_model: the model with the notes of its fit; it is not changed.

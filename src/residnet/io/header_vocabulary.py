@@ -265,7 +265,7 @@ class ParsedName(NamedTuple):
     Attributes:
         text: name in lower case without accents, units and punctuation.
         concepts: concepts that the name mentions, keys of `concepts` in the vocabulary.
-        number: number in the name that distinguishes several columns; None if there is none.
+        number: number in the name that distinguishes several columns; None without a number.
     """
 
     text: str

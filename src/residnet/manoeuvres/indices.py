@@ -141,7 +141,7 @@ def first_crossing(
 ) -> float | None:
     """Return the first time after `start_time` at which a function rises through zero.
 
-    The sign changes are searched between samples at t [T]; the result is None if there is none.
+    The sign changes are searched between samples at t [T]. The result is None without a change.
     """
     times = np.concatenate(([start_time], t[t > start_time]))
     values = function(times)

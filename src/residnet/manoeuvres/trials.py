@@ -105,7 +105,7 @@ def make_manoeuvre_source(manoeuvres: Sequence[Manoeuvre], helm: Helm, times: Te
     """Return the source of manoeuvres of any kinds, one for each row of a batch.
 
     Args:
-        manoeuvres: the manoeuvres; those of one kind are consecutive.
+        manoeuvres: the manoeuvres; manoeuvres of one kind are consecutive.
         helm: properties of the vessel.
         times: times [T] of the steps in s.
 

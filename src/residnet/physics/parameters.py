@@ -81,7 +81,7 @@ _BASE_DIMENSIONS = {
 
 
 def parse_dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
-    """Return the exponents of metre and second in an SI unit with `mass` as that of kilogram.
+    """Return the exponents of metre and second in an SI unit whose exponent of kilogram is `mass`.
 
     For example, the result is (2, -1) for `kg m^2/s` or `N m s/rad`. It is None for any other
     unit.

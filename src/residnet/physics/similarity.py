@@ -1,6 +1,6 @@
 """Dimensions of coefficients, non-dimensional systems of ship hydrodynamics and Froude scaling.
 
-The prime systems are those of SNAME (1952), Nomenclature for Treating the Motion of a Submerged
+The prime systems are defined by SNAME (1952), Nomenclature for Treating the Motion of a Submerged
 Body Through a Fluid, Technical and Research Bulletin 1-5, in the notation of Fossen (2011),
 Handbook of Marine Craft Hydrodynamics and Motion Control, section 7.2.5, as is Norrbin's (1970)
 bis system.
@@ -324,9 +324,9 @@ class FroudeScaling:
         return self.factor(dimension_of_term(parse_term(term, names), units) or DIMENSIONLESS)
 
     def scale_config(self, config: ConfigT) -> ConfigT:
-        """Return a config whose dimensional values are those of the target.
+        """Return a config with its dimensional values at the target scale.
 
-        The units are those of the annotations, such as `Metres`, and of parameters of vessel files.
+        Units are taken from annotations such as `Metres`, and from parameters of vessel files.
         Numbers without a unit, such as coefficients in a mapping of terms, do not change.
         """
         if isinstance(config, Parameter):
@@ -501,8 +501,8 @@ def estimate_linear_derivatives(particulars: Particulars) -> dict[str, float] | 
 def estimate_lateral_dynamics(particulars: Particulars) -> list[list[float]] | None:
     """Estimate the derivatives of sway and yaw accelerations by v and r at the service speed.
 
-    The hull derivatives are those of `estimate_linear_derivatives`, the masses those of
-    `estimate_added_mass` with the rigid body of the particulars (Fossen 2011, section 6.5).
+    The hull derivatives come from `estimate_linear_derivatives`, and the masses from
+    `estimate_added_mass` and the rigid body of the particulars (Fossen 2011, section 6.5).
 
     Returns:
         Rows [[v_dot by v, v_dot by r], [r_dot by v, r_dot by r]] in SI; None if particulars are

@@ -180,7 +180,7 @@ class CandidatesConfig(Config):
         magnitudes: whether magnitudes of factors are included, as in `u|u|`.
         inputs: inputs of the products; null for all that are neither motions nor angles.
         input_degree: maximum degree of the products of inputs without magnitudes. If null, it is 1
-            with `coupling`; without `coupling` the products are those of propellers and rudders.
+            with `coupling`; without `coupling` the products describe propellers and rudders.
         angles: inputs whose sine and cosine are used.
         coupling: motions by which products of inputs are multiplied.
         coupling_degree: maximum degree of these factors.

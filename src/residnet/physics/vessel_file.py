@@ -67,9 +67,9 @@ class VesselFile(Config, ABC):
 def merge_with_base(data: Any, folder: Path | None) -> Any:
     """Merge the content of a vessel file with the content of its `base`.
 
-    Sections are merged key by key; a section of another `kind` replaces that of the base. `base` is
-    the name of a file in `configs/vessels`, or the path of a YAML file, which is first searched
-    relative to the folder of the file.
+    Sections are merged key by key; a section of another `kind` replaces the section of the base.
+    `base` is the name of a file in `configs/vessels`, or the path of a YAML file, which is first
+    searched relative to the folder of the file.
 
     Raises:
         ValueError: if the base does not exist, cannot be read, or bases form a cycle.

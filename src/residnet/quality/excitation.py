@@ -1,4 +1,4 @@
-"""Checks of excitation: ranges, rest and collinearity of velocities and inputs."""
+"""Checks of excitation: ranges, standstill and collinearity of velocities and inputs."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ class Finding:
         code: identifier of the kind of finding, constant between versions.
         text: one line with figures.
         figures: numbers in SI units.
-        action: recommended action; empty if there is none.
+        action: recommended action; empty without one.
         sample_mask: affected samples [T] bool; None if the finding is not about single samples.
         effect: measured effect on a fit: relative change of its one-step predictions if the fault
             is removed from the log (`residnet.quality.effects`); None if it was not measured.
@@ -294,7 +294,7 @@ class InspectionSummary:
         n_logs_by_code: code of such a finding -> number of logs that have it, the most severe
             first; findings about the set of logs count as one log.
         tally: one sentence with these numbers.
-        first_action: one sentence about the most severe finding; empty if there is none.
+        first_action: one sentence about the most severe finding; empty without findings.
     """
 
     n_logs: int

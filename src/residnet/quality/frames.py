@@ -165,7 +165,7 @@ class FrameAgreement:
     Attributes:
         overlaps: convention -> complex correlation. Its absolute value is the coherence (1 for full
             agreement); its angle is the correction of psi in rad.
-        speed_ratio: norm of the declared velocity over that of the velocity over ground.
+        speed_ratio: ratio of the norms of the declared velocity and of the velocity over ground.
     """
 
     overlaps: dict[str, complex]

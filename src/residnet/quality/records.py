@@ -21,7 +21,7 @@ class FindingRow(Record):
         level: severity.
         code: kind of finding.
         text: one line with figures.
-        action: recommended action; empty if there is none.
+        action: recommended action; empty without one.
         effect: relative change of the predictions of a one-step fit without the fault; None if it
             was not measured.
         figures: numbers in SI units; None for a number that is not finite.
@@ -59,7 +59,7 @@ class InspectionFile(FileRecord):
         logs: findings by log.
         together: findings about the set of logs.
         tally: one sentence with the numbers of findings.
-        first: one sentence about the most severe finding; empty if there is none.
+        first: one sentence about the most severe finding; empty without findings.
     """
 
     schema_name: Literal["residnet.inspection/1"] = Field(alias="schema")

@@ -155,7 +155,7 @@ def unwrap_headings(log: Log) -> Log:
 
 @check("values", "nan", fix="split the log there (mask kind: nan)")
 def check_missing_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report missing samples, and channels whose sampling rate is below that of the log."""
+    """Report missing samples, and channels with a lower sampling rate than the log."""
     for name in log:
         is_missing = ~np.isfinite(log[name])
         missing_share = float(is_missing.mean())

@@ -685,7 +685,7 @@ def evolve_equation(
 
 
 def validation_mask(group: np.ndarray, group_interval: int) -> np.ndarray:
-    """Return the mask of the validation samples [N]: those of every n-th group.
+    """Return the mask of the validation samples [N]: the samples of every n-th group.
 
     Args:
         group: group number of each sample [N].

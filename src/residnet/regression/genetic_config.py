@@ -18,7 +18,7 @@ BINARY = {"+": "add", "-": "subtract", "*": "multiply", "/": "divide"}
 class EvolutionConfig(Config):
     """Settings of the evolution.
 
-    The defaults except the population are those of Halvorsen 2019, Table 6.1.
+    The defaults except the population follow Halvorsen 2019, Table 6.1.
 
     Attributes:
         population: number of individuals.

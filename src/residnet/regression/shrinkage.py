@@ -62,7 +62,7 @@ class CentredMoments(NamedTuple):
 class FoldMoments:
     """Raw moments [1, X, Y]' [1, X, Y] of each fold, float64.
 
-    The moments need one pass over the data. Those of a training set are the sum over all folds
+    The moments need one pass over the data. A training set has the sum of the moments of all folds
     minus the moments of the test fold. X and Y are shifted by their overall means first, which
     avoids cancellation.
 

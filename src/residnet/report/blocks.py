@@ -297,7 +297,7 @@ def build_table(
         groups: titles that span several columns, see `Table`.
         caption: a sentence above the table.
         is_selected: predicate that highlights a row.
-        group_key: a rule is drawn above each row whose key differs from that of the previous row.
+        group_key: a rule is drawn above each row whose key differs from the previous row's key.
 
     Example:
         build_table(rows, [("model", "model"), ("time [s]", "time.mean", 2), ("rms", "rms", 1,

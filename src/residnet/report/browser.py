@@ -83,7 +83,7 @@ def _build_canvases(figure: Figure) -> list[Canvas]:
 
 
 def _axis_range(limits: Sequence[float]) -> DataRange1d | Range1d:
-    """Return the range of an axis: the given limits, or those of all visible curves."""
+    """Return the range of an axis: the given limits, or the limits of all visible curves."""
     from bokeh.models import DataRange1d, Range1d
 
     return Range1d(start=limits[0], end=limits[1]) if limits else DataRange1d(only_visible=True)

@@ -170,7 +170,7 @@ def read_figures(folder: Path, names: str = ".*") -> list[Figure]:
 
 
 def figures_section(folder: Path, names: str = ".*") -> list[Section]:
-    """Return a section with the figures of a folder; an empty list if there are none.
+    """Return a section with the figures of a folder; an empty list without figures.
 
     Args:
         folder: folder that `write_figures` wrote.

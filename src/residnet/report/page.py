@@ -139,7 +139,7 @@ def _load_template() -> Template:
 
 
 def _collect_figures(blocks: Sequence[Block]) -> list[Figure]:
-    """Return the figures among blocks, including those of nested sections."""
+    """Return the figures among blocks, including the figures of nested sections."""
     figures: list[Figure] = []
     for block in blocks:
         if isinstance(block, Figure):

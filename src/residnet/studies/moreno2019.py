@@ -275,7 +275,7 @@ def grid_errors(notes: GridNotes) -> tuple[GridErrors, GridErrors]:
     """Return the validation and the one-step error by penalty and width of the radial kernel.
 
     Only grid points with equal values for all outputs are used. One-step errors are
-    cross-validated and relative to the smallest one of each axis.
+    cross-validated and relative to the smallest error of the axis.
     """
     validation_errors: GridErrors = {}
     for point in notes.grid:

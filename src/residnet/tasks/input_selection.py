@@ -233,7 +233,7 @@ def _is_excited(name: str, values: np.ndarray, draft_notes: DraftNotes) -> bool:
 def _choose_force_set(
     logs: Sequence[Log], names: Sequence[str], draft_notes: DraftNotes
 ) -> list[str]:
-    """Return one set of force channels, which replaces all actuators; empty if there is none."""
+    """Return one set of force channels, which replaces all actuators; empty without forces."""
     force_sets: dict[str, list[str]] = {}
     for name in names:
         force = next((f for f in _FORCE_CHANNELS if name == f or name.startswith(f"{f}_")), None)

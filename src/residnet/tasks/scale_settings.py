@@ -14,7 +14,7 @@ from residnet.runs.folder import RunFolder
 
 
 class ScaleRequest(NamedTuple):
-    """A request to write a run whose models and logs are those of a finished fit at another scale.
+    """A request to write a run with the models and logs of a finished fit at another scale.
 
     Attributes:
         run: folder of the fit.

@@ -35,7 +35,7 @@ from residnet.training.trainer import EpochTraining, run_epochs
 class RudderResponses(NamedTuple):
     """States [S, nx] and their simulated changes [S, 2, C] for each of C rudder angles.
 
-    The changes are those of heading [rad] and yaw rate [rad/s].
+    These are changes of heading [rad] and yaw rate [rad/s].
     """
 
     x: Tensor

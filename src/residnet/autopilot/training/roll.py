@@ -77,7 +77,7 @@ class RollFit(EpochTraining):
         self._start_laws = () if start_law is None else (start_law,)
 
     def compute_loss(self, runs: RollRuns, inputs: Tensor, heights: Tensor) -> Tensor:
-        """Return the mean cost, plus the penalty of a heading error above that of the start law.
+        """Return the mean cost, plus the penalty of a larger heading error than the start law has.
 
         Args:
             runs: simulations of the policy.

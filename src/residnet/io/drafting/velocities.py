@@ -76,7 +76,7 @@ class SwaySlope(NamedTuple):
     Attributes:
         value: slope; 1 for a drift angle that is positive with the flow from port.
         standard_error: standard error by the residuals of windows of all logs.
-        size_ratio: standard deviation of the regressor over that of the response.
+        size_ratio: ratio of the standard deviations of regressor and response.
     """
 
     value: float

@@ -86,7 +86,7 @@ def list_log_endings() -> tuple[str, ...]:
 
 
 def _external_endings(reader: type[ReaderKind]) -> list[str]:
-    """Return the endings of a registered reader in lower case, without those of residnet."""
+    """Return the endings of a registered reader in lower case, if residnet does not use them."""
     # a package must not take over the tables and recordings that residnet reads
     return [ending.lower() for ending in reader.endings if ending.lower() not in _RESERVED_ENDINGS]
 

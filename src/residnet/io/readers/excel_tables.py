@@ -30,7 +30,7 @@ def read_excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> 
 
     Args:
         path: Excel file, or one of its tests.
-        sheet: name of the sheet; None takes that of the test, or the first one.
+        sheet: name of the sheet; None takes the sheet of the test, or the first one.
         rows: largest number of rows to read; None reads all.
 
     Returns:
@@ -81,7 +81,7 @@ def _refuse_tables_side_by_side(path: Path, names: Sequence[str]) -> None:
     """Refuse a sheet whose column names occur again further right, and that is not divided.
 
     Raises:
-        DataError: if the names are those of several tables.
+        DataError: if the names belong to several tables.
     """
     filled = [name for name in names if name]
     if len(filled) < _MIN_TABLE_COLUMNS:
@@ -222,7 +222,7 @@ def join_excel_sheets(path: Path, tables: Mapping[str, pd.DataFrame]) -> pd.Data
 
 
 def list_sheet_names(path: Path) -> list[str]:
-    """Return the names of the sheets of an Excel file, or those of one of its tests, in order.
+    """Return the names of the sheets of an Excel file, or of one of its tests, in order.
 
     Raises:
         UsageError: if openpyxl is not installed.

@@ -161,7 +161,7 @@ def _log_file(split: str, index: int, log: Log) -> str:
 def scale_fit_config(
     config: FitConfig, scaling: FroudeScaling, folder: Path, logs: LogsBySplit
 ) -> FitConfig:
-    """Return the config of the full-scale run, whose logs are those of its folder.
+    """Return the config of the full-scale run, whose logs are in its folder.
 
     Args:
         config: config of the fit.

@@ -518,7 +518,7 @@ def export_model(
 
     Raises:
         UsageError: if the run has no course of this name.
-        ExportError: if the planned course differs from that of the run.
+        ExportError: if the planned course differs from the course of the run.
     """
     protocols = {f"{config.policy}_{protocol}": protocol for protocol in config.protocols}
     name = request.resolve_model_name(protocols)

@@ -119,7 +119,7 @@ class RollTaskConfig(PackageTask, ComputingTask):
         """Check that the vessel has rudders and fins that can follow the commands.
 
         Raises:
-            ConfigError: if the vessel has no fins, or a limit is larger than that of the vessel.
+            ConfigError: if the vessel has no fins, or a limit exceeds the limit of the vessel.
         """
         actuators = getattr(load_vessel(self.vessel), "actuators", None)
         fins = getattr(actuators, "fins", None)

@@ -28,7 +28,7 @@ of the median interval."""
 
 
 def _are_same_posts(first: np.ndarray, second: np.ndarray) -> bool:
-    """Return whether two clocks [T] in s are those of variables posted one after the other."""
+    """Return whether two clocks [T] in s belong to variables posted one after the other."""
     if first.size != second.size or first.size < 2:
         return np.array_equal(first, second)
     interval = float(np.median(np.diff(first)))
