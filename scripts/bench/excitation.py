@@ -41,7 +41,7 @@ from residnet.report.sections.verdict import verdict_level
 _HORIZON = 10.0
 _HISTORY = 2.0
 _N_NEW_LOGS = 4
-_N_FLIGHTS = 8
+_N_FLIGHTS = 40
 
 
 def run_residnet(*arguments: str, folder: Path) -> str:

@@ -15,7 +15,7 @@ from residnet.dynamics.domain_config import (
     MAX_TABLE_BYTES,
     OperatingDomain,
 )
-from residnet.identification.domain import estimate_density, estimate_domain
+from residnet.identification.domain import _calibrate_limits, estimate_density, estimate_domain
 from residnet.identification.excitation import assess_excitation
 from residnet.physics.signals_config import SignalsConfig
 
@@ -101,6 +101,21 @@ def test_the_log_distance_compares_with_the_training_data() -> None:
         assert distance(log, 1.0).mean() < 0.2
         assert distance(log, 4.0).mean() > 1.0
     assert log_domain_distance(OperatingDomain(n_logs=1), log.y, log.w, STATES, ("delta",)) is None
+
+
+def test_limits_from_few_unlike_logs_hold_for_new_logs() -> None:
+    random = np.random.default_rng(3)
+
+    def draw_scores(n_logs: int) -> list[np.ndarray]:
+        scales = np.exp(0.4 * random.standard_normal(n_logs))
+        return [scale * np.abs(random.standard_normal(200)) for scale in scales]
+
+    flagged_shares = []
+    for _ in range(60):
+        (limit,), _ = _calibrate_limits([draw_scores(8)], [1e-9], [np.inf])
+        flagged_shares.append(np.mean([score > limit for score in draw_scores(20)]))
+    # limits at the quantile of the eight logs themselves flag 1.3 % of the samples of new logs
+    assert 0.005 < np.mean(flagged_shares) < 0.011
 
 
 def test_a_log_of_another_kind_does_not_widen_the_domain() -> None:

@@ -248,6 +248,10 @@ def _calibrate_limits(
 ) -> tuple[list[float], float]:
     """Return the limits of some criteria at the joint level 1 - FALSE_FLAG_SHARE.
 
+    Extreme scores come from a few logs, so that limits from all logs flag more of a new log than of
+    these. Limits from the other logs therefore score each log, and the quantile of these scores
+    multiplies the limits from all logs.
+
     Args:
         scores: of each criterion, the scores [K] of the held-out samples of each log.
         smallest_limits: smallest limit of each criterion.
@@ -258,32 +262,62 @@ def _calibrate_limits(
     """
     if not scores:
         return [], 0.0
-    level = 1.0 - FALSE_FLAG_SHARE
     bounds = list(zip(smallest_limits, largest_limits, strict=True))
+    n_parts = len(scores[0])
+    ratios = [np.zeros(0)] * n_parts
+    for others, held_out in _make_folds(n_parts):
+        limits = _joint_limits([[score[k] for k in others] for score in scores], bounds)
+        for k in held_out:
+            ratios[k] = _joint_scores([score[k] for score in scores], limits, bounds)
+    factor = max(_weighted_quantile(ratios, 1.0 - FALSE_FLAG_SHARE), 1.0)
+    limits = [
+        float(np.clip(factor * limit, *bound))
+        for limit, bound in zip(_joint_limits(scores, bounds), bounds, strict=True)
+    ]
+    flags = [
+        np.any([score[k] > limit for score, limit in zip(scores, limits, strict=True)], axis=0)
+        for k in range(n_parts)
+    ]
+    return limits, float(np.mean([flag.mean() for flag in flags]))
+
+
+def _joint_limits(
+    scores: Sequence[Sequence[np.ndarray]], bounds: Sequence[tuple[float, float]]
+) -> list[float]:
+    """Return the limits of some criteria, which together flag FALSE_FLAG_SHARE of the samples.
+
+    Args:
+        scores: of each criterion, the scores [K] of the samples of each log.
+        bounds: smallest and largest limit of each criterion.
+    """
+    level = 1.0 - FALSE_FLAG_SHARE
     limits = [
         float(np.clip(_weighted_quantile(score, level), *bound))
         for score, bound in zip(scores, bounds, strict=True)
     ]
-    # a score beyond the largest limit is flagged in any case and must not widen other criteria
     joint_scores = [
-        np.max(
-            [
-                np.minimum(score[k], bound[1]) / limit
-                for score, limit, bound in zip(scores, limits, bounds, strict=True)
-            ],
-            axis=0,
-        )
-        for k in range(len(scores[0]))
+        _joint_scores([score[k] for score in scores], limits, bounds) for k in range(len(scores[0]))
     ]
     factor = max(_weighted_quantile(joint_scores, level), 1.0)
-    limits = [
+    return [
         float(np.clip(factor * limit, *bound)) for limit, bound in zip(limits, bounds, strict=True)
     ]
-    flags = [
-        np.any([score[k] > limit for score, limit in zip(scores, limits, strict=True)], axis=0)
-        for k in range(len(scores[0]))
+
+
+def _joint_scores(
+    scores: Sequence[np.ndarray],
+    limits: Sequence[float],
+    bounds: Sequence[tuple[float, float]],
+) -> np.ndarray:
+    """Return the largest ratio [K] of the scores [K] of some criteria to their limits.
+
+    A score beyond the largest limit is flagged in any case and must not widen other criteria.
+    """
+    ratios = [
+        np.minimum(score, bound[1]) / limit
+        for score, limit, bound in zip(scores, limits, bounds, strict=True)
     ]
-    return limits, float(np.mean([flag.mean() for flag in flags]))
+    return np.asarray(np.max(ratios, axis=0))
 
 
 Fold = tuple[np.ndarray, np.ndarray]
