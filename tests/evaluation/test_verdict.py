@@ -167,7 +167,7 @@ def test_velocity_errors_are_compared_with_constant_velocity_and_the_baseline() 
         " constant velocity (paired 95 % confidence interval"
     )
     for part in (
-        "-0.4 to -0.2)",
+        "−0.400 to −0.200)",
         "20 % lower than those of the baseline",
         "zero: the difference is not significant",
     ):

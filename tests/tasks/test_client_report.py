@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from made_run import made_run
+from made_run import KINDS, data_quality, made_run, write_json
 from tiny import write_yaml
 
 from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.report.client import ClientText, read_client_text, write_client_report
-from residnet.report.client_content import ReportTable, build_sections
+from residnet.report.client_content import ReportTable, ReportText, build_sections
 from residnet.report.run_reader import RunFiles
 
 typst = pytest.importorskip("typst")
@@ -23,8 +23,10 @@ LOGO = (
 
 
 def test_the_sections_have_the_tests_the_errors_and_the_limits(tmp_path: Path) -> None:
-    run = RunFiles(made_run(tmp_path / "run"))
-    sections = build_sections(run, {})
+    folder = made_run(tmp_path / "run")
+    rows = data_quality({"early_1": "zigzag", "early_2": "zigzag"}, "train")
+    write_json(folder / "data_quality.json", [*rows, *data_quality(KINDS, "test")])
+    sections = build_sections(RunFiles(folder), {})
     titles = [section.title for section in sections]
     assert titles == [
         "Summary",
@@ -36,6 +38,9 @@ def test_the_sections_have_the_tests_the_errors_and_the_limits(tmp_path: Path) -
         for block in section.blocks:
             if isinstance(block, ReportTable):
                 assert all(len(row) == len(block.header) for row in block.rows)
+    summary = sections[0].blocks[0]
+    assert isinstance(summary, ReportText)
+    assert f"identified from 2 of {2 + len(KINDS)} records" in summary.paragraphs[0]
 
 
 def test_the_pdf_has_logo_and_text_of_the_user(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from residnet.core.format import (
     display_unit,
     format_count,
     format_interval,
+    format_minus_signs,
     format_number,
     format_seconds,
     join_list,
@@ -847,9 +848,8 @@ def _format_paired_interval(evidence: VerdictEvidence, reference_name: str) -> s
         if difference.excludes_zero
         else ", which includes zero: the difference is not significant"
     )
-    return (
-        f" (paired 95 % confidence interval of the difference {lower:+.3g} to {upper:+.3g}{suffix})"
-    )
+    bounds = format_minus_signs(f"{lower:+#.3g} to {upper:+#.3g}")
+    return f" (paired 95 % confidence interval of the difference {bounds}{suffix})"
 
 
 def _format_percent(share: float) -> str:

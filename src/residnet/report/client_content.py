@@ -157,10 +157,13 @@ def _summary_section(run: RunFiles, booklet: BookletFile | None) -> ReportSectio
     """Return the main results: the verdict on the prediction and the comparison with IMO."""
     section = ReportSection("Summary")
     n_logs = len({entry.log for entry in run.quality})
+    n_training_logs = len({entry.log for entry in run.quality if entry.split == "train"})
+    logs_text = f"{n_training_logs} of " if 0 < n_training_logs < n_logs else ""
     kinds = sorted({(entry.manoeuvre or "unknown").replace("_", " ") for entry in run.quality})
     sentences = [
-        f"A manoeuvring model was identified from {n_logs} test records ({', '.join(kinds)}) and"
-        " validated by free runs, in which the model receives the measured inputs only."
+        f"A manoeuvring model was identified from {logs_text}{n_logs} records of tests"
+        f" ({', '.join(kinds)}) and validated by free runs, in which the model receives the"
+        " measured inputs only."
     ]
     row = run.find_row(run.main_model, run.report_split, run.main_protocol)
     reference = run.find_row("constant_velocity", run.report_split, run.main_protocol)
@@ -551,20 +554,20 @@ def _limits_section(
         si = run.si_unit(name)
         unit, factor = display_unit(si)
         ship = scale ** {"1/s": -0.5, **_SHIP_EXPONENTS}.get(si, 0.0)
-        rows.append(
-            (
-                f"{name} [{unit}]",
-                format_interval((low, high), factor),
-                format_interval((low, high), factor * ship),
-            )
+        row = (
+            f"{name} [{unit}]",
+            format_interval((low, high), factor),
+            format_interval((low, high), factor * ship),
         )
+        # without a scale both ranges are the same
+        rows.append(row if scale != 1.0 else row[:2])
     if rows:
         section.blocks.append(
             ReportTable(
-                ("quantity", "range of the tests", "range at full scale"),
+                ("quantity", "range of the tests", "range at full scale")[: len(rows[0])],
                 rows,
                 "The model is valid within these ranges; outside, predictions are extrapolations.",
-                (1, 1.5, 1.5),
+                (1, 1.5, 1.5)[: len(rows[0])],
             )
         )
     statements = [
