@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 from tiny_tasks import TINY_TASKS
 from torch import Tensor
 
-from residnet.autopilot.heading.steering_variation import VariedPlant
+from residnet.autopilot.heading.steering_variation import DEPTH, HEADING, Axis, VariedPlant
 from residnet.autopilot.heading.vessels import SteeredPlant
 from residnet.core.errors import ConfigError, ExportError
 from residnet.core.frames import to_body
@@ -203,6 +203,20 @@ def test_no_variation_is_the_plant(name: str) -> None:
     mine = run(VariedPlant(plant, 0.1), x, w, nominal)
     torch.testing.assert_close(mine, run(PlantDynamics(plant, 0.1), x, w), rtol=0, atol=1e-12)
     assert mine[0, -1, plant.state_names.index("psi")] > 0.05
+
+
+@pytest.mark.parametrize(("name", "axis"), [("patrol_mss", HEADING), ("remus_100", DEPTH)])
+def test_nominal_model_equals_the_model_without_variation(name: str, axis: Axis) -> None:
+    vessel = SteeredPlant(load_vessel(name).build(), axis=axis)
+    x, w = vessel.straight_course(torch.tensor([1.0, 0.8], dtype=torch.float64))
+    w[:, 0] = torch.tensor([0.2, -0.3])
+    w = w.unsqueeze(1).repeat(1, 30, 1)
+    nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(2, -1)
+    expected = run(vessel.model(0.4), x, w, nominal)
+    found = run(vessel.nominal_model(0.4), x, w, nominal)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+    with pytest.raises(ConfigError, match=axis.command):
+        SteeredPlant(load_vessel("wam_v_cal").build(), axis=axis).nominal_model(0.4)
 
 
 def test_a_rudder_with_a_lag_moves_within_the_step_and_its_effect_is_varied() -> None:

@@ -185,7 +185,7 @@ class TurnMaker:
             else step_plan
         ):
             if dt not in self.rollouts:
-                self.rollouts[dt] = Rollout(self.vessel.model(dt))
+                self.rollouts[dt] = Rollout(self.vessel.nominal_model(dt))
             with torch.no_grad():
                 states, _, _ = self.rollouts[dt](
                     state_parts[-1][:, -1], w.expand(-1, count, -1), nominal
@@ -300,7 +300,9 @@ def simulate_steady_turn(
     variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
     steps = math.ceil(duration / dt)
     with torch.no_grad():
-        states, _, _ = Rollout(vessel.model(dt))(x, w.unsqueeze(1).expand(-1, steps, -1), variation)
+        states, _, _ = Rollout(vessel.nominal_model(dt))(
+            x, w.unsqueeze(1).expand(-1, steps, -1), variation
+        )
     psi = states[0, :, vessel.state_column("psi")]
     track = states[0, :, [vessel.state_column("x"), vessel.state_column("y")]]
     # the last tenth of the simulation is steady

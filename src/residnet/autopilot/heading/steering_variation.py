@@ -77,6 +77,19 @@ NOMINAL = Vessels(
 """The nominal vessel, for which courses are planned, without current."""
 
 
+def require_command(plant: Plant, axis: Axis) -> None:
+    """Check that a vessel has the command of an axis.
+
+    Raises:
+        ConfigError: if it lacks the command.
+    """
+    if axis.command not in plant.input_names[: plant.n_commands]:
+        raise ConfigError(
+            f"{axis.name} control needs a vessel with the command {axis.command}, found"
+            f" {', '.join(plant.input_names[: plant.n_commands])}"
+        )
+
+
 @final
 class VariedPlant(Dynamics):
     """A plant whose rudder effect, time constants and rudder bias differ from row to row.
@@ -101,11 +114,7 @@ class VariedPlant(Dynamics):
         super().__init__(dt, "heun" if integrator == "heun" else "rk4")
         self.plant = plant
         self.n_state = len(VARIATION)
-        if axis.command not in plant.input_names[: plant.n_commands]:
-            raise ConfigError(
-                f"{axis.name} control needs a vessel with the command {axis.command}, found"
-                f" {', '.join(plant.input_names[: plant.n_commands])}"
-            )
+        require_command(plant, axis)
         names = plant.state_names
         self.set_attitude_columns(plant.attitude_columns, len(names))
 

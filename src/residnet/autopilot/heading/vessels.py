@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import final
 
@@ -11,7 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from residnet.autopilot.heading.steering_variation import HEADING, Axis, VariedModel, VariedPlant
+from residnet.autopilot.heading.steering_variation import (
+    HEADING,
+    Axis,
+    VariedModel,
+    VariedPlant,
+    require_command,
+)
 from residnet.autopilot.heading.turning import (
     Array,
     ManoeuvreRecord,
@@ -23,6 +30,7 @@ from residnet.core.errors import ConfigError, FitError
 from residnet.core.names import suggest_name
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.engine.recorded_plant import RecordedPlantDynamics
 from residnet.manoeuvres.actuated import command_name_for
 from residnet.physics.plant import HullPlant, Plant
 from residnet.physics.symmetry import get_dof
@@ -77,6 +85,13 @@ class SteeredVessel(ABC):
 
         The memory of each row starts with the variation of its steering, see `memory`.
         """
+
+    def nominal_model(self, dt: float) -> Dynamics:
+        """Build the dynamics without variation of the steering, for simulations without gradients.
+
+        Its arguments are those of `model`.
+        """
+        return self.model(dt)
 
     def memory(self, variation: Tensor) -> Tensor:
         """Return the initial memory of `model`.
@@ -213,7 +228,7 @@ class SteeredVessel(ABC):
         longest_step = self._longest_step(dt)
         with torch.inference_mode():
             while times[-1] < duration - 0.5 * dt:
-                model = self.model(dt)
+                model = self.nominal_model(dt)
                 for _ in range(min(_STEPS_PER_DOUBLING, round((duration - times[-1]) / dt))):
                     x, s = model.step(x, w, s)
                     times.append(times[-1] + dt)
@@ -243,7 +258,7 @@ class SteeredVessel(ABC):
             if longest_step <= dt
             else min(max(expected_switch_time / _STEPS_TO_FIRST_SWITCH, dt), longest_step)
         )
-        model = self.model(dt)
+        model = self.nominal_model(dt)
         (x, w, s) = self._straight_state()
         initial_heading = float(x[0, psi])
         rudder_sign = float(np.sign(angle))
@@ -286,6 +301,25 @@ def _is_steady(times: Array, rates: Array) -> bool:
 
 
 @final
+class _NominalPlant(Dynamics):
+    """A plant with its nominal steering, whose step is evaluated by CasADi.
+
+    Args:
+        plant: the plant.
+        dt: time step in s.
+        inputs: names of the columns of w.
+    """
+
+    def __init__(self, plant: Plant, dt: float, inputs: Sequence[str]) -> None:
+        super().__init__(dt, "rk4")
+        self.plant_dynamics = RecordedPlantDynamics(plant, dt)
+        self.input_columns = [inputs.index(name) for name in plant.input_names]
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        return self.plant_dynamics.step(x, w[:, self.input_columns], s)
+
+
+@final
 class SteeredPlant(SteeredVessel):
     """A simulated vessel, in calm water or with environmental inputs.
 
@@ -314,6 +348,10 @@ class SteeredPlant(SteeredVessel):
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
         return VariedPlant(self.plant, dt, integrator, self.axis)
 
+    def nominal_model(self, dt: float) -> Dynamics:
+        require_command(self.plant, self.axis)
+        return _NominalPlant(self.plant, dt, self.inputs)
+
     def straight_course(self, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return states and inputs on straight courses, with thrust proportional to speed^2."""
         x = self._straight_course_state.to(speed.dtype).repeat(len(speed), 1)
@@ -328,7 +366,7 @@ class SteeredPlant(SteeredVessel):
         unit_speed = torch.ones(1, dtype=torch.float64)
         column = self.state_column("u")
         (x, w) = self.straight_course(unit_speed)
-        model = self.model(_RUN_UP_TIME_STEP)
+        model = self.nominal_model(_RUN_UP_TIME_STEP)
         with torch.no_grad():
             for k in range(_MAX_RUN_UP_STEPS):
                 previous_speed = float(x[0, column])
