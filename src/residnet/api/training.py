@@ -56,7 +56,7 @@ class HeadTrainingRun:
     def finish(self) -> Models:
         """Return constant-velocity model, baseline and trained head, with their free runs.
 
-        The head has the weights of the epoch that `fit` selects.
+        The head has the weights of the epoch with the smallest validation error.
 
         Raises:
             UsageError: if the training has no finished epoch.

@@ -521,8 +521,6 @@ class Fitter:
             self.state_scales,
             validate,
             head_fit.seed,
-            # the constant-velocity model has no validation error
-            float(head_fit.baseline.notes.get("validation", math.inf)),
         )
 
     def finish_head(self, head_fit: HeadFit, notes: dict[str, Any]) -> FittedModel:

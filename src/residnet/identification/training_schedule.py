@@ -130,8 +130,7 @@ def _schedule_network(
 
     Accelerations are learned first, because a batch of them is ten times faster than a batch of
     rollouts. Rollouts follow, over two horizons, and average the noise of differentiated
-    velocities. The weights with the smallest free-run error on the validation logs are taken, of
-    the last stage that is better than the baseline.
+    velocities. The weights with the smallest free-run error on the validation logs are taken.
     """
     dt = summary.dt
     max_horizon_samples = max(2, int(summary.max_free_run_length / dt))
@@ -165,5 +164,4 @@ def _schedule_network(
         ],
         "weight_decay": 0.001,
         "require_improvement": True,
-        "selects_later_stage": True,
     }

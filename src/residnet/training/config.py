@@ -201,9 +201,6 @@ class TrainingConfig(MachineConfig):
         validate_every: number of epochs between validations.
         require_improvement: whether the residual is set to zero if no epoch has a smaller
             validation error than the baseline.
-        selects_later_stage: whether weights of a later stage that are better than the baseline take
-            precedence over a smaller validation error in an earlier stage, unless more windows
-            diverge.
     """
 
     one_step: OneStep = OneStep(epochs=0)
@@ -219,7 +216,6 @@ class TrainingConfig(MachineConfig):
     patience: int = Field(default=20, ge=1)
     validate_every: int = Field(default=1, ge=1)
     require_improvement: bool = False
-    selects_later_stage: bool = False
 
     @model_validator(mode="after")
     def _check_stages(self) -> TrainingConfig:

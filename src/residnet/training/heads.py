@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -187,11 +186,9 @@ class HeadTraining(EpochTraining):
         scales: Tensor,
         validate: Validate,
         seed: int,
-        baseline_error: float = math.inf,
     ) -> None:
         super().__init__(config, seed)
         self.model = model
-        self.baseline_error = baseline_error
         self._validated_models = (model,)
         self.rollout = Rollout(model)
         self._compiled: FreeRun | None = None
@@ -401,16 +398,6 @@ class HeadTraining(EpochTraining):
             self._compiled = compile_rollout(self.rollout, TRAINING_STEPS)
         return self._compiled
 
-    def _is_improvement(self, score: float) -> bool:
-        stage, _ = self.settings.stage(self.epoch)
-        if self.settings.selects_later_stage and self.best_state and stage > self.best_stage:
-            # The smallest of many scores on few validation logs is often due to chance: with six
-            # logs of a ship, the differences between epochs were .002 to .005 of .075, and their
-            # standard errors .010 to .012. An early epoch was selected, and its position error on
-            # test logs was twice that of the last epoch.
-            return score < self.baseline_error and self.diverged <= self.best_diverged
-        return super()._is_improvement(score)
-
     def compute_validation_score(self) -> tuple[nn.Module, float]:
         score = self.validate(self.model)
         self.diverged = score.diverged
@@ -432,7 +419,6 @@ class TrainingSetup:
         scales: scales of the velocities, SI [n].
         validate: returns the validation score of a model.
         seed: seed of noise and batches.
-        baseline_error: validation error of the baseline; infinite if it is not known.
     """
 
     model: HybridDynamics
@@ -442,7 +428,6 @@ class TrainingSetup:
     scales: Tensor
     validate: Validate
     seed: int
-    baseline_error: float = math.inf
 
 
 def make_training(setup: TrainingSetup) -> tuple[HeadTraining, WindowsDataModule]:
@@ -478,14 +463,9 @@ def make_training(setup: TrainingSetup) -> tuple[HeadTraining, WindowsDataModule
             finally:
                 trained.head.set_step(coarse.dt)
 
-        trained_model = coarse
-        validate: Validate = validate_fine
+        module = HeadTraining(coarse, config, setup.scales.to(dtype), validate_fine, setup.seed)
     else:
-        trained_model = model
-        validate = setup.validate
-    module = HeadTraining(
-        trained_model, config, setup.scales.to(dtype), validate, setup.seed, setup.baseline_error
-    )
+        module = HeadTraining(model, config, setup.scales.to(dtype), setup.validate, setup.seed)
     # losses and scores use velocities only
     module.model.has_position = False
     module.model.to(dtype)

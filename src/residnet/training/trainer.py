@@ -37,8 +37,8 @@ Logger = LightningLogger
 Epochs = OneStage | TrainingConfig
 """Settings of a training."""
 _CHECKPOINT_FIELDS = (
-    "best_score", "best_diverged", "best_stage", "best_state", "start_score", "without_gain",
-    "history", "stopped",
+    "best_score", "best_diverged", "best_state", "start_score", "without_gain", "history",
+    "stopped",
 )  # fmt: skip
 """Attributes of `EpochTraining` in a checkpoint, in addition to the state of Lightning."""
 
@@ -103,7 +103,6 @@ class EpochTraining(L.LightningModule, ABC):
         self.diverged = 0
         self.best_score = math.inf
         self.best_diverged = 0
-        self.best_stage = 0
         self.best_state: dict[str, Tensor] = {}
         self.start_score: float | None = None
         self.without_gain = 0
@@ -190,7 +189,6 @@ class EpochTraining(L.LightningModule, ABC):
             if self._is_improvement(score):
                 self.best_score = score
                 self.best_diverged = self.diverged
-                self.best_stage = stage
                 self.without_gain = 0
                 self.best_state = _copy_state(model)
                 self._validated_models = (model,)
@@ -209,7 +207,6 @@ class EpochTraining(L.LightningModule, ABC):
         self.trainer.should_stop = self.is_finished
 
     def _is_improvement(self, score: float) -> bool:
-        """Return whether the weights of the last validation replace the best ones."""
         if not self.best_state:
             return math.isfinite(score)
         return (self.diverged, score) < (self.best_diverged, self.best_score)

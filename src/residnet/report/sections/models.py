@@ -501,9 +501,7 @@ def learning_figure(run: RunFiles) -> Figure | None:
         if reference is not None:
             error_curves["baseline"] = (epoch[:1], np.array([reference.mean_nrmse]))
         if has_validation.any():
-            # not always the smallest error: a later stage or fewer diverged windows come first
-            selected_error = notes.validation_error or 0.0
-            best_index = [int(np.nanargmin(np.abs(validation - selected_error)))]
+            best_index = [int(np.nanargmin(validation))]
             error_curves["best"] = (epoch[best_index], validation[best_index])
         if len(stage_starts):
             loss_curves["stage"] = error_curves["stage"] = (
@@ -544,7 +542,7 @@ def learning_figure(run: RunFiles) -> Figure | None:
             "loss": GlyphStyle("training loss", BLUE),
             "validation": GlyphStyle("validation", BLUE),
             "baseline": replace(baseline, kind="hline"),
-            "best": replace(_RING_STYLE, label="selected epoch"),
+            "best": replace(_RING_STYLE, label="best epoch"),
             "stage": GlyphStyle("next stage", "#7F7F7F", width=0.8, kind="vline", z_order=1),
         },
         [
