@@ -63,7 +63,7 @@ _MIN_CLOCK_ADVANTAGE = 20.0
 """Smallest difference of the BIC by which the data distinguish two hypotheses."""
 _MAX_SHIFT = 3.0
 """Largest delay in s that is tried."""
-_SHIFT_STEPS = (0.3, 0.6)
+_SHIFT_STEPS = (0.3, 1.0)
 """Smallest and largest step in s between delays that are tried."""
 _SHIFT_STEP_SHARE = 0.3
 """Step between delays over the time scale of the motion; a period has 20 steps."""
@@ -425,7 +425,13 @@ def _compare_clocks(
     residual_square = float(np.nan_to_num(regression.squares).mean()) if regression.causes else 0.0
     if is_unlike or residual_square <= _MAX_ROUNDING_SHARE * regression.response_square:
         return regression.causes
-    shifts = _search_shifts(log.excerpt_middle(_MAX_CLOCK_SAMPLES), make_model, names, clocks)
+    unshifted = _ClockHypothesis(regression, channels)
+    excerpt = log.excerpt_middle(_MAX_CLOCK_SAMPLES)
+    if excerpt is not log:
+        excerpt_channels = _select_channels(excerpt, *names)
+        explanation = _explain_increments(make_model(excerpt, excerpt_channels))
+        unshifted = _ClockHypothesis(explanation, excerpt_channels)
+    shifts = _search_shifts(excerpt, make_model, unshifted, clocks)
     if not shifts:
         return regression.causes
     for clock, n_samples in shifts.items():
@@ -441,7 +447,7 @@ def _compare_clocks(
 def _search_shifts(
     log: LogStatistics,
     make_model: Callable[..., _IncrementModel],
-    names: Sequence[str],
+    unshifted: _ClockHypothesis,
     clocks: Mapping[str, tuple[str, ...]],
 ) -> dict[str, int]:
     """Return lag -> number of samples for the clocks of the likeliest hypothesis; see above.
@@ -450,10 +456,9 @@ def _search_shifts(
     known beforehand. The extended BIC counts the hypotheses with as many shifts (Chen and Chen
     2008, Biometrika 95, 759-771, eq. 1 with gamma = 1).
     """
-    channels = _select_channels(log, *names)
-    model = make_model(log, channels)
-    candidates = [name for name in clocks if name in model.columns]
-    hypotheses = [_ClockHypothesis(_explain_increments(model), channels)]
+    columns = make_model(log, unshifted.channels).columns
+    candidates = [name for name in clocks if name in columns]
+    hypotheses = [unshifted]
     continued = hypotheses
     for _ in range(_MAX_CLOCKS):
         trials = [
