@@ -224,7 +224,7 @@ def test_facts_have_reference_evidence_domain_and_next_step(level: str, tmp_path
     assert "free runs of 30 s on 4 test logs: zigzag (3) and turning (1)" in facts
     assert "mean speeds 0.90 to 1.1 m/s" in facts
     domain = "u 0.00 to 1.25 m/s, v −0.200 to 0.200 m/s, r −5.73 to 5.73 deg/s, n 5.0 to 20.0 1/s"
-    assert f"{domain}; errors outside are unknown" in facts
+    assert f"{domain}; errors outside, and under other kinds of commands than" in facts
     assert "First fix this: zigzag_01: a gap" in facts
     (run / "doctor.json").unlink()
     facts = facts_of(run)

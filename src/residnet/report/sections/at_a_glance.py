@@ -165,7 +165,8 @@ def _describe_operating_domain(run: RunFiles, evidence: VerdictEvidence) -> str:
     relations = () if evidence.excitation is None else evidence.excitation.domain
     # the report has the complete sentences among the reasons
     facts = [", ".join(ranges), *(sentence.partition(":")[0] for sentence in relations)]
-    return f"{'; '.join(facts)}; errors outside are unknown." if ranges else ""
+    scope = "errors outside, and under other kinds of commands than in the logs, are unknown"
+    return f"{'; '.join(facts)}; {scope}." if ranges else ""
 
 
 def _recommend_next_step(run: RunFiles, evidence: VerdictEvidence) -> str:
