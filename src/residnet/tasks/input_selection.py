@@ -331,9 +331,9 @@ def _are_duplicates(first: np.ndarray, second: np.ndarray) -> bool:
 
 
 def missing_control(names: Sequence[str], dof: DegreesOfFreedom = SURGE_SWAY_YAW) -> str:
-    """Return the missing effect of the inputs, `drives` or `steers`; empty if none is missing.
+    """Return the missing effect of the inputs, `propels` or `steers`; empty if none is missing.
 
-    A vessel without yaw needs no input that steers, a vessel without surge none that drives.
+    A vessel without yaw needs no input that steers, a vessel without surge none that propels.
     Forces, azimuth thrusters and several thrusters have both effects.
     """
     base_names = [name.removeprefix("cmd_") for name in names if not PLANE_PATTERN.match(name)]
@@ -346,5 +346,5 @@ def missing_control(names: Sequence[str], dof: DegreesOfFreedom = SURGE_SWAY_YAW
     has_both = any(name.startswith(("tau", "azimuth", "nozzle")) for name in undetermined)
     if has_both or any(is_steering) + any(is_driving) + len(undetermined) > 1:
         return ""
-    missing = "drives" if any(is_steering) else "steers"
-    return missing if {"drives": dof.has_position, "steers": dof.has_heading}[missing] else ""
+    missing = "propels" if any(is_steering) else "steers"
+    return missing if {"propels": dof.has_position, "steers": dof.has_heading}[missing] else ""
