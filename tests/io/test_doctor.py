@@ -87,6 +87,7 @@ TWIN = changed(n=np.full(len(LOG), 10.0), delta_stbd=LOG["delta"].copy())
 STOPPED = {name: np.where(T < 60.0, 0.0, LOG[name]) for name in "uvr"}
 NO_POSE = Log("short", T, {name: LOG[name] for name in ("u", "v", "r", "delta")})
 BAD = np.arange(75, 2000, 150)
+NOISE = np.random.default_rng(1).normal(0.0, 0.01, LOG["v"].size)
 TURN = 2.0 * np.pi
 WRAPS = float((np.abs(np.diff(PSI % TURN)) > 3.0).sum())
 # a level is what the fault does to a fit: what changes nothing is a note
@@ -160,6 +161,7 @@ TOLD: list[tuple[Log, str, str, str, dict[str, float]]] = [
         {"share": 13 / 2000},
     ),
     (changed(u=np.round(LOG["u"], 1)), "resolution", "will mislead", "0.1 m/s", {"levels": 10}),
+    (changed(v=np.round(NOISE, 3)), "resolution", "note", "0.001 m/s", {"levels": 33}),
     # clock
     (GAP, "gaps", "note", "1 gaps", {"count": 1, "longest": 6.1, "lost": 6.0}),
     (changed(u=np.repeat(LOG["u"][::2], 2)), "held", "note", "once in 2 samples", {"every": 2}),

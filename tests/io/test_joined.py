@@ -135,6 +135,25 @@ def test_a_third_recorder_is_joined_by_the_rate_that_it_shares(
     assert float(parts[1]) == pytest.approx(1.75e9 - 3.0, abs=0.03)
 
 
+@pytest.mark.parametrize("column", ["gyro_z_dps", "gyro_z"])
+def test_a_joined_yaw_rate_gets_the_sign_of_the_heading(
+    column: str, ship_logs: list[Log], tmp_path: Path
+) -> None:
+    log = ship_logs[0]
+    fixes, acts = tables(log)
+    board = acts.assign(**{column: -np.degrees(log["r"])})
+    for name, table in (("gnss", fixes), ("board", board)):
+        table.to_csv(tmp_path / f"{name}.csv", index=False)
+    (result,) = read_mixed_formats(sorted(tmp_path.iterdir()))
+    channels = result.reader["parts"]["board"]["channels"]
+    assert channels["r"] == {"column": column, "unit": "deg/s", "sign": -1}
+    # the direction of the rudder follows from the corrected yaw rate
+    assert "sign" not in channels["delta"]
+    (joined,) = result.logs.values()
+    expected = np.interp(joined.t - 1.75e9, log.t, log["r"])
+    assert float(np.nanmax(np.abs(joined["r"] - expected))) < 0.1 * float(np.abs(log["r"]).max())
+
+
 def reader_of(**more: Any) -> dict[str, Any]:
     def table(*names: str) -> dict[str, Any]:
         units = {"x": "m", "y": "m", "k": "-"}
