@@ -16,6 +16,7 @@ from residnet.io.drafting.questions import DraftNotes
 from residnet.io.drafting.reading import DraftResult, read_drafted
 from residnet.io.drafting.tables import draft_tables
 from residnet.io.readers import ReaderConfig
+from residnet.quality import inspect_log
 
 TIMES = np.arange(0.0, 79.0, 0.2)
 
@@ -117,6 +118,24 @@ def test_velocities_of_another_run_stop_the_draft(tmp_path: Path) -> None:
     path = write_run(tmp_path / "run.csv", motion, rng, turned)
     with pytest.raises(DataError, match=r"integrated, differ from the positions by \d+ %"):
         read_drafted([path], DraftNotes())
+
+
+def test_a_reset_of_the_position_is_no_contradiction(tmp_path: Path) -> None:
+    motion = true_motion(1)
+    velocities = compute_velocities(motion)
+    table = {name: motion.sample(name, TIMES) for name in ("x", "y", "psi", "r")}
+    after = np.flatnonzero(TIMES > 40.0)
+    for name in ("x", "y"):
+        table[name][after] -= table[name][after[0]] + 60.0
+    table |= {"t": TIMES, "u": velocities["u"], "v": velocities["v"]}
+    path = tmp_path / "run.csv"
+    pd.DataFrame(table).to_csv(path, index=False)
+    (log,) = read_drafted([path], DraftNotes()).logs.values()
+    found = {finding.code: finding for finding in inspect_log(log).findings}
+    assert found["position_jump"].level == "will mislead"
+    assert found["position_jump"].figures["t"] == pytest.approx(TIMES[after[0]], abs=0.01)
+    # the frames of both parts are right
+    assert found["frames"].level == "note"
 
 
 def test_velocities_along_north_and_east_need_a_heading(tmp_path: Path) -> None:

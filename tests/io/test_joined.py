@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,10 @@ import pandas as pd
 import pytest
 
 from residnet.core.config import validate_config
-from residnet.core.errors import ConfigError, DataError
+from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.io.drafting.reading import read_mixed_formats
+from residnet.io.drafting.trips import refuse_topics
 from residnet.io.readers import ReaderConfig
 from residnet.io.readers.base import hash_files
 from residnet.io.readers.joined_files import estimate_clock_offset, group_trip_files
@@ -133,6 +135,25 @@ def test_a_third_recorder_is_joined_by_the_rate_that_it_shares(
     )
     assert parts is not None, told[0]
     assert float(parts[1]) == pytest.approx(1.75e9 - 3.0, abs=0.03)
+
+
+def test_topics_of_several_recordings_in_one_folder_are_named(tmp_path: Path) -> None:
+    t = np.arange(5) * 1e5
+    pose = {"timestamp": t, "x": t, "y": t, "heading": t}
+    files = {}
+    for folder, columns in (
+        ("topics", {"timestamp": t, "control[0]": t}),
+        ("kinds of complete logs", {**pose, "u": t}),
+    ):
+        (tmp_path / folder).mkdir()
+        files[folder] = []
+        for recording, topic in itertools.product(("log_1", "log_2"), ("vehicle_pose", "servos")):
+            files[folder].append(tmp_path / folder / f"{recording}_{topic}.csv")
+            table = pose if topic == "vehicle_pose" else columns
+            pd.DataFrame(table).to_csv(files[folder][-1], index=False)
+    with pytest.raises(UsageError, match=r"2 topics .* of 2 recordings \(log_1, log_2\); move"):
+        refuse_topics(files["topics"])
+    refuse_topics(files["kinds of complete logs"])
 
 
 @pytest.mark.parametrize("column", ["gyro_z_dps", "gyro_z"])

@@ -36,7 +36,7 @@ from residnet.io.drafting.problems import (
 from residnet.io.drafting.questions import INPUTS_KEY, READER_KEY, DraftNotes, Key
 from residnet.io.drafting.recordings import draft_recordings
 from residnet.io.drafting.tables import draft_tables
-from residnet.io.drafting.trips import draft_trip_parts, group_by_trip
+from residnet.io.drafting.trips import draft_trip_parts, group_by_trip, refuse_topics
 from residnet.io.header_vocabulary import PLANE_PATTERN, parse_header_unit
 from residnet.io.readers import ReaderConfig
 from residnet.io.readers.detect import detect_log_kind, is_channel_reader
@@ -90,6 +90,7 @@ def read_drafted(
         # a trip has the name of its file with the most channels of the motion
         paths = [*trip_files[next(iter(result.reader["parts"]))]]
     elif log_kind == "table":
+        refuse_topics(paths)
         with name_files_in_errors(paths):
             result.reader, result.errors = draft_tables(paths, draft_notes)
     elif is_channel_reader(log_kind):
@@ -180,6 +181,8 @@ def read_mixed_formats(
         path: read_column_names(path) for path in paths if detect_log_kind(path) == "table"
     }
     has_trips = bool(group_by_trip([*columns_by_path]))
+    if not has_trips:
+        refuse_topics([*columns_by_path])
     for path in paths:
         log_kind = detect_log_kind(path)
         names = columns_by_path[path] if log_kind == "table" and not has_trips else ()
