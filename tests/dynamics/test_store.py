@@ -16,6 +16,7 @@ from residnet.core.errors import ConfigError, UsageError
 from residnet.dynamics.store import ModelSpec, load_model, model_names, rebuild_module, save_model
 from residnet.heads.lstm_config import LstmConfig
 from residnet.heads.mirror import Tanh
+from residnet.heads.skip import SkipHead
 from residnet.physics.signals_config import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
@@ -95,16 +96,19 @@ def test_a_rebuilt_model_is_the_loaded_one_bit_for_bit(tmp_path: Path) -> None:
         assert torch.equal(value, other), name
 
 
-def test_readouts_of_earlier_versions_are_tanh(tmp_path: Path) -> None:
+def test_networks_of_earlier_versions_have_tanh_readouts_and_no_skip(
+    tmp_path: Path,
+) -> None:
     head = {"kind": "lstm", "hidden_size": 3, "readout": 4}
-    kept = saved(tmp_path / "m", head={**head, "readout_activation": "tanh"})
+    kept = saved(tmp_path / "m", head={**head, "readout_activation": "tanh", "skip": "none"})
     content = json.loads((tmp_path / "m" / "model.json").read_text())
-    del content["head"]["readout_activation"]
+    del content["head"]["readout_activation"], content["head"]["skip"]
     edited(tmp_path / "m", head=content["head"])
     loaded, model = load_model(tmp_path / "m")
     assert loaded == kept
     readouts = [module for module in model.modules() if isinstance(module, Tanh | torch.nn.SiLU)]
     assert [type(module) for module in readouts] == [Tanh]
+    assert not any(isinstance(module, SkipHead) for module in model.modules())
     # a new head has a readout that does not saturate
     new_config = LstmConfig(hidden_size=3, readout=4)
     assert any(

@@ -178,7 +178,7 @@ def test_instability_is_flagged_with_its_doubling_time_and_where_it_is() -> None
 
 
 def test_growth_rate_with_a_memory_is_that_of_the_whole_step() -> None:
-    spec, model = made(RUDDER, head={"kind": "lstm", "hidden_size": 3})
+    spec, model = made(RUDDER, head={"kind": "lstm", "hidden_size": 3, "skip": "none"})
     model = model.double().eval()
     of_kind(model.head, LstmHead).scale.std.fill_(0.3)
     point = find_operating_points(spec, model)[2]
@@ -250,7 +250,7 @@ def test_wind_from_the_other_side_is_the_mirror_of_wind() -> None:
 
 
 def test_a_network_on_top_is_checked_with_its_memory_settled() -> None:
-    spec, model = made(RUDDER, head={"kind": "lstm", "hidden_size": 4})
+    spec, model = made(RUDDER, head={"kind": "lstm", "hidden_size": 4, "skip": "none"})
     of_kind(model.head, LstmHead).scale.std.fill_(1e-6)
     # the memory of an untrained network may be unstable by itself
     assert all(found.ok for found in findings(spec, model).values() if found.check != STABILITY)

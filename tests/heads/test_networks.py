@@ -35,7 +35,7 @@ from residnet.preprocessing.windows import WindowStore
 def built(**config: object) -> LstmHead:
     torch.manual_seed(0)
     head = LstmConfig.model_validate(
-        {"kind": "lstm", "hidden_size": 12, "readout": 0, **config}
+        {"kind": "lstm", "hidden_size": 12, "readout": 0, "skip": "none", **config}
     ).build(NAMES)
     assert isinstance(head, LstmHead)
     head.calibrate(made())
@@ -103,7 +103,7 @@ def test_a_softsign_cell_equals_numpy() -> None:
 def test_the_documents_network_has_axes_of_their_own() -> None:
     """4 * 100 * (4 + 100 + 1) + 101 = 42,101 for each of surge, sway, yaw (correction W4)."""
     config = LstmConfig(
-        hidden_size=100, readout=0, per_axis=True, features=("u", "v", "r", "tau_n")
+        hidden_size=100, readout=0, per_axis=True, features=("u", "v", "r", "tau_n"), skip="none"
     )
     head: Any = config.build(NAMES)
     counts = [sum(p.numel() for p in network.parameters()) for network in head.networks]
@@ -436,7 +436,7 @@ SCENES = {
 }
 TURNED = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 MIRRORED: dict[str, Any] = {
-    "mlp": MlpConfig(mirror=True, hidden=(9, 7)),
+    "mlp": MlpConfig(mirror=True, hidden=(9, 7), skip="none"),
     "lstm": LstmConfig(mirror=True, hidden_size=6, readout=0),
     "readout": LstmConfig(mirror=True, hidden_size=5, readout=4, memory=("v", "r")),
     "per axis": LstmConfig(

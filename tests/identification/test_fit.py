@@ -28,7 +28,6 @@ from residnet.identification.fitter import (
     FittedModel,
     Fitter,
     find_reference_names,
-    select_by_free_run,
 )
 from residnet.identification.identified import (
     IdentifiedModels,
@@ -41,6 +40,7 @@ from residnet.preprocessing.samples import compute_channels, make_samples
 from residnet.preprocessing.windows import WindowStore
 from residnet.regression.estimator import Solution
 from residnet.training.score import Score
+from residnet.training.selection import select_by_free_run
 
 
 @pytest.fixture(scope="module")

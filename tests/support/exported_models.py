@@ -42,7 +42,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         for kind in KINDS
         if kind != "sklearn"
     },
-    "mlp_mirror": {"kind": "mlp", "hidden": (8,), "mirror": True},
+    "mlp_mirror": {"kind": "mlp", "hidden": (8,), "mirror": True, "skip": "none"},
     "lstm_mirror": {
         "kind": "lstm",
         "hidden_size": 5,
@@ -67,7 +67,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "encoder": "measurements",
     },
     "mean": {},
-    "lstm_per_axis": {"kind": "lstm", "hidden_size": 4, "per_axis": True, "activation": "softsign"},
+    "lstm_per_axis": {
+        "kind": "lstm",
+        "hidden_size": 4,
+        "per_axis": True,
+        "activation": "softsign",
+        "skip": "none",
+    },
 }
 
 

@@ -29,6 +29,7 @@ from residnet.heads.mlp import MlpHead
 from residnet.heads.mlp_config import MlpConfig
 from residnet.heads.recurrent import GRUEnsembleHead
 from residnet.heads.recurrent_config import GRUEnsembleConfig
+from residnet.heads.skip import SkipHead
 from residnet.preprocessing.data_module import WindowBatch, WindowsDataModule
 from residnet.preprocessing.prepare import PreparedLog
 from residnet.preprocessing.samples import make_samples
@@ -105,9 +106,8 @@ UNITS = torch.tensor([0.5, 0.2, 0.3], dtype=torch.float64)
 
 def with_mlp() -> HybridDynamics:
     torch.manual_seed(0)
-    return model_of(
-        LINEAR, THETA, MlpConfig(hidden=(5,)).build(("u", "v", "r", "tau_x", "tau_n"))
-    ).double()
+    head = MlpConfig(hidden=(5,), skip="none").build(("u", "v", "r", "tau_x", "tau_n"))
+    return model_of(LINEAR, THETA, head).double()
 
 
 def layers(model: HybridDynamics) -> tuple[nn.Linear, nn.Linear]:
@@ -225,9 +225,8 @@ def prepared(
 ) -> tuple[HybridDynamics, Samples, WindowStore]:
     """A linear baseline of the quadratic vessel with a fresh head on it."""
     torch.manual_seed(1)
-    model = model_of(
-        LINEAR, head=(head or MlpConfig(hidden=(12,))).build(("u", "v", "r", "tau_x", "tau_n"))
-    )
+    head = head or MlpConfig(hidden=(12,), skip="none")
+    model = model_of(LINEAR, head=head.build(("u", "v", "r", "tau_x", "tau_n")))
     known = make_samples(logs, model.signals)
     RegressorsConfig(terms=LINEAR).fit_preferred(model.baseline, known)
     with torch.no_grad():
@@ -308,6 +307,46 @@ def test_training_lowers_the_free_run_error(tmp_path: Path) -> None:
     assert free_run_error(model) < 0.7 * baseline
     assert not any(parameter.requires_grad for parameter in model.parameters())
     assert (tmp_path / "checkpoints" / "mlp" / "last.ckpt").is_file()
+
+
+def test_a_skip_connection_is_selected_by_free_runs_and_is_a_candidate(
+    logs: Sequence[PreparedLog],
+) -> None:
+    model, residual, store = prepared(logs, MlpConfig(hidden=(6,)))
+    settings = TrainingConfig.model_validate({"steps": 3, "one_step": ONE_STEP})
+    seen: list[Tensor] = []
+
+    def validate(validated: HybridDynamics) -> Score:
+        """Prefer a linear part of medium size, without a network."""
+        linear = of_kind(validated.head, SkipHead).linear.coefficients
+        network = of_kind(of_kind(validated.head, SkipHead).network, MlpHead).network
+        output = of_kind(network[-1], nn.Linear).weight.detach()
+        seen.append(linear.clone())
+        return Score(0, abs(float(linear.abs().sum()) - medium) + float(output.abs().sum()))
+
+    trial_head = of_kind(model.head, SkipHead)
+    trial_head.calibrate(residual)
+    sizes = [
+        float(solution.state["coefficients"].abs().sum())
+        for solution in trial_head.linear_solutions(residual)
+    ]
+    # neither the solution of cross-validation nor that without a residual
+    medium = sizes[2]
+    assert medium not in (sizes[0], 0.0)
+    setup = TrainingSetup(model, residual, store, settings, SCALES, validate, 0)
+    notes = train("mlp", setup, None)
+    head = of_kind(model.head, SkipHead)
+    assert float(head.linear.coefficients.abs().sum()) == pytest.approx(medium, rel=1e-5)
+    # every epoch is worse than the linear part alone, which is returned
+    assert notes["start_validation"] == notes["best_validation"]
+    assert len(seen) == len(sizes) + 1 + 2
+    z = residual.z.float()
+    with torch.no_grad():
+        torch.testing.assert_close(head(z, z[:, :0])[0], head.linear(z, z[:, :0])[0])
+    remainder = residual.target - head.linear.double()(residual.z, z[:, :0])[0]
+    torch.testing.assert_close(
+        head.residual_scale().double(), remainder.std(0, correction=0), rtol=1e-4, atol=0
+    )
 
 
 @pytest.mark.parametrize(

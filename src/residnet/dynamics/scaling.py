@@ -32,6 +32,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import BandTable, ModelSpec
 from residnet.heads.base import Features, ResidualScale
 from residnet.heads.basis import BasisHead
+from residnet.heads.skip import RangeWeight
 from residnet.physics.signals import SoftVelocityLimit
 from residnet.physics.similarity import FroudeScaling, is_drive, is_rudder
 from residnet.physics.symmetry import get_dof
@@ -272,6 +273,10 @@ def _part_factors(
         if isinstance(part, Features) and set(part.names) <= set(names):
             for key in ("mean", "std", "low", "high"):
                 factors[prefix + key] = channel_factors(part.names)
+        elif isinstance(part, RangeWeight):
+            ranges = channel_factors(part.names)
+            factors |= {f"{prefix}low": ranges, f"{prefix}high": ranges}
+            factors[f"{prefix}decay"] = 1.0 / ranges
         elif isinstance(part, ResidualScale):
             factors[f"{prefix}std"] = acceleration
         elif isinstance(part, SoftVelocityLimit):

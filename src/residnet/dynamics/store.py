@@ -318,11 +318,14 @@ def read_spec(folder: Path, spec_class: type[SpecT]) -> SpecT:
 def _add_earlier_defaults(content: dict[str, Any]) -> None:
     """Add keys that descriptions of earlier versions lack, with the values that applied then.
 
-    The readout of an LSTM was always `tanh`, which is no longer the default.
+    The readout of an LSTM was always `tanh`, which is no longer the default, and networks had no
+    skip connection.
     """
     head = content.get("head")
     if isinstance(head, dict) and head.get("kind") == "lstm":
         head.setdefault("readout_activation", "tanh")
+    if isinstance(head, dict) and head.get("kind") in ("lstm", "mlp"):
+        head.setdefault("skip", "none")
     members = content.get("members")
     for member in members if isinstance(members, list) else ():
         if isinstance(member, dict):

@@ -168,8 +168,9 @@ class LstmNetwork(RenamedStateModule):
         self.has_hidden_readout_layer = config.readout > 0
         output_layer = nn.Linear(config.readout or config.hidden_size, n_outputs)
         with torch.no_grad():
-            # small initial outputs: training starts near the baseline
-            output_layer.weight.mul_(0.1)
+            # small initial outputs: training starts near the baseline, or at the linear model of a
+            # skip connection
+            output_layer.weight.mul_(0.1 if config.skip == "none" else 0.0)
             output_layer.bias.zero_()
         hidden_layers = (
             nn.Sequential(
@@ -231,7 +232,10 @@ class LstmHead(ResidualHead):
         self.n_state = self.network_state_size * len(self.networks)
         self.scale = ResidualScale(self.n_dof)
         self.restoring_acceleration: SoftVelocityLimit | None = (
-            SoftVelocityLimit(n_channels=self.n_dof, n_dof=self.n_dof) if config.restoring else None
+            # a skip connection has its own, which does not decay outside the training range
+            SoftVelocityLimit(n_channels=self.n_dof, n_dof=self.n_dof)
+            if config.restoring and config.skip == "none"
+            else None
         )
 
     def residual_scale(self) -> Tensor:

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field, model_validator
 
 from residnet.core.errors import ConfigError
-from residnet.heads.config import FeatureConfig, NetworkConfig
+from residnet.heads.config import FeatureConfig
+from residnet.heads.skip_config import SkipNetworkConfig
 from residnet.physics.symmetry import get_dof, require_mirror_image
 
 if TYPE_CHECKING:
     from residnet.heads.base import ResidualHead
 
 
-class LstmConfig(NetworkConfig):
+class LstmConfig(SkipNetworkConfig):
     """LSTM for all axes, or an LSTM per axis.
 
     Attributes:
@@ -32,7 +33,6 @@ class LstmConfig(NetworkConfig):
         dropout: dropout probability of the hidden outputs before the readout.
         per_axis: whether surge, sway and yaw have a network each, as in Woo et al. 2018.
         axis_features: channels of the network of each axis if they differ; needs `per_axis`.
-        mirror: whether the residual is mirror-symmetric between port and starboard by construction.
         restoring: whether an acceleration returns velocities to their training range, so that a
             network without a baseline cannot diverge; see `physics.signals.SoftVelocityLimit`.
     """
@@ -46,7 +46,6 @@ class LstmConfig(NetworkConfig):
     dropout: float = Field(default=0.0, ge=0, lt=1)
     per_axis: bool = False
     axis_features: dict[Literal["u", "v", "r"], tuple[str, ...]] | None = None
-    mirror: bool = False
     restoring: bool = False
 
     @model_validator(mode="after")
@@ -78,13 +77,14 @@ class LstmConfig(NetworkConfig):
         """
         return FeatureConfig(features=self.memory).select_features(feature_names)
 
-    def build(self, names: Sequence[str]) -> ResidualHead:
-        """Build the head for channels `names`."""
-        from residnet.heads.lstm import LstmHead
-        from residnet.heads.mirror import MirroredHead
+    @property
+    def has_restoring_acceleration(self) -> bool:
+        return self.restoring
 
-        head = LstmHead(self, names)
-        return MirroredHead(head, names) if self.mirror else head
+    def build_network(self, names: Sequence[str]) -> ResidualHead:
+        from residnet.heads.lstm import LstmHead
+
+        return LstmHead(self, names)
 
     def network_specs(self, names: Sequence[str]) -> list[tuple[tuple[str, ...], int]]:
         """Return (features, number of outputs) of each network."""

@@ -42,8 +42,9 @@ class MlpHead(RenamedStateModule, ResidualHead):
             n_inputs = n_units
         output_layer = nn.Linear(n_inputs, self.n_dof)
         with torch.no_grad():
-            # small initial outputs: training starts near the baseline
-            output_layer.weight.mul_(0.1)
+            # small initial outputs: training starts near the baseline, or at the linear model of a
+            # skip connection
+            output_layer.weight.mul_(0.1 if config.skip == "none" else 0.0)
             output_layer.bias.zero_()
         self.network = nn.Sequential(*layers, output_layer)
 

@@ -18,14 +18,16 @@ from residnet.dynamics.hybrid import HybridDynamics, MeasuredPast
 from residnet.dynamics.time_steps import Integrator
 from residnet.engine.free_runs import compile_rollout
 from residnet.engine.rollout import TRAINING_STEPS, FreeRun, Rollout
-from residnet.heads.mirror import add_mirror_images
+from residnet.heads.mirror import MirroredHead, add_mirror_images
 from residnet.heads.recurrent import GRUEnsembleHead
+from residnet.heads.skip import SkipHead
 from residnet.physics.signals import Signals
 from residnet.physics.symmetry import get_axis_parities, mirror_channels
 from residnet.preprocessing.data_module import WindowBatch, WindowsDataModule
 from residnet.preprocessing.windows import WindowStore
 from residnet.training.config import TrainingConfig
 from residnet.training.score import Score
+from residnet.training.selection import select_by_free_run
 from residnet.training.trainer import EpochTraining, TrainerExtensions, run_epochs
 
 ProcessMean = Callable[[Tensor], Tensor]
@@ -251,6 +253,10 @@ class HeadTraining(EpochTraining):
             self.rank = self.global_rank
             self.world_size = torch.distributed.get_world_size()
         self.scales = self.scales.to(self.device)
+        if self.epoch == 0 and _find_skip_head(self.model) is not None:
+            # the linear part alone is a candidate: the network is zero before its first epoch
+            self.validate_start()
+            self.best_diverged = self.diverged
 
     def on_train_epoch_start(self) -> None:
         """Seed the epoch and set its learning rate."""
@@ -446,6 +452,9 @@ def make_training(setup: TrainingSetup) -> tuple[HeadTraining, WindowsDataModule
     # velocities are pulled back
     calibration_samples = add_mirror_images(setup.samples) if config.mirror else setup.samples
     model.head.calibrate(calibration_samples)
+    skip_head = _find_skip_head(model)
+    if skip_head is not None:
+        _select_linear_part(setup, skip_head, calibration_samples)
     dtype = torch.float64 if config.is_double_precision else torch.float32
     if isinstance(model.head, GRUEnsembleHead):
         coarse, stride = _with_coarse_step(model, model.head)
@@ -470,6 +479,21 @@ def make_training(setup: TrainingSetup) -> tuple[HeadTraining, WindowsDataModule
     module.model.has_position = False
     module.model.to(dtype)
     return module, module.data(store)
+
+
+def _find_skip_head(model: HybridDynamics) -> SkipHead | None:
+    return next((part for part in model.head.modules() if isinstance(part, SkipHead)), None)
+
+
+def _select_linear_part(setup: TrainingSetup, head: SkipHead, samples: Samples) -> None:
+    """Select the linear part of a skip connection by free runs, as for a head of this kind."""
+    if isinstance(setup.model.head, MirroredHead):
+        samples = add_mirror_images(samples)
+    solutions = head.linear_solutions(samples)
+    if solutions:
+        # the network is zero, so that the model is the baseline with the linear part
+        select_by_free_run(setup.model, head.linear, solutions, setup.validate)
+        head.calibrate_network(samples)
 
 
 def finish_training(model: HybridDynamics) -> None:
