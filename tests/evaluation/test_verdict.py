@@ -31,6 +31,7 @@ from residnet.evaluation.verdict import (
     rate_model,
     write_verdict,
 )
+from residnet.tasks.fit.service import advise_excitation
 
 
 def row(
@@ -530,6 +531,21 @@ def test_the_verdict_names_unexcited_directions_and_controlled_test_logs() -> No
     assert "Differential thrust: not excited. n was held at 12 1/s." in text
     assert "common thrust" not in text
     assert "for operation under the same controller only" in text
+
+
+def test_a_level_from_zigzags_holds_for_such_commands_only() -> None:
+    good = under(horizons=[horizon(10.0, errors(0.5, 2.0))])
+    found = excitation("excited", relay_inputs=["delta"])
+    sentences = write_verdict(evidence(limits_by_protocol=good, excitation=found))
+    assert sentences[0].startswith("After a 10 s free run with commands like those in the logs the")
+    assert sentences[1].startswith("Good for such commands: ")
+    assert "only switch delta between the ends of its range" in sentences[2]
+    assert advise_excitation(found, ["delta"]) == (
+        "delta only switches between the ends of its range; run steps of delta to a quarter, a half"
+        " and three quarters of its range, each held until the motion is steady.",
+    )
+    sentences = write_verdict(evidence(limits_by_protocol=good, excitation=excitation("excited")))
+    assert "commands" not in " ".join(sentences[:3])
 
 
 def test_velocities_that_leave_the_positions_make_no_model_good() -> None:

@@ -14,7 +14,9 @@ from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError
 from residnet.io.drafting.questions import DraftNotes
 from residnet.io.drafting.reading import DraftResult, read_drafted
+from residnet.io.drafting.tables import draft_tables
 from residnet.io.readers import ReaderConfig
+from residnet.quality import inspect_log
 
 TIMES = np.arange(0.0, 79.0, 0.2)
 
@@ -71,6 +73,7 @@ def true_motion(seed: int) -> TrueMotion:
         {"u [m/s]": "north", "v [m/s]": "east"},
         {"u [m/s]": "east", "v [m/s]": "north"},
         {"vx [m/s]": "north", "vy [m/s]": "east"},
+        {"vel_n": "north", "vel_e": "east"},
     ],
 )
 def test_earth_fixed_velocities_are_rotated(tmp_path: Path, columns: dict[str, str]) -> None:
@@ -117,6 +120,40 @@ def test_velocities_of_another_run_stop_the_draft(tmp_path: Path) -> None:
         read_drafted([path], DraftNotes())
 
 
+def test_a_reset_of_the_position_is_no_contradiction(tmp_path: Path) -> None:
+    motion = true_motion(1)
+    velocities = compute_velocities(motion)
+    table = {name: motion.sample(name, TIMES) for name in ("x", "y", "psi", "r")}
+    after = np.flatnonzero(TIMES > 40.0)
+    for name in ("x", "y"):
+        table[name][after] -= table[name][after[0]] + 60.0
+    table |= {"t": TIMES, "u": velocities["u"], "v": velocities["v"]}
+    path = tmp_path / "run.csv"
+    pd.DataFrame(table).to_csv(path, index=False)
+    (log,) = read_drafted([path], DraftNotes()).logs.values()
+    found = {finding.code: finding for finding in inspect_log(log).findings}
+    assert found["position_jump"].level == "will mislead"
+    assert found["position_jump"].figures["t"] == pytest.approx(TIMES[after[0]], abs=0.01)
+    # the frames of both parts are right
+    assert found["frames"].level == "note"
+
+
+def test_velocities_along_north_and_east_need_a_heading(tmp_path: Path) -> None:
+    motion = true_motion(1)
+    velocities = compute_velocities(motion)
+    table = {"t [s]": TIMES, "nav.vel.n": velocities["north"], "nav.vel.e": velocities["east"]}
+    table["rudder [deg]"] = 10.0 * np.sin(TIMES)
+    heading = {"heading [deg]": np.degrees(motion.sample("psi", TIMES))}
+    drafts = []
+    for name, columns in (("with", {**table, **heading}), ("without", table)):
+        path = tmp_path / f"{name}.csv"
+        pd.DataFrame(columns).to_csv(path, index=False)
+        drafts.append(draft_tables([path], DraftNotes())[0]["channels"])
+    assert drafts[0]["u"] == {"column": "nav.vel.n", "frame": "ned", "unit": "m/s"}
+    assert drafts[0]["v"]["column"] == "nav.vel.e"
+    assert set(drafts[1]) == {"delta"}
+
+
 def test_earth_velocities_need_both_columns_and_a_heading() -> None:
     entry = {"column": "u", "unit": "m/s", "frame": "ned"}
     settings = {"kind": "csv", "time": {"column": "t"}, "channels": {"u": entry}}
@@ -152,10 +189,20 @@ def test_earth_fixed_velocities_of_a_matlab_struct(tmp_path: Path) -> None:
     velocities = compute_velocities(motion)
     columns = {name: motion.sample(name, TIMES) for name in ("x", "y", "psi", "r")}
     columns |= {"u": velocities["north"], "v": velocities["east"], "time": TIMES}
-    path = tmp_path / "run.mat"
-    scipy.io.savemat(path, {"run": columns})
-    result = read_drafted([path], DraftNotes())
-    assert result.reader["velocity"]["kind"] == "earth_fixed"
-    (log,) = result.logs.values()
-    errors = log["v"] - np.interp(log.t, TIMES, motion.sample("v", TIMES))
-    assert float(np.nanmax(np.abs(errors))) < 0.1
+    zeros = np.zeros(TIMES.size)
+    matrices = {
+        "time": TIMES,
+        "pos": np.stack((columns["x"], columns["y"], zeros), axis=1),
+        "vel": np.stack((columns["u"], columns["v"], zeros), axis=1),
+        "rpy": np.degrees(np.stack((zeros, zeros, columns["psi"]), axis=1)),
+        "pqr": np.stack((zeros, zeros, columns["r"]), axis=1),
+    }
+    for name, run in (("columns", columns), ("matrices", matrices)):
+        path = tmp_path / f"{name}.mat"
+        scipy.io.savemat(path, {"run": run})
+        result = read_drafted([path], DraftNotes())
+        assert result.reader["velocity"]["kind"] == "earth_fixed"
+        (log,) = result.logs.values()
+        for channel in ("v", "r"):
+            errors = log[channel] - np.interp(log.t, TIMES, motion.sample(channel, TIMES))
+            assert float(np.nanmax(np.abs(errors))) < 0.1

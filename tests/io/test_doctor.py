@@ -87,6 +87,7 @@ TWIN = changed(n=np.full(len(LOG), 10.0), delta_stbd=LOG["delta"].copy())
 STOPPED = {name: np.where(T < 60.0, 0.0, LOG[name]) for name in "uvr"}
 NO_POSE = Log("short", T, {name: LOG[name] for name in ("u", "v", "r", "delta")})
 BAD = np.arange(75, 2000, 150)
+NOISE = np.random.default_rng(1).normal(0.0, 0.01, LOG["v"].size)
 TURN = 2.0 * np.pi
 WRAPS = float((np.abs(np.diff(PSI % TURN)) > 3.0).sum())
 # a level is what the fault does to a fit: what changes nothing is a note
@@ -160,6 +161,7 @@ TOLD: list[tuple[Log, str, str, str, dict[str, float]]] = [
         {"share": 13 / 2000},
     ),
     (changed(u=np.round(LOG["u"], 1)), "resolution", "will mislead", "0.1 m/s", {"levels": 10}),
+    (changed(v=np.round(NOISE, 3)), "resolution", "note", "0.001 m/s", {"levels": 33}),
     # clock
     (GAP, "gaps", "note", "1 gaps", {"count": 1, "longest": 6.1, "lost": 6.0}),
     (changed(u=np.repeat(LOG["u"][::2], 2)), "held", "note", "once in 2 samples", {"every": 2}),
@@ -675,3 +677,30 @@ def test_check_extrapolation_notes_channels_that_do_not_drive_the_vessel() -> No
     for inputs, level in ((["delta"], "note"), (["delta", "e_heading"], "will mislead")):
         found = inspect_log_set(logs, inputs, splits).find_by_code("extrapolation")
         assert [f.level for f in found if f.text.startswith("e_heading")] == [level]
+
+
+@pytest.mark.parametrize("angles", ["switched", "held"])
+def test_check_rudder_clipping_needs_held_smaller_angles(angles: str) -> None:
+    """A zigzag passes smaller angles only while its rudder turns."""
+    random = np.random.default_rng(2)
+    dt = 0.1
+    psi = rate = rudder = target = 0.0
+    side = 1.0
+    rows = []
+    for k in range(3000):
+        side = -side if side * psi > 0.3 else side
+        if angles == "switched":
+            target = 0.35 * side
+        elif k % 50 == 0:
+            target = random.uniform(-0.35, 0.35)
+        rudder += float(np.clip(target - rudder, -0.04, 0.04))
+        rate += dt * (0.7 * rudder - rate) / 0.8
+        psi += dt * rate
+        rows.append((psi, rate, rudder))
+    psi_values, rates, rudders = np.array(rows).T
+    r = rates + 0.005 * random.standard_normal(3000)
+    channels = {"psi": psi_values, "u": np.full(3000, 2.0), "v": -0.3 * rates, "r": r}
+    recorded = channels | {"delta": np.clip(rudders, -0.2, 0.2)}
+    statistics = LogStatistics(Log("log", dt * np.arange(3000), recorded), ["delta"])
+    found = [one for one in run_checks("actuators", statistics) if one.code == "rudder_clipped"]
+    assert len(found) == (angles == "held")

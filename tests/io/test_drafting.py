@@ -25,6 +25,7 @@ from residnet.core.log import Log
 from residnet.io.drafting.questions import DraftNotes, Question
 from residnet.io.drafting.tables import draft_tables
 from residnet.io.header_vocabulary import (
+    guess_scaling,
     match_depth_channel,
     match_input_channel,
     match_state_channel,
@@ -116,12 +117,12 @@ CALLED: dict[str | None, str] = {
     "speed": "speed over ground [kn]|speed through water|nopeus",
     "v": "speed to starboard [kn]|Vy [m/s]|SpeedTrans_kn|pose.twist.linear.y",
     "cmd_delta": "rudder_cmd|Ruderlage soll|Rudersollwinkel",
-    "n_port": "engine rpm port|left_rpm|Motor L (%)",
+    "n_port": "engine rpm port|left_rpm|Motor L (%)|/tug/thruster/port/state.rpm",
     "tau_n_estimate": "tau_n_est",
     "p": "roll rate|p_dps|p_degps",
     "latitude": "Latitude",
     "u": "Longitudinal velocity|Velocidad longitudinal|vx|velocity_x_mps|twist.linear.x"
-    "|Long. speed",
+    "|Long. speed|dvl_vx_mm_s",
     "thrust_stbd": "thruster right",
     "cmd_thrust_port": "/thrusters/left/cmd/data",
     "wind_dir": "TWD",
@@ -189,6 +190,14 @@ def test_match_depth_channel_of_names(name: str, channel: str) -> None:
 )
 def test_parse_header_unit_of_names(column: str, expected: str, unit: str | None) -> None:
     assert parse_header_unit(column, expected) == unit
+
+
+def test_a_nozzle_in_per_cent_is_no_angle_in_degrees() -> None:
+    values = np.linspace(-60.0, 60.0, 50)
+    scaling = guess_scaling("azimuth_port", "Nozzle Port [%]", values)
+    assert scaling is not None
+    assert scaling.settings == {"unit": "deg", "scale": 0.35}
+    assert guess_scaling("azimuth_port", "azimuth port", values) is None
 
 
 def test_draft_tables_recognises_exchanged_axis_letters(logs: list[Log], tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from residnet.quality.feedback import (
     MAX_FEEDBACK_SHARE,
     cross_validated_r2,
     detect_feedback,
+    find_relay_inputs,
     response_time,
 )
 
@@ -26,6 +27,27 @@ def test_excited_inputs_are_not_reported(steering: Steering, n_logs: int) -> Non
         assert found[0].relay_share > 0.3
     else:
         assert found[0].share < 0.5 * MAX_FEEDBACK_SHARE
+
+
+@pytest.mark.parametrize(
+    ("steerings", "relays"),
+    [
+        (["zigzag"] * 4, ["delta"]),
+        # one log of steps among four shows other commands
+        (["zigzag", "zigzag", "zigzag", "steps"], []),
+        (["steps"] * 2, []),
+        (["controller"] * 2, []),
+        (["set_points"] * 2, []),
+    ],
+)
+def test_find_relay_inputs_names_a_rudder_that_all_logs_switch(
+    steerings: list[Steering], relays: list[str]
+) -> None:
+    logs = [dict(steered_log(steering, seed).channels) for seed, steering in enumerate(steerings)]
+    # a shaft speed has two levels in each log, which it does not switch often
+    logs = [log | {"n": np.repeat([8.0, 12.0], 1500)} for log in logs]
+    assert find_relay_inputs(logs, ["n", "delta"]) == relays
+    assert find_relay_inputs([{"n": np.full(100, 5.0)}], ["n"]) == []
 
 
 @pytest.mark.parametrize("n_logs", [1, 4])

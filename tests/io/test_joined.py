@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,10 @@ import pandas as pd
 import pytest
 
 from residnet.core.config import validate_config
-from residnet.core.errors import ConfigError, DataError
+from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.io.drafting.reading import read_mixed_formats
+from residnet.io.drafting.trips import refuse_topics
 from residnet.io.readers import ReaderConfig
 from residnet.io.readers.base import hash_files
 from residnet.io.readers.joined_files import estimate_clock_offset, group_trip_files
@@ -133,6 +135,44 @@ def test_a_third_recorder_is_joined_by_the_rate_that_it_shares(
     )
     assert parts is not None, told[0]
     assert float(parts[1]) == pytest.approx(1.75e9 - 3.0, abs=0.03)
+
+
+def test_topics_of_several_recordings_in_one_folder_are_named(tmp_path: Path) -> None:
+    t = np.arange(5) * 1e5
+    pose = {"timestamp": t, "x": t, "y": t, "heading": t}
+    files = {}
+    for folder, columns in (
+        ("topics", {"timestamp": t, "control[0]": t}),
+        ("kinds of complete logs", {**pose, "u": t}),
+    ):
+        (tmp_path / folder).mkdir()
+        files[folder] = []
+        for recording, topic in itertools.product(("log_1", "log_2"), ("vehicle_pose", "servos")):
+            files[folder].append(tmp_path / folder / f"{recording}_{topic}.csv")
+            table = pose if topic == "vehicle_pose" else columns
+            pd.DataFrame(table).to_csv(files[folder][-1], index=False)
+    with pytest.raises(UsageError, match=r"2 topics .* of 2 recordings \(log_1, log_2\); move"):
+        refuse_topics(files["topics"])
+    refuse_topics(files["kinds of complete logs"])
+
+
+@pytest.mark.parametrize("column", ["gyro_z_dps", "gyro_z"])
+def test_a_joined_yaw_rate_gets_the_sign_of_the_heading(
+    column: str, ship_logs: list[Log], tmp_path: Path
+) -> None:
+    log = ship_logs[0]
+    fixes, acts = tables(log)
+    board = acts.assign(**{column: -np.degrees(log["r"])})
+    for name, table in (("gnss", fixes), ("board", board)):
+        table.to_csv(tmp_path / f"{name}.csv", index=False)
+    (result,) = read_mixed_formats(sorted(tmp_path.iterdir()))
+    channels = result.reader["parts"]["board"]["channels"]
+    assert channels["r"] == {"column": column, "unit": "deg/s", "sign": -1}
+    # the direction of the rudder follows from the corrected yaw rate
+    assert "sign" not in channels["delta"]
+    (joined,) = result.logs.values()
+    expected = np.interp(joined.t - 1.75e9, log.t, log["r"])
+    assert float(np.nanmax(np.abs(joined["r"] - expected))) < 0.1 * float(np.abs(log["r"]).max())
 
 
 def reader_of(**more: Any) -> dict[str, Any]:

@@ -4,6 +4,8 @@ their digits hold.
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -107,6 +109,30 @@ def test_frames_of_nmea_2000_in_each_notation(notation: str, tmp_path: Path) -> 
         steady = np.isfinite(got[f"n_{side}"])
         assert steady.mean() > 0.9
         assert np.median(np.abs(got[f"n_{side}"] - np.abs(log[f"cmd_{side}"]))[steady]) < 1e-2
+
+
+@pytest.mark.parametrize("sentences", ["HDG", "HDM with RMC", "HDM"])
+def test_magnetic_headings_of_nmea_0183(sentences: str, tmp_path: Path) -> None:
+    log = trial(10.0)
+    path = written_recorders.nmea(log, tmp_path)
+    lines = []
+    for line in path.read_text().splitlines():
+        text = line[1:].split("*")[0]
+        if text.startswith("HEHDT"):
+            magnetic = float(text.split(",")[1]) + 12.4
+            text = f"HCHDG,{magnetic - 1.5:.6f},1.5,E,12.4,W"
+            if sentences != "HDG":
+                text = f"HCHDM,{magnetic:.6f},M"
+        elif text.startswith("GPRMC") and sentences == "HDM with RMC":
+            text = text.replace("110425,,,", "110425,12.4,W,")
+        lines.append(f"${text}*{functools.reduce(operator.xor, text.encode()):02X}")
+    path.write_text("\n".join(lines) + "\n")
+    got = read(path, kind="nmea")
+    offset = np.radians(12.4) if sentences == "HDM" else 0.0
+    np.testing.assert_allclose(got["psi"] - offset, log["psi"], atol=1e-5)
+    assert {"u", "v", "r"} <= set(got.channels)
+    levels = [f["level"] for f in got.meta["findings"] if f["code"] == "magnetic_heading"]
+    assert levels == ["will mislead" if sentences == "HDM" else "note"]
 
 
 def test_magnetic_headings_of_nmea_2000(tmp_path: Path) -> None:

@@ -69,6 +69,7 @@ class ExcitationFile(FileRecord):
         inputs: inputs that are regressors of the model.
         directions: sums and differences of inputs of the same kind.
         closed_loop_test_inputs: inputs of the test logs that feedback sets.
+        relay_inputs: inputs that the training logs switch between the ends of their ranges.
         domain: sentences on the relations of the operating domain.
     """
 
@@ -78,6 +79,7 @@ class ExcitationFile(FileRecord):
     directions: tuple[DirectionRow, ...]
     closed_loop_test_inputs: tuple[str, ...]
     domain: tuple[str, ...]
+    relay_inputs: tuple[str, ...] = ()
 
 
 class LogQuality(Record):

@@ -154,9 +154,10 @@ def write_verdict(evidence: VerdictEvidence) -> list[str]:
     """Return the verdict sentence by sentence, the most important first.
 
     Position and heading errors of the selected model at the main horizon, the reasons for its
-    level, findings of the data checks, reference models and noise floor, other horizons, number of
-    windows and range of speeds, velocity errors, failed checks, reason of the selection, heads that
-    diverged, and the share of data outside the training range. Sentences without data are omitted.
+    level and the commands for which it holds, findings of the data checks, reference models and
+    noise floor, other horizons, number of windows and range of speeds, velocity errors, failed
+    checks, reason of the selection, heads that diverged, and the share of data outside the training
+    range. Sentences without data are omitted.
     """
     main = main_horizon(evidence)
     limitation_sentences = [
@@ -169,6 +170,7 @@ def write_verdict(evidence: VerdictEvidence) -> list[str]:
             if main is None
             else describe_main_horizon(evidence, main)
         ),
+        "" if is_useless(evidence) else describe_relays(evidence),
         evidence.data_quality_text,
         describe_unexcited(evidence),
         evidence.current_text,
@@ -231,6 +233,34 @@ def list_unidentifiable_inputs(evidence: VerdictEvidence) -> list[str]:
         for row in (() if evidence.excitation is None else evidence.excitation.inputs)
         if row.state in ("feedback", "collinear")
     ]
+
+
+def list_relay_inputs(evidence: VerdictEvidence) -> tuple[str, ...]:
+    """Return the inputs that the training logs only switch between the ends of their ranges."""
+    return () if evidence.excitation is None else evidence.excitation.relay_inputs
+
+
+def describe_relays(evidence: VerdictEvidence) -> str:
+    """Return for which commands the errors are shown, if logs only switch an input; may be empty.
+
+    A zigzag hardly holds a steady turn, so that its errors do not show those of other commands.
+    """
+    if not (inputs := list_relay_inputs(evidence)):
+        return ""
+    names = join_list(list(inputs))
+    return (
+        f"The training logs only switch {names} between the ends of its range, as zigzags and"
+        " 3-2-1-1 do: under other commands errors may exceed the prediction intervals. Add logs of"
+        f" {advise_intermediate_steps(names)}."
+    )
+
+
+def advise_intermediate_steps(name: str) -> str:
+    """Return the manoeuvre that zigzags of an input lack."""
+    return (
+        f"steps of {name} to a quarter, a half and three quarters of its range, each held until the"
+        " motion is steady"
+    )
 
 
 def describe_unexcited(evidence: VerdictEvidence) -> str:
@@ -457,8 +487,9 @@ def describe_main_horizon(evidence: VerdictEvidence, main: ProtocolHorizon) -> l
         main: the main horizon.
     """
     row = main.row
+    scope_text = " with commands like those in the logs" if list_relay_inputs(evidence) else ""
     errors_text = (
-        f"After a {format_seconds(row.seconds)} free run"
+        f"After a {format_seconds(row.seconds)} free run{scope_text}"
         f" {_describe_errors(evidence.selected, row)}."
     )
     error_names = list(row.models[evidence.selected].by_name)
@@ -491,7 +522,8 @@ def describe_main_horizon(evidence: VerdictEvidence, main: ProtocolHorizon) -> l
     )
     return [
         errors_text,
-        f"Good: upper limits within {join_list(list(limits))}{comparison}, no divergence.",
+        f"Good{' for such commands' if scope_text else ''}: upper limits within"
+        f" {join_list(list(limits))}{comparison}, no divergence.",
     ]
 
 

@@ -25,7 +25,7 @@ from residnet.evaluation.data_records import DirectionRow, ExcitationFile, Input
 from residnet.identification.domain import MAX_VARIANCE_INFLATION, detect_feedback_of_logs
 from residnet.physics.signals_config import SignalsConfig
 from residnet.preprocessing.prepare import PreparedLog
-from residnet.quality.feedback import InputFeedback, cross_validated_r2
+from residnet.quality.feedback import InputFeedback, cross_validated_r2, find_relay_inputs
 
 SCHEMA = "residnet.excitation/1"
 _HELD_SHARE: Final = 0.02
@@ -73,8 +73,17 @@ def assess_excitation(
                 feedback.name for feedback in test_feedback if feedback.is_closed_loop
             ],
             "domain": [] if domain is None else describe_domain(domain, units),
+            "relay_inputs": _find_relay_inputs(training_logs, signals),
         }
     )
+
+
+def _find_relay_inputs(logs: Sequence[PreparedLog], signals: SignalsConfig) -> list[str]:
+    """Return the inputs that prepared logs switch between the ends of their ranges."""
+    tables = [
+        {name: log.w[log.usable, k] for k, name in enumerate(signals.input_columns)} for log in logs
+    ]
+    return find_relay_inputs(tables, signals.inputs) if tables else []
 
 
 def _assess_input(

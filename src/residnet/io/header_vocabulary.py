@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Iterable
 from functools import lru_cache
 from importlib import resources
 from typing import Any, NamedTuple
@@ -105,7 +106,8 @@ def parse_header_unit(column: str, expected: str | None) -> str | None:
     """
     texts = [text.strip() for text in _IN_BRACKETS.findall(column)]
     if expected is not None:
-        name_parts = re.split(r"[\s_,;]+", _IN_BRACKETS.sub("", column).strip())
+        # also behind the dots and slashes of namespaces, as in `/thruster/state.rpm`
+        name_parts = re.split(r"[\s_,;./]+", _IN_BRACKETS.sub("", column).strip())
         # `r_deg_s` and `speed_m_s` are quotients
         texts += ["/".join(name_parts[-2:]), name_parts[-1]] if len(name_parts) > 1 else []
         texts += (
@@ -200,7 +202,10 @@ def guess_scaling(channel: str, column: str, values: np.ndarray) -> Scaling | No
     Returns:
         The conversion; None if the column has a physical unit.
     """
-    is_rudder = channel.removeprefix("cmd_").startswith("delta")
+    bare_channel = channel.removeprefix("cmd_")
+    is_rudder = bare_channel.startswith("delta")
+    # the nozzle of a waterjet in per cent; other azimuths are angles
+    is_rudder |= bare_channel.startswith("azimuth") and parse_header_unit(column, "-") == "%"
     if is_rudder and parse_header_unit(column, "rad") is not None:
         return None
     unit, full_value, full_text = (
@@ -407,7 +412,7 @@ def _match_rules(rules: tuple[_ChannelRule, ...], parsed_name: ParsedName) -> st
 
 _TWIST_PATTERN = (
     r"\b(?:(?:twist|velocity) linear|linear velocity|v|vel|velo|velocity|speed|lin|linear)"
-    r" ?{}(?: (?:m s|mps|ms))?$"
+    r" ?{}(?: (?:m s|mps|ms|mm s|cm s|kn|kts))?$"
 )
 _RATE_UNITS = "(?:dps|degps|degs|radps|rads|rps|deg s|rad s)"
 """Units of angular velocities at the end of a name."""
@@ -562,6 +567,21 @@ def match_axis_velocity(parsed_name: ParsedName) -> str | None:
     return _match_rules(_AXIS_RULES, parsed_name)
 
 
+_EARTH_AXIS_VELOCITY = re.compile(
+    r"(?:^|.* )(?:v|vel|velo|velocity|speed|geschwindigkeit) ?"
+    r"(?:(?P<north>n|north|nord)|(?P<east>e|east|ost))(?: (?:m s|mps|ms|mm s|cm s|kn|kts))?"
+)
+"""Normalised name of a velocity along north or east."""
+
+
+def find_earth_velocities(columns: Iterable[str]) -> tuple[str, str] | None:
+    """Return the first columns of the velocities along north and along east, or None."""
+    matches = [(name, _EARTH_AXIS_VELOCITY.fullmatch(parse_name(name).text)) for name in columns]
+    north = next((name for name, match in matches if match and match["north"]), None)
+    east = next((name for name, match in matches if match and match["east"]), None)
+    return None if north is None or east is None else (north, east)
+
+
 _EARTH_VELOCITY_PATTERN = re.compile(r"\bvel\w* (?:n|e|d|north|east|down)\b")
 """Velocity along north, east or down, whose N is no shaft speed."""
 _SIDE_LETTER_PATTERN = re.compile(r"(?<=\w) ([lr])(?= |$)")
@@ -579,6 +599,8 @@ _INPUT_RULES = (
     _ChannelRule("throttle{side}", "engine throttle", "revolutions angle"),
     _ChannelRule("{cmd_}n{side}", "revolutions|propeller", "thrust"),
     _ChannelRule("{cmd_}n{side}", "engine", "thrust angle"),
+    # a thruster in revolutions; a thrust has another unit
+    _ChannelRule("{cmd_}n{side}", "revolutions thrust", "force"),
     _ChannelRule("{cmd_}thrust{side}", "thrust"),
     _ChannelRule("servo{side}", "servo"),
     _ChannelRule("throttle{side}", "throttle"),

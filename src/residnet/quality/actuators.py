@@ -331,6 +331,9 @@ _MIN_EFFECT_RATIO = 1.3
 """Smallest ratio of the actual yaw moment at the limit to that of the recorded angle."""
 _MIN_T_STATISTIC_AT_LIMIT = 4.5
 """Smallest t statistic of their difference."""
+_MIN_BLOCKS_AT_SMALLER_ANGLES = 10
+"""Smallest number of overlapping blocks with a constant smaller angle for a comparison. A zigzag
+has none: its smaller angles are those of a turning rudder, whose effect is extrapolated."""
 
 
 @check(
@@ -342,7 +345,10 @@ _MIN_T_STATISTIC_AT_LIMIT = 4.5
     on_subsample=True,
 )
 def check_rudder_clipping(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report a clipped rudder record: at its limit the yaw moment exceeds the model."""
+    """Report a clipped rudder record: at its limit the yaw moment exceeds the model.
+
+    Nothing is reported of a rudder that does not rest at smaller angles.
+    """
     rudder_limit = abs_quantile(log["delta"], 1.0)
     is_at_limit = np.abs(log["delta"]) > 0.999 * rudder_limit
     share_at_limit = float(is_at_limit.mean())
@@ -354,7 +360,9 @@ def check_rudder_clipping(log: LogStatistics, make_finding: Check) -> Iterator[F
         or n_visits < 3
     ):
         return
-    # the additional term is identifiable if smaller angles occur as well, as in zigzags
+    is_resting = _rests_at_smaller_angle(log, is_at_limit)
+    if is_resting.sum() < _MIN_BLOCKS_AT_SMALLER_ANGLES:
+        return
     yaw_fit = _fit_yaw_model(log, np.sign(log["delta"]) * is_at_limit)
     excess_statistic = 0.0
     if yaw_fit is not None:
@@ -366,7 +374,8 @@ def check_rudder_clipping(log: LogStatistics, make_finding: Check) -> Iterator[F
             else 0.0
         )
     excess_statistic = max(
-        excess_statistic, _excess_turning_at_limit(log, is_at_limit) if n_visits >= 8 else 0.0
+        excess_statistic,
+        _excess_turning_at_limit(log, is_at_limit, is_resting) if n_visits >= 8 else 0.0,
     )
     if excess_statistic > 0.0:
         text = (
@@ -377,7 +386,30 @@ def check_rudder_clipping(log: LogStatistics, make_finding: Check) -> Iterator[F
         yield make_finding(text, {"limit": rudder_limit, "harder": excess_statistic})
 
 
-def _excess_turning_at_limit(log: LogStatistics, is_at_limit: np.ndarray) -> float:
+def _rests_at_smaller_angle(log: LogStatistics, is_at_limit: np.ndarray) -> np.ndarray:
+    """Return the blocks [K] bool away from the rudder limit with a constant angle other than zero.
+
+    Args:
+        log: statistics of the log.
+        is_at_limit: samples at the recorded limit [T] bool.
+    """
+    blocks = log.cached(make_blocks, "r")
+    values = log["delta"]
+    max_angle = abs_quantile(values, 1.0)
+    # the changes over a block and over its half exclude a rudder that returns to its first angle
+    half_blocks = replace(blocks, length=blocks.length // 2)
+    rudder_travel = np.abs(blocks.compute_changes(values))
+    rudder_travel = rudder_travel + np.abs(half_blocks.compute_changes(values))
+    return np.asarray(
+        blocks.are_clear_of(is_at_limit)
+        & (rudder_travel < 0.05 * max_angle)
+        & (np.abs(values[blocks.starts]) > 0.15 * max_angle)
+    )
+
+
+def _excess_turning_at_limit(
+    log: LogStatistics, is_at_limit: np.ndarray, is_resting: np.ndarray
+) -> float:
     """Return the mean excess of the yaw acceleration at the rudder limit, over the RMS residual.
 
     The yaw model is fitted to the blocks away from the limit. The result is 0 if these contain too
@@ -386,25 +418,15 @@ def _excess_turning_at_limit(log: LogStatistics, is_at_limit: np.ndarray) -> flo
     Args:
         log: statistics of the log.
         is_at_limit: samples at the recorded limit [T] bool.
+        is_resting: blocks with a constant smaller angle [K] bool.
     """
     blocks = log.cached(make_blocks, "r")
-    values = log["delta"]
+    initial_angles = log["delta"][blocks.starts]
     x, y = _yaw_regression_data(log)
     is_finite = np.isfinite(x).all(axis=1) & np.isfinite(y)
     is_inside_limit = is_finite & blocks.are_clear_of(~is_at_limit)
     is_outside_limit = is_finite & blocks.are_clear_of(is_at_limit)
-    initial_angles = values[blocks.starts]
-    max_angle = abs_quantile(values, 1.0)
-    # the changes over a block and over its half exclude a rudder that returns to its first angle
-    half_blocks = replace(blocks, length=blocks.length // 2)
-    rudder_travel = np.abs(blocks.compute_changes(values))
-    rudder_travel = rudder_travel + np.abs(half_blocks.compute_changes(values))
-    is_rudder_constant = (
-        is_outside_limit
-        & (rudder_travel < 0.05 * max_angle)
-        & (np.abs(initial_angles) > 0.15 * max_angle)
-    )
-    if is_inside_limit.sum() < 10 or is_rudder_constant.sum() < 20:
+    if is_inside_limit.sum() < 10 or (is_finite & is_resting).sum() < 20:
         return 0.0
     yaw_fit = fit_least_squares(x[is_outside_limit], y[is_outside_limit])
     rms_residual = max(float(np.sqrt(np.mean(yaw_fit.residuals**2))), 1e-300)

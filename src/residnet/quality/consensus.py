@@ -23,7 +23,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-import scipy
 
 from residnet.core.arrays.paged import MAX_SAMPLES_IN_MEMORY
 from residnet.core.layout import SIX_DOF_LAYOUT
@@ -534,8 +533,18 @@ class Fleet:
             / (1.0 + fits[j].compute_leverage(self.data[j]))[:, None]
             for j in references
         ]
-        tree = scipy.spatial.cKDTree(np.concatenate([self.data[j].X for j in references]))
-        return np.asarray(np.concatenate(squares)[tree.query(data.X)[1]])
+        # squared distances in blocks of the references; scipy.spatial takes longer to import
+        distance = np.full(len(data.X), np.inf)
+        nearest_squares = np.zeros_like(data.Y)
+        for reference, reference_squares in zip(references, squares, strict=True):
+            X = self.data[reference].X
+            distances = (X**2).sum(1) - 2.0 * data.X @ X.T
+            nearest = distances.argmin(axis=1)
+            block_distance = distances[np.arange(len(nearest)), nearest]
+            is_nearer = block_distance < distance
+            distance = np.where(is_nearer, block_distance, distance)
+            nearest_squares[is_nearer] = reference_squares[nearest[is_nearer]]
+        return nearest_squares
 
     @cached_property
     def feature_groups(self) -> list[np.ndarray]:

@@ -32,6 +32,10 @@ without excitation, at most 0.04 for open loop and steps of the set point, up to
 one amplitude."""
 _MIN_RELAY_SHARE: Final = 0.2
 """Share of samples near either end of the range of an input, from which it is a relay."""
+_MIN_RELAY_SWITCHES: Final = 3
+"""Smallest number of changes from one end of the range to the other in a log of a relay."""
+_MIN_SHARE_OF_RELAY_LOGS: Final = 0.8
+"""Share of the samples in logs of a relay, above which hardly any log holds other commands."""
 _LAGS: Final = (-1.0, -0.5, 0.0, 0.5, 1.0, 2.0)
 """Times at which velocities count as effects, in units of the response time."""
 _SAMPLES_PER_RESPONSE: Final = 6
@@ -124,10 +128,42 @@ def measure_relay_share(values: np.ndarray) -> float:
 
     The range is from the 1 % to the 99 % quantile.
     """
+    is_lower, is_upper = _find_range_ends(values)
+    return float(min(is_lower.mean(), is_upper.mean())) if values.min() < values.max() else 0.0
+
+
+def _find_range_ends(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the samples [T] bool at the lower and at the upper end of the range."""
     lower, upper = np.quantile(values, (0.01, 0.99))
     margin = 0.1 * (upper - lower)
-    shares = ((values <= lower + margin).mean(), (values >= upper - margin).mean())
-    return float(min(shares)) if upper > lower else 0.0
+    return values <= lower + margin, values >= upper - margin
+
+
+def find_relay_inputs(logs: Sequence[Signals], input_names: Sequence[str]) -> list[str]:
+    """Return the inputs that nearly all logs switch between the ends of their ranges.
+
+    These are the rudder angles of zigzags and 3-2-1-1 manoeuvres. An input with few levels, such as
+    the speed of a shaft, switches less often.
+
+    Args:
+        logs: signals [T] of each log by name.
+        input_names: inputs to look at.
+    """
+    n_samples = [len(next(iter(log.values()))) for log in logs]
+    return [
+        name
+        for name in input_names
+        if np.average([_is_relay(log[name]) for log in logs], weights=n_samples)
+        >= _MIN_SHARE_OF_RELAY_LOGS
+    ]
+
+
+def _is_relay(values: np.ndarray) -> bool:
+    """Return whether an input [T] mostly switches between the ends of its range."""
+    is_lower, is_upper = _find_range_ends(values)
+    ends = is_upper[is_lower | is_upper]
+    n_switches = int(np.count_nonzero(np.diff(ends)))
+    return n_switches >= _MIN_RELAY_SWITCHES and measure_relay_share(values) >= _MIN_RELAY_SHARE
 
 
 def response_time(rates: Sequence[np.ndarray], step: float) -> float:
@@ -317,6 +353,7 @@ __all__ = [
     "check_feedback",
     "cross_validated_r2",
     "detect_feedback",
+    "find_relay_inputs",
     "response_time",
     "to_uniform_signals",
 ]

@@ -195,12 +195,19 @@ class FrameAgreement:
         return is_declared and 0.8 < self.speed_ratio < 1.25
 
 
+_MAX_SPEED_RATIO = 5.0
+"""Largest ratio of a speed from positions to its 95 % quantile."""
+
+
 def compare_frames(log: LogStatistics) -> FrameAgreement | None:
     """Compare position and velocities; None with fewer than 50 samples in motion."""
     averaged_rates = log.cached(compute_averaged_rates)
     is_finite = np.isfinite(averaged_rates.ground_velocity)
     for values in averaged_rates.body_velocity.values():
         is_finite &= np.isfinite(values)
+    # a jump of the position, which has a check of its own, is no motion
+    speed = np.abs(np.where(is_finite, averaged_rates.ground_velocity, 0.0))
+    is_finite &= speed <= _MAX_SPEED_RATIO * float(np.quantile(speed, 0.95))
     ground_velocity = averaged_rates.ground_velocity[is_finite]
     declared_velocity = averaged_rates.body_velocity["as declared"][is_finite]
     if is_finite.sum() < MIN_SAMPLES or not ground_velocity.any() or not declared_velocity.any():

@@ -69,6 +69,8 @@ _SHIFT_STEP_SHARE = 0.3
 """Step between delays over the time scale of the motion; a period has 20 steps."""
 _MISFIT_BLOCK_SHARE = 2.0 / 3.0
 """Length of the blocks of samples in which shifts are compared over the step between delays."""
+_MIN_DELAY_SHARE = 0.5
+"""Difference of pose and velocities over the effect of a delay below which this is not searched."""
 _MAX_ROUNDING_SHARE = 1e-3
 """Unexplained share of the squared differences below which no delay is searched."""
 _MIN_COMMON_SHARE = 0.7
@@ -129,6 +131,8 @@ class KinematicCause:
 class _IncrementModel:
     """Increments of a pose, and the effects of possible causes on them.
 
+    The increments are those between successive samples, or over blocks of samples.
+
     Attributes:
         measured_pose: measured pose [T], real or complex; NaN if missing.
         integrated_increments: integrals of the velocities [T - 1], NaN if missing.
@@ -145,8 +149,8 @@ class _IncrementModel:
     rate_noise: np.ndarray
     columns: dict[str, list[np.ndarray]]
 
-    def compute_block_misfit(self, n_samples: int) -> float:
-        """Return the mean squared residual over blocks of samples, with all causes of the model.
+    def compute_misfit(self) -> float:
+        """Return the mean squared residual of the increments, with all causes of the model.
 
         Residuals beyond three standard deviations count as three.
         """
@@ -158,21 +162,18 @@ class _IncrementModel:
             if not (name == "gain" and "gain_v" in self.columns)
             for column in columns
         ]
-        n_blocks = self.dt.size // n_samples
-        # sums of strided samples, because a sum over a short last axis takes ten times as long
-        steps = np.array(table)[:, : n_blocks * n_samples]
-        blocks = sum((steps[:, k::n_samples] for k in range(n_samples)), np.zeros(1)).T
-        blocks = blocks[np.isfinite(blocks).all(axis=1)]
-        if len(blocks) < 2 * len(table):
+        increments = np.array(table).T
+        increments = increments[np.isfinite(increments).all(axis=1)]
+        if len(increments) < 2 * len(table):
             return math.inf
-        if np.iscomplexobj(blocks):
-            blocks = np.concatenate((blocks.real, blocks.imag))
+        if np.iscomplexobj(increments):
+            increments = np.concatenate((increments.real, increments.imag))
         # normal equations, because this is computed for each delay that is tried
-        gram = blocks.T @ blocks
+        gram = increments.T @ increments
         norms = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         gram = gram / np.outer(norms, norms)
         coefficients = np.linalg.lstsq(gram[1:, 1:], gram[1:, 0], rcond=_COLLINEARITY_TOLERANCE)[0]
-        residuals = blocks[:, 0] - blocks[:, 1:] @ (norms[0] * coefficients / norms[1:])
+        residuals = increments[:, 0] - increments[:, 1:] @ (norms[0] * coefficients / norms[1:])
         scale = SIGMA_OF_MAD * float(np.median(np.abs(residuals)))
         return float(np.mean(np.minimum(residuals**2, (3.0 * scale) ** 2)))
 
@@ -258,12 +259,16 @@ def estimate_yaw_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     return _compare_clocks(log, _model_heading, ("r",), _YAW_CLOCKS)
 
 
-def _model_heading(
-    log: LogStatistics, channels: Channels, *, with_lags: bool = True
-) -> _IncrementModel:
-    """Return the model of the increments of psi by the integral of r and its errors."""
-    r = channels["r"]
-    t = log.t
+def _model_heading(log: LogStatistics, channels: Channels, block: int = 1) -> _IncrementModel:
+    """Return the model of the increments of psi by the integral of r and its errors.
+
+    Args:
+        log: statistics of the log.
+        channels: measured and smoothed channels, of which some may be shifted.
+        block: number of samples of each increment; lags have columns for 1 only.
+    """
+    block_ends = _find_block_ends(log, block)
+    t = log.t[block_ends]
     dt = np.diff(t)
     smoothed_rate = channels["r smoothed"]
     normalized_time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
@@ -273,13 +278,18 @@ def _model_heading(
     if log.cached(
         _is_significant, "r"
     ) and heading_std > _MIN_HEADING_SIGNAL_TO_NOISE * log.noise_std("psi"):
-        columns = {"gain": [-_integrate_steps(dt, smoothed_rate)], **columns}
-        if with_lags:
+        columns = {"gain": [-_integrate_blocks(log.t, smoothed_rate, block)], **columns}
+        if block == 1:
             columns["lag"] = [np.diff(smoothed_rate)]
             columns["curvature"] = _differentiate_twice(smoothed_rate, t)
     rate_noise = np.full(dt.size, log.noise_std("r"))
     return _IncrementModel(
-        log["psi"], _integrate_steps(dt, r), dt, log.noise_std("psi"), rate_noise, columns
+        log["psi"][block_ends],
+        _integrate_blocks(log.t, channels["r"], block),
+        dt,
+        log.noise_std("psi"),
+        rate_noise,
+        columns,
     )
 
 
@@ -295,28 +305,33 @@ def estimate_position_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     return _compare_clocks(log, _model_positions, ("u", "v", "psi"), _POSITION_CLOCKS)
 
 
-def _model_positions(
-    log: LogStatistics, channels: Channels, *, with_lags: bool = True
-) -> _IncrementModel:
-    """Return the model of the increments of x, y by the integrals of R(psi) [u, v] and errors."""
-    dt = np.diff(log.t)
+def _model_positions(log: LogStatistics, channels: Channels, block: int = 1) -> _IncrementModel:
+    """Return the model of the increments of x, y by the integrals of R(psi) [u, v] and errors.
+
+    Args:
+        log: statistics of the log.
+        channels: measured and smoothed channels, of which some may be shifted.
+        block: number of samples of each increment; lags have columns for 1 only.
+    """
+    block_ends = _find_block_ends(log, block)
+    dt = np.diff(log.t[block_ends])
     psi = channels["psi"]
     # horizontal vectors are complex numbers: north + 1j east, or forward + 1j starboard
     heading_rotation = np.exp(1j * psi)
     u = channels["u smoothed"]
     v = channels["v smoothed"]
-    surge_increments = _integrate_steps(dt, heading_rotation * u)
-    sway_increments = 1j * _integrate_steps(dt, heading_rotation * v)
+    surge_increments = _integrate_blocks(log.t, heading_rotation * u, block)
+    sway_increments = 1j * _integrate_blocks(log.t, heading_rotation * v, block)
     both_increments = surge_increments + sway_increments
-    rotation_increments = np.diff(heading_rotation)
-    integrated_rotation = _integrate_steps(dt, heading_rotation)
+    rotation_increments = np.diff(heading_rotation[block_ends])
+    integrated_rotation = _integrate_blocks(log.t, heading_rotation, block)
     columns: dict[str, list[np.ndarray]] = {
         "gain_u": [-surge_increments],
         "gain_v": [-sway_increments],
         "gain": [-both_increments],
         "heading": [-1j * both_increments],
     }
-    if with_lags:
+    if block == 1:
         columns |= _differentiate_by_lags(log.t, channels)
     columns |= {
         "lever_arm": [rotation_increments, 1j * rotation_increments],
@@ -333,14 +348,13 @@ def _model_positions(
         for name, cause_columns in columns.items()
         if not any(name in _UNIDENTIFIABLE_CAUSES[channel] for channel in noise_only_channels)
     }
-    speed = np.hypot(np.nan_to_num(channels["u"]), np.nan_to_num(channels["v"]))
+    speed = np.hypot(np.nan_to_num(channels["u"]), np.nan_to_num(channels["v"]))[block_ends]
     heading_noise_velocity = log.noise_std("psi") * 0.5 * (speed[1:] + speed[:-1])
     rate_noise = np.hypot(max(log.noise_std("u"), log.noise_std("v")), heading_noise_velocity)
     velocity = heading_rotation * (channels["u"] + 1j * channels["v"])
-    position = log["x"] + 1j * log["y"]
     return _IncrementModel(
-        position,
-        _integrate_steps(dt, velocity),
+        log["x"][block_ends] + 1j * log["y"][block_ends],
+        _integrate_blocks(log.t, velocity, block),
         dt,
         max(log.noise_std("x"), log.noise_std("y")),
         rate_noise,
@@ -456,8 +470,9 @@ def _search_shifts(
     known beforehand. The extended BIC counts the hypotheses with as many shifts (Chen and Chen
     2008, Biometrika 95, 759-771, eq. 1 with gamma = 1).
     """
-    columns = make_model(log, unshifted.channels).columns
-    candidates = [name for name in clocks if name in columns]
+    model = make_model(log, unshifted.channels)
+    identifiable_clocks = [name for name in clocks if name in model.columns]
+    candidates = [name for name in identifiable_clocks if _may_contain_delay(log, model, name)]
     hypotheses = [unshifted]
     continued = hypotheses
     for _ in range(_MAX_CLOCKS):
@@ -476,7 +491,7 @@ def _search_shifts(
         order = np.argsort(bics[1:]).tolist()
         continued = [trials[k] for k in order[:_N_CONTINUED_HYPOTHESES]]
     bics = _compute_bics([hypothesis.explanation for hypothesis in hypotheses])
-    n_alternatives = len(candidates) * (2 * _count_shift_steps(log) + 1)
+    n_alternatives = len(identifiable_clocks) * (2 * _count_shift_steps(log) + 1)
     bics += [2.0 * math.log(math.comb(n_alternatives, len(h.shifts))) for h in hypotheses]
     # among hypotheses that the data do not distinguish the simplest one counts
     likely = np.flatnonzero(bics < bics.min() + _MIN_CLOCK_ADVANTAGE)
@@ -486,6 +501,22 @@ def _search_shifts(
         default=hypotheses[0],
     )
     return best.shifts
+
+
+def _may_contain_delay(log: LogStatistics, model: _IncrementModel, clock: str) -> bool:
+    """Return whether pose and velocities disagree as much as by the shortest delay of a clock.
+
+    Compares the root mean squares over the blocks in which delays are tried.
+    """
+    stride = log.cached(_shift_stride)
+    block = _choose_misfit_block(stride)
+    difference = np.diff(model.measured_pose) - model.integrated_increments
+    shortest_delay = 0.5 * stride * log.sampling_interval
+    difference_square, effect_square = (
+        np.nanmean(np.abs(_sum_blocks(steps, block)) ** 2)
+        for steps in (difference, shortest_delay * model.columns[clock][0])
+    )
+    return bool(difference_square >= _MIN_DELAY_SHARE**2 * effect_square)
 
 
 def _shift_clock(
@@ -562,6 +593,11 @@ def _shift_stride(log: LogStatistics) -> int:
     return max(round(float(np.clip(step, *_SHIFT_STEPS)) / log.sampling_interval), 1)
 
 
+def _choose_misfit_block(stride: int) -> int:
+    """Return the number of samples of the blocks in which delays are compared."""
+    return max(round(_MISFIT_BLOCK_SHARE * stride), 1)
+
+
 def _count_shift_steps(log: LogStatistics) -> int:
     """Return the number of delays that are tried to either side."""
     return max(int(_MAX_SHIFT / (log.cached(_shift_stride) * log.sampling_interval)), 1)
@@ -576,11 +612,11 @@ def _find_most_likely_shift(
     """Return the shift in samples under which all causes but lags explain the increments best."""
     stride = log.cached(_shift_stride)
     n_steps = _count_shift_steps(log)
-    block = max(round(_MISFIT_BLOCK_SHARE * stride), 1)
+    block = _choose_misfit_block(stride)
 
     def compute_misfit(n_samples: int) -> float:
         shifted = _shift_channels(log, channels, names, n_samples)
-        return make_model(log, shifted, with_lags=False).compute_block_misfit(block)
+        return make_model(log, shifted, block).compute_misfit()
 
     # every other delay, then the neighbours of the best one
     misfits = {k: compute_misfit(stride * k) for k in range(-n_steps, n_steps + 1, 2)}
@@ -619,9 +655,21 @@ def _differentiate_twice(values: np.ndarray, t: np.ndarray) -> list[np.ndarray]:
     return steps
 
 
-def _integrate_steps(dt: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Return the trapezoidal integrals [T - 1] of a rate [T] over each step."""
-    return np.asarray(0.5 * dt * (rates[1:] + rates[:-1]))
+def _find_block_ends(log: LogStatistics, block: int) -> slice:
+    """Return the samples at the ends of blocks of a number of samples."""
+    return slice(None, (len(log) - 1) // block * block + 1, block)
+
+
+def _integrate_blocks(t: np.ndarray, rates: np.ndarray, block: int) -> np.ndarray:
+    """Return the trapezoidal integrals of a rate [T] over blocks of samples at times t [T] in s."""
+    return _sum_blocks(0.5 * np.diff(t) * (rates[1:] + rates[:-1]), block)
+
+
+def _sum_blocks(steps: np.ndarray, block: int) -> np.ndarray:
+    """Return the sums over blocks of successive steps [T - 1]; remaining steps are left out."""
+    steps = steps[: steps.size // block * block]
+    # sums of strided samples, because a sum over a short last axis takes ten times as long
+    return np.asarray(sum((steps[k::block] for k in range(1, block)), steps[::block]))
 
 
 def _is_significant(log: LogStatistics, name: str) -> bool:

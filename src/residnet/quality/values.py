@@ -646,6 +646,8 @@ def check_clipping(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
 
 # smallest number of levels between the 5th and the 95th percentile for a sufficient resolution
 _MIN_LEVELS = 50
+# smallest median increment, in steps of the resolution, of a channel that noise dithers
+_DITHER_STEPS = 2.0
 # a channel with a smaller range carries no information; yaw rates of +-0.05 deg/s turn a vessel by
 # 3 deg in a minute
 _NEGLIGIBLE_RANGES = {"rad": math.radians(3.0), "rad/s": math.radians(0.1)}
@@ -675,8 +677,13 @@ def check_resolution(log: LogStatistics, make_finding: Check) -> Iterator[Findin
             f"{name} has a resolution of {format_quantity(level_step, log.units[name])},"
             f" {n_levels:.0f} levels between its 5th and 95th percentile"
         )
-        is_fine = n_levels >= _MIN_LEVELS or upper - lower < _NEGLIGIBLE_RANGES.get(
-            log.units[name], 0.0
+        # noise beyond the resolution makes rounding a white noise of step / sqrt(12) without bias
+        # (Widrow 1956)
+        is_dithered = float(np.median(np.abs(increments_in_steps))) >= _DITHER_STEPS
+        is_fine = (
+            n_levels >= _MIN_LEVELS
+            or is_dithered
+            or upper - lower < _NEGLIGIBLE_RANGES.get(log.units[name], 0.0)
         )
         level: Level = "note" if is_fine else "will mislead"
         fix = "" if is_fine else None

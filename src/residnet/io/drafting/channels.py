@@ -28,14 +28,17 @@ from residnet.io.drafting.motion_regression import (
     differentiate_on_grid,
     estimate_motion,
     estimate_rudder_gain,
+    fit_rate_to_angle,
     fit_to_motion,
     forward_alignment,
 )
 from residnet.io.drafting.questions import CHANNELS_KEY, DraftNotes
 from residnet.io.drafting.velocities import (
     BODY_AXES,
+    EARTH_AXES,
     EXCHANGED_EARTH_AXES,
     HeadingOffset,
+    Meaning,
     MeaningChoice,
     MeasuredVelocities,
     choose_meaning,
@@ -46,6 +49,7 @@ from residnet.io.drafting.velocities import (
 )
 from residnet.io.header_vocabulary import (
     Scaling,
+    find_earth_velocities,
     guess_scaling,
     guess_unit_from_size,
     infer_unit,
@@ -105,6 +109,10 @@ class ChannelMapper:
 
     def draft_entries(self) -> dict[str, dict[str, Any]]:
         """Choose units, signs and frames, and return the entry of each channel in a channel map."""
+        if self._is_named_earth_fixed and "psi" not in self._names:
+            columns = " and ".join(f"'{self._names.pop(name)}'" for name in ("u", "v"))
+            text = f"{columns} are left out: velocities along north and east need a heading"
+            self._draft_notes.add_note(CHANNELS_KEY, text)
         if {"x", "y", "psi"} <= set(self._names):
             self._choose_velocity_meaning()
             self.choose_frame()
@@ -115,6 +123,7 @@ class ChannelMapper:
             self._require_compatible_velocities()
         elif "psi" in self._names:
             self._psi_unit = self._infer_unit("psi")
+            self._is_earth_fixed = self._is_named_earth_fixed
         self._choose_wind_reference()
         entries = {name: self._make_entry(name) for name in self._names}
         for force, velocity in (("tau_y", "v"), ("tau_n", "r")):
@@ -153,6 +162,12 @@ class ChannelMapper:
             column = self._names.pop(name)
             text = f"'{column}' {problem}; left out: {name} is derived from them"
             self._draft_notes.add_note(CHANNELS_KEY, text)
+
+    @property
+    def _is_named_earth_fixed(self) -> bool:
+        """Whether u and v have the names of velocities along north and east."""
+        columns = tuple(self._names.get(name, "") for name in ("u", "v"))
+        return find_earth_velocities(columns) == columns
 
     @property
     def _is_ros_pose(self) -> bool:
@@ -282,20 +297,12 @@ class ChannelMapper:
         header_unit = parse_header_unit(self._names["psi"], "rad")
         is_consistent &= (header_unit or unit_from_size) == as_named._psi_unit
         reference = as_named
-        if len(names) < 2 or not is_consistent:
+        if len(names) < 2 or not is_consistent or self._is_named_earth_fixed:
             other_names = {n: column for n, column in self._names.items() if n not in names}
             reference = self._try_heading_frame(other_names)
             if logs := reference.measure_velocities(names, self._logs):
                 choice = choose_meaning(logs)
-        meaning = choice.meaning
-        if choice.is_ambiguous:
-            options = (choice.meaning.description, choice.runner_up.description)
-            columns = " and ".join(f"'{self._names[name]}'" for name in names)
-            question = f"meaning of {columns} (the margin {choice.margin:.0f} decides nothing)"
-            answer = self._draft_notes.ask_question(
-                (*CHANNELS_KEY, names[-1]), question, options[0], choice.text, options
-            )
-            meaning = choice.meaning if answer == options[0] else choice.runner_up
+        meaning = self._select_meaning(choice, names)
         if meaning == BODY_AXES:
             for name in names:
                 if match_axis_velocity(parse_name(self._names[name])) is not None:
@@ -312,13 +319,29 @@ class ChannelMapper:
             self._names["u"], self._names["v"] = self._names["v"], self._names["u"]
         # names such as vx say nothing about axes; u and v say something else
         is_named_by_axes = all(match_axis_velocity(parse_name(self._names[n])) for n in names)
+        is_named_by_axes |= self._is_named_earth_fixed
         add = self._draft_notes.add_note if is_named_by_axes else self._draft_notes.add_guess
-        add((*CHANNELS_KEY, "u"), choice.text)
+        add((*CHANNELS_KEY, "u"), choice.text or "velocities along north and east by their names")
         self._is_earth_fixed = True
         self._logs = [
             reference._rotate_to_body(table, meaning == EXCHANGED_EARTH_AXES)
             for table in self._logs
         ]
+
+    def _select_meaning(self, choice: MeaningChoice, names: Sequence[str]) -> Meaning:
+        """Return the chosen meaning of u and v; if it is ambiguous, that of the names or answer."""
+        if self._is_named_earth_fixed and (choice.is_ambiguous or choice.meaning == BODY_AXES):
+            # a wrong name contradicts the positions, see `require_compatible`
+            return EARTH_AXES
+        if not choice.is_ambiguous:
+            return choice.meaning
+        options = (choice.meaning.description, choice.runner_up.description)
+        columns = " and ".join(f"'{self._names[name]}'" for name in names)
+        question = f"meaning of {columns} (the margin {choice.margin:.0f} decides nothing)"
+        answer = self._draft_notes.ask_question(
+            (*CHANNELS_KEY, names[-1]), question, options[0], choice.text, options
+        )
+        return choice.meaning if answer == options[0] else choice.runner_up
 
     def _try_heading_frame(self, names: Mapping[str, str]) -> ChannelMapper:
         """Return a mapper of some of the channels with its frame, without notes."""
@@ -552,21 +575,20 @@ class ChannelMapper:
                 entry |= self._correct_magnetic_heading(column)
             entry["unit"] = self._psi_unit
             return entry | ({"frame": "enu"} if self._pose_frame.is_from_east else {})
+        if self._is_earth_fixed and name in ("u", "v"):
+            entry["frame"] = "ned"
         if name in ("u", "v", "r") and {"x", "y", "psi"} <= set(self._names):
             fit = fit_to_motion(self._logs, self._motions, name)
-            frame = {"frame": "ned"} if self._is_earth_fixed and name in ("u", "v") else {}
-            return entry | self._settle_rate(name, fit, "position and heading") | frame
+            return entry | self._settle_rate(name, fit, "position and heading")
         if name == "r" and "psi" in self._names:
-            return entry | self._settle_rate(
-                name, self._fit_rate_to_angle("psi", self._psi_unit, name), "headings"
-            )
+            fit = fit_rate_to_angle(self._logs, "psi", self._psi_unit, name, self._pose_frame)
+            return entry | self._settle_rate(name, fit, "headings")
         if name in ("w", "p", "q") and (vertical_fit := self._fit_vertical_motion(name)):
             return entry | self._settle_rate(name, vertical_fit, "positions and attitude")
         if name == "p" and "phi" in self._names:
             unit = self._infer_unit("phi", should_note=False)
-            return entry | self._settle_rate(
-                name, self._fit_rate_to_angle("phi", unit, name), "roll angles"
-            )
+            fit = fit_rate_to_angle(self._logs, "phi", unit, name)
+            return entry | self._settle_rate(name, fit, "roll angles")
         if name not in MOTION_AND_WIND_CHANNELS and (
             scaling := guess_scaling(name, column, self._concatenate_values(name))
         ):
@@ -603,27 +625,6 @@ class ChannelMapper:
         text = "assumed positive to port, as for a pose of ROS (REP 103)"
         self._draft_notes.add_guess((*CHANNELS_KEY, name), text)
         return -1
-
-    def _fit_rate_to_angle(self, angle: str, unit: str, name: str) -> ScaleFit:
-        """Regress the derivative of an angle on the column of its rate.
-
-        Args:
-            angle: channel of the angle, `psi` or `phi`.
-            unit: unit of the angle.
-            name: channel of the rate.
-        """
-        tables_with_both = [table for table in self._logs if {angle, name} <= set(table.columns)]
-        angles = [
-            RawTable(table.t, dict.fromkeys(("x", "y", "psi"), table.columns[angle]))
-            for table in tables_with_both
-        ]
-        frame = self._pose_frame if angle == "psi" else POSE_FRAMES[0]
-        motions = [estimate_motion(table, unit, frame) for table in angles]
-        return fit_to_motion(
-            [RawTable(table.t, {"r": table.columns[name]}) for table in tables_with_both],
-            motions,
-            "r",
-        )
 
     def _fit_vertical_motion(self, name: str) -> ScaleFit | None:
         """Regress the heave velocity, roll rate or pitch rate on a column.

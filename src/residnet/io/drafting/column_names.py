@@ -15,6 +15,7 @@ from residnet.io.header_vocabulary import (
     MOTION_CHANNELS,
     REVOLUTION_PATTERN,
     ParsedName,
+    find_earth_velocities,
     find_mismatched_unit,
     is_drift_angle,
     match_input_channel,
@@ -69,7 +70,12 @@ def match_channels(
             draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
             return {**north_east, **other_channels}
     drift_angle = next((column for column in columns if is_drift_angle(column)), None)
-    parsed_names = {column: parse_name(column) for column in columns if column != drift_angle}
+    earth_velocities = find_earth_velocities(columns)
+    parsed_names = {
+        column: parse_name(column)
+        for column in columns
+        if column not in (drift_angle, *(earth_velocities or ()))
+    }
     names, duplicates, speeds = _assign_columns([*parsed_names], parsed_names, draft_notes)
     _resolve_duplicates(names, duplicates, columns, draft_notes)
     has_position = bool({"x", "y", "latitude", "longitude"} & names.keys())
@@ -87,6 +93,8 @@ def match_channels(
         or "psi" in names
         or any("course" in parsed.concepts for parsed in parsed_names.values())
     )
+    if earth_velocities and has_heading and not {"u", "v"} & names.keys():
+        names |= dict(zip(("u", "v"), earth_velocities, strict=True))
     if drift_angle is not None:
         names |= _pair_speed_with_drift_angle(drift_angle, names, speeds, parsed_names, draft_notes)
     if "speed" in names:

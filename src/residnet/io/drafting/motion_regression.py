@@ -228,6 +228,34 @@ def fit_to_motion(
     )
 
 
+def fit_rate_to_angle(
+    logs: Sequence[RawTable],
+    angle: str,
+    unit: str,
+    rate: str,
+    frame: PoseFrame = POSE_FRAMES[0],
+) -> ScaleFit:
+    """Regress the derivative of an angle on the column of its rate.
+
+    Args:
+        logs: tables; those without one of the columns are not used.
+        angle: channel of the angle, `psi` or `phi`.
+        unit: unit of the angle.
+        rate: channel of the rate.
+        frame: frame of the angle.
+    """
+    complete_logs = [table for table in logs if {angle, rate} <= table.columns.keys()]
+    angles = [
+        RawTable(table.t, dict.fromkeys(("x", "y", "psi"), table.columns[angle]))
+        for table in complete_logs
+    ]
+    return fit_to_motion(
+        [RawTable(table.t, {"r": table.columns[rate]}) for table in complete_logs],
+        [estimate_motion(table, unit, frame) for table in angles],
+        "r",
+    )
+
+
 def estimate_rudder_gain(
     logs: Sequence[RawTable],
     channel: str,

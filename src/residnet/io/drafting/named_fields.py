@@ -249,8 +249,12 @@ _VECTOR_STATES = {
     ("nu", 3): ("u", "v", "r"),
     ("nu", 6): ("u", "v", "w", "p", "q", "r"),
     ("tau", 3): ("tau_x", "tau_y", "tau_n"),
+    **dict.fromkeys((("rpy", 3), ("euler", 3), ("euler_angles", 3)), ("phi", "theta", "psi")),
+    ("ypr", 3): ("psi", "theta", "phi"),
+    ("pqr", 3): ("p", "q", "r"),
+    ("uvw", 3): ("u", "v", "w"),
 }
-"""Name and length of a vector in Fossen's notation (2021, table 2.1) -> names of its parts."""
+"""Name and length of a vector -> names of its parts (Fossen 2021, table 2.1; autopilots)."""
 _SPATIAL_VECTOR_PATTERN = re.compile(
     r"(?:^|[\W_])(?:pos|position|linear|angular|vel|velocity|lin_?vel|ang_?vel|omega|gyro|force)s?"
     r"(?:$|[\W_])",

@@ -19,10 +19,13 @@ from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.layout import DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.core.progress import report_progress
+from residnet.core.units import to_si
 from residnet.io.drafting.motion_regression import (
     MIN_STANDARD_ERRORS,
     RawTable,
+    ScaleFit,
     estimate_rudder_gain,
+    fit_rate_to_angle,
 )
 from residnet.io.drafting.problems import (
     UnreadableLogsError,
@@ -33,8 +36,8 @@ from residnet.io.drafting.problems import (
 from residnet.io.drafting.questions import INPUTS_KEY, READER_KEY, DraftNotes, Key
 from residnet.io.drafting.recordings import draft_recordings
 from residnet.io.drafting.tables import draft_tables
-from residnet.io.drafting.trips import draft_trip_parts, group_by_trip
-from residnet.io.header_vocabulary import PLANE_PATTERN
+from residnet.io.drafting.trips import draft_trip_parts, group_by_trip, refuse_topics
+from residnet.io.header_vocabulary import PLANE_PATTERN, parse_header_unit
 from residnet.io.readers import ReaderConfig
 from residnet.io.readers.detect import detect_log_kind, is_channel_reader
 from residnet.io.readers.manoeuvre_kinds import UNKNOWN, resolve_manoeuvre
@@ -87,6 +90,7 @@ def read_drafted(
         # a trip has the name of its file with the most channels of the motion
         paths = [*trip_files[next(iter(result.reader["parts"]))]]
     elif log_kind == "table":
+        refuse_topics(paths)
         with name_files_in_errors(paths):
             result.reader, result.errors = draft_tables(paths, draft_notes)
     elif is_channel_reader(log_kind):
@@ -113,6 +117,7 @@ def read_drafted(
     report_progress("reading logs", len(paths), len(paths))
     if not result.logs:
         raise_unreadable(result.errors)
+    _correct_joined_rates(result)
     _correct_rudder_signs(result)
     _name_manoeuvres(result)
     return result
@@ -176,6 +181,8 @@ def read_mixed_formats(
         path: read_column_names(path) for path in paths if detect_log_kind(path) == "table"
     }
     has_trips = bool(group_by_trip([*columns_by_path]))
+    if not has_trips:
+        refuse_topics([*columns_by_path])
     for path in paths:
         log_kind = detect_log_kind(path)
         names = columns_by_path[path] if log_kind == "table" and not has_trips else ()
@@ -190,6 +197,41 @@ def read_mixed_formats(
         except ResidnetError as error:
             results.append(DraftResult({}, draft_notes, errors=dict.fromkeys(group, error)))
     return results
+
+
+def _correct_joined_rates(result: DraftResult) -> None:
+    """Correct sign and unit of a yaw rate whose heading is in another file of its trip.
+
+    The settings of the drafted reader and the logs are changed in place.
+
+    Args:
+        result: drafted reader and its logs.
+    """
+    for part_name, part in result.reader.get("parts", {}).items():
+        entry = part["channels"].get("r")
+        logs = [log for log in result.logs.values() if {"psi", "r"} <= log.channels.keys()]
+        if entry is None or "psi" in part["channels"] or not logs:
+            continue
+        tables = [RawTable(log.t, {"psi": log["psi"], "r": log["r"]}) for log in logs]
+        fit = fit_rate_to_angle(tables, "psi", "rad", "r")
+        if not fit.is_significant:
+            continue
+        key = (*READER_KEY, "parts", part_name, "channels", "r")
+        factor = 1.0
+        unit = ScaleFit(fit.factor * to_si(entry["unit"]), fit.correlation).matching_unit("rad/s")
+        if unit not in (None, entry["unit"]) and not parse_header_unit(entry["column"], "rad/s"):
+            factor = to_si(unit) / to_si(entry["unit"])
+            entry["unit"] = unit
+            text = f"the header has no unit; headings give {unit}"
+            result.draft_notes.add_guess(key, f"{text} (correlation {fit.correlation:.2f})")
+        if fit.factor < 0.0:
+            factor = -factor
+            entry["sign"] = -1 * int(entry.get("sign", 1))
+            text = f"positive to port by headings (correlation {fit.correlation:.2f})"
+            result.draft_notes.add_guess(key, text)
+        for path, log in result.logs.items():
+            if factor != 1.0 and "r" in log.channels:
+                result.logs[path] = log.replace(channels={**log.channels, "r": factor * log["r"]})
 
 
 def _correct_rudder_signs(result: DraftResult) -> None:

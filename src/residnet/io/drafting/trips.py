@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from residnet.core.errors import ResidnetError
-from residnet.core.names import STATE_NAMES
+from residnet.core.errors import ResidnetError, UsageError
+from residnet.core.names import STATE_NAMES, truncate
 from residnet.io.drafting.column_names import match_channels
 from residnet.io.drafting.questions import READER_KEY, DraftNotes
 from residnet.io.drafting.table_preview import preview_table
@@ -82,6 +82,44 @@ def group_by_trip(paths: Sequence[Path]) -> dict[str, list[Path]]:
         first_set & second_set for first_set, second_set in itertools.combinations(motion_sets, 2)
     )
     return {} if is_ambiguous else trip_files
+
+
+def refuse_topics(paths: Sequence[Path]) -> None:
+    """Stop if tables are the topics of several recordings in one folder, as `ulog2csv` writes them.
+
+    The name of such a table is that of its recording and that of its topic. Topics have different
+    columns, and at most one of them has the complete motion.
+
+    Args:
+        paths: tables that are not parts of trips.
+
+    Raises:
+        UsageError: if they are topics.
+    """
+    longest_name = max((path.stem.count("_") for path in paths), default=0)
+    for n_words in range(longest_name, 0, -1):
+        topics: dict[str, dict[str, Path]] = {}
+        for path in paths:
+            words = path.stem.split("_")
+            recording = "_".join(words[:n_words])
+            topics.setdefault(recording, {})["_".join(words[n_words:])] = path
+        first, *others = topics.values()
+        if not others or len(first) < 2 or any(other.keys() != first.keys() for other in others):
+            continue
+        headers, *other_headers = [
+            {topic: read_column_names(path) for topic, path in files.items()}
+            for files in topics.values()
+        ]
+        if len({*headers.values()}) < 2 or any(other != headers for other in other_headers):
+            continue
+        channels = [_motion_channels(_channels_from_headers([path])) for path in first.values()]
+        if sum({"x", "y", "psi"} <= names for names in channels) < 2:
+            raise UsageError(
+                f"{paths[0].parent}: the tables are {len(first)} topics"
+                f" ({truncate(', '.join(first), 100)}) of {len(topics)} recordings"
+                f" ({truncate(', '.join(topics), 60)}); move the files of each recording to a"
+                " folder of its own"
+            )
 
 
 def _channels_from_headers(files: Sequence[Path]) -> Iterable[str]:

@@ -39,6 +39,8 @@ _MAX_NODES = 300
 """Largest number of nodes of a log in that comparison; bounds its computing time."""
 _NODE_STEP = 0.5
 """Smallest step between nodes in s."""
+_MIN_JUMP_RATIO = 15.0
+"""Smallest ratio of a jump of the position to the median of unexplained steps."""
 _N_WINDOWS = 12
 """Windows of a log over which velocities are integrated."""
 _MAX_UNRELATED_SLOPE = 0.5
@@ -427,7 +429,8 @@ def measure_contradiction(logs: Sequence[MeasuredVelocities]) -> Contradiction |
     """Compare displacements with integrals of u, v in body axes over windows of each log.
 
     A heading offset and a scale (for all logs), and a current (for each log) are fitted, so that
-    they are no contradiction.
+    they are no contradiction. Windows with a jump of the position, such as a reset of its origin,
+    are not used.
 
     Args:
         logs: logs with u and v in body axes in m/s.
@@ -445,10 +448,12 @@ def measure_contradiction(logs: Sequence[MeasuredVelocities]) -> Contradiction |
         bounds = np.linspace(0, log.t.size - 1, _N_WINDOWS + 1).astype(int)
         dt = np.diff(log.t)
         increments = 0.5 * dt * (velocity[1:] + velocity[:-1])
+        jumps = np.flatnonzero(_is_jump(np.diff(track), increments))
         for first, last in itertools.pairwise(bounds.tolist()):
             integral = increments[first:last].sum()
             displacement = track[last] - track[first]
-            if np.isfinite(integral) and np.isfinite(displacement) and last > first:
+            has_jump = bool(((jumps >= first) & (jumps < last)).any())
+            if np.isfinite(integral + displacement) and last > first and not has_jump:
                 displacements.append(displacement)
                 integrals.append(integral)
                 durations.append(log.t[last] - log.t[first])
@@ -471,6 +476,20 @@ def measure_contradiction(logs: Sequence[MeasuredVelocities]) -> Contradiction |
         angle = 0.0
     offset = HeadingOffset(angle, spread, "from velocities against positions")
     return Contradiction(float(np.abs(residual).sum()) / distance, offset)
+
+
+def _is_jump(steps: np.ndarray, increments: np.ndarray) -> np.ndarray:
+    """Return whether steps of a track [T - 1] are jumps that the velocities do not explain.
+
+    The steps of a noisy or contradictory track are all large, so that none of them is a jump.
+
+    Args:
+        steps: differences of the positions [T - 1] as complex numbers in m.
+        increments: integrals of the velocities over the same steps [T - 1].
+    """
+    excess = np.nan_to_num(np.abs(steps - increments))
+    largest_distance = float(np.nanmax(np.abs(increments), initial=0.0))
+    return np.asarray(excess > max(_MIN_JUMP_RATIO * float(np.median(excess)), largest_distance))
 
 
 def estimate_drift_free_offset(logs: Sequence[MeasuredVelocities]) -> HeadingOffset | None:

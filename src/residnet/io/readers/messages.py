@@ -486,6 +486,7 @@ MESSAGE_KINDS = (
     ),
     MessageKind("MoosNavigation", ("Variables",), _plan_moos),
     MessageKind("NmeaHeading", ("HDT",), _make_field_plan({}, heading="heading")),
+    MessageKind("NmeaCompass", ("HDG", "HDM"), _make_field_plan({}, heading="heading_true")),
     MessageKind("NmeaRateOfTurn", ("ROT",), _make_field_plan({"r": "rate_of_turn"}, "deg/s")),
     MessageKind(
         "NmeaRudder",

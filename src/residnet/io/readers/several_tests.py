@@ -6,6 +6,7 @@ file by `expand_files`; the readers of tables read them like files.
 
 from __future__ import annotations
 
+import itertools
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -41,11 +42,13 @@ _TEXT_ENDINGS = (".csv", ".tsv", ".txt", ".dat")
 _MAX_TEXT_BYTES = 64_000_000
 """Largest size of a text that is searched for several tests; a larger text is one log."""
 _SAMPLED_LINES = 300
-"""Number of lines from which the separator of cells is determined."""
+"""Number of first lines from which the separator of cells is determined."""
+_CLASSIFIED_LINES = 60
+"""Number of lines among these, evenly spread, whose cells are counted."""
 _NUMBERS_AT_START = re.compile(r"\s*[\"']?[-+]?\.?\d")
 _WORD = re.compile(r"[^\W\d_]{3}")
-_NUMBER_CHARACTERS = "0123456789.,;|+-eE \t"
-"""Characters of lines of numbers; `str.strip` is faster than a search for words."""
+_NUMBERS = re.compile(r"[-+]?\.?\d[\d.,;|+\-eE \t]*")
+"""Line of numbers; a test of its characters is faster than that of its cells."""
 
 
 class PlacedTest(NamedTuple):
@@ -288,8 +291,7 @@ def _rows_of_cells(cells: pd.DataFrame) -> Rows:
         ["" if cell is None or cell != cell else str(cell).strip() for cell in row]
         for row in cells.itertuples(index=False)
     ]
-    kinds = [classify_cells(row) for row in table]
-    return Rows(len(table), table.__getitem__, kinds.__getitem__)
+    return Rows([classify_cells(row) for row in table], table.__getitem__)
 
 
 def _rows_of_lines(lines: Sequence[str], delimiter: str) -> Rows:
@@ -297,9 +299,8 @@ def _rows_of_lines(lines: Sequence[str], delimiter: str) -> Rows:
 
     def classify(i: int) -> RowKind:
         line = lines[i]
-        # most lines are numbers, which their beginning and their characters show
         is_number_first = _NUMBERS_AT_START.match(line) and delimiter in line
-        if is_number_first and not (line.strip(_NUMBER_CHARACTERS) and _WORD.search(line)):
+        if is_number_first and not _WORD.search(line):
             return "values"
         return "text" if line.lstrip()[:1] in ("#", "%") else classify_cells(split(i))
 
@@ -307,14 +308,22 @@ def _rows_of_lines(lines: Sequence[str], delimiter: str) -> Rows:
         line = lines[i]
         if '"' in line or delimiter == WHITESPACE_DELIMITER:
             return split_line(line, delimiter)
-        return list(map(str.strip, line.split(delimiter)))
+        cells = line.split(delimiter)
+        return [cell.strip() for cell in cells] if " " in line or "\t" in line else cells
 
-    return Rows(len(lines), split, classify)
+    # most lines are numbers only
+    kinds: list[RowKind] = [
+        "values" if _NUMBERS.fullmatch(line) and delimiter in line else classify(i)
+        for i, line in enumerate(lines)
+    ]
+    return Rows(kinds, split)
 
 
 def _choose_delimiter(lines: Sequence[str]) -> str:
     """Return the separator with most rows of values; empty if there are no such rows."""
-    sample = [line for line in lines if line.strip()][:_SAMPLED_LINES]
+    filled_lines = (line for line in lines if line.strip())
+    sample = [*itertools.islice(filled_lines, _SAMPLED_LINES)]
+    sample = sample[:: max(len(sample) // _CLASSIFIED_LINES, 1)]
 
     def count_values(delimiter: str) -> int:
         is_whitespace = delimiter == WHITESPACE_DELIMITER

@@ -79,14 +79,12 @@ class Rows(NamedTuple):
     """Rows of a sheet or of a text.
 
     Attributes:
-        n_rows: number of rows.
+        kinds: kind of each row.
         split: index of a row -> its cells without surrounding blanks.
-        classify: index of a row -> its kind.
     """
 
-    n_rows: int
+    kinds: Sequence[RowKind]
     split: Callable[[int], Sequence[str]]
-    classify: Callable[[int], RowKind]
 
 
 def classify_cells(cells: Sequence[str]) -> RowKind:
@@ -104,15 +102,13 @@ def find_sections(rows: Rows) -> list[Section]:
     Sections of fewer than `MIN_ROWS` rows are no tests but, for example, failed starts of the
     recorder.
     """
-    kinds = [rows.classify(i) for i in range(rows.n_rows)]
-    first_values = next((i for i, kind in enumerate(kinds) if kind == "values"), None)
-    if first_values is None:
+    if "values" not in rows.kinds:
         return []
-    for i in range(first_values - 1, -1, -1):
+    for i in range(rows.kinds.index("values") - 1, -1, -1):
         tables = _split_columns(rows.split(i))
         if tables:
             return [section for columns in tables for section in _find_in_columns(rows, columns)]
-    return _find_stacked(rows, kinds)
+    return _find_stacked(rows)
 
 
 def _split_columns(names: Sequence[str]) -> list[tuple[int, int]]:
@@ -132,10 +128,9 @@ def _split_columns(names: Sequence[str]) -> list[tuple[int, int]]:
 
 def _find_in_columns(rows: Rows, columns: tuple[int, int]) -> list[Section]:
     """Return the tests in some columns of a sheet or a text."""
-    table = [rows.split(i)[slice(*columns)] for i in range(rows.n_rows)]
-    kinds = [classify_cells(cells) for cells in table]
-    part = Rows(len(table), table.__getitem__, kinds.__getitem__)
-    return [section._replace(columns=columns) for section in _find_stacked(part, kinds)]
+    table = [rows.split(i)[slice(*columns)] for i in range(len(rows.kinds))]
+    part = Rows([classify_cells(cells) for cells in table], table.__getitem__)
+    return [section._replace(columns=columns) for section in _find_stacked(part)]
 
 
 class _Head(NamedTuple):
@@ -194,8 +189,9 @@ def _names_test(title: str) -> bool:
     )
 
 
-def _find_stacked(rows: Rows, kinds: Sequence[RowKind]) -> list[Section]:
+def _find_stacked(rows: Rows) -> list[Section]:
     """Return the tests of a table, one below the other."""
+    kinds = rows.kinds
     value_rows = np.flatnonzero([kind == "values" for kind in kinds])
     if not value_rows.size:
         return []
@@ -284,7 +280,12 @@ class _Clock:
         """Return the times [T] of rows in the unit of their column, NaN where unknown."""
         if self._time_column is None:
             return np.full(stop - start, np.nan)
-        return np.array([_parse_time(rows.split(i), self._time_column) for i in range(start, stop)])
+        column = self._time_column
+        cells = [rows.split(i)[column : column + 1] for i in range(start, stop)]
+        try:
+            return np.array([float(cell) for (cell,) in cells])
+        except ValueError:
+            return np.array([_parse_time(cell[0] if cell else "") for cell in cells])
 
     def split(
         self, rows: Rows, start: int, stop: int, times: np.ndarray
@@ -311,9 +312,8 @@ class _Clock:
         ]
 
 
-def _parse_time(cells: Sequence[str], column: int) -> float:
+def _parse_time(cell: str) -> float:
     """Return a time in the unit of its column, or in s for a time of day; NaN otherwise."""
-    cell = cells[column] if column < len(cells) else ""
     try:
         return float(cell.replace(",", "."))
     except ValueError:

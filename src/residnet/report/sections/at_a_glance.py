@@ -21,9 +21,11 @@ from residnet.evaluation.verdict import (
     GOOD_LEVEL,
     TOO_FEW_WINDOWS,
     VerdictEvidence,
+    advise_intermediate_steps,
     contradicts_positions,
     format_pose_error,
     is_better_than_constant_velocity,
+    list_relay_inputs,
     list_unidentifiable_inputs,
     main_horizon,
     rate_model,
@@ -192,6 +194,9 @@ def _recommend_next_step(run: RunFiles, evidence: VerdictEvidence) -> str:
             "Record more test logs, or longer ones, and run `residnet evaluate RUN LOGS` (RUN is"
             " this folder)."
         )
+    if level == GOOD_LEVEL and (inputs := list_relay_inputs(evidence)):
+        steps = advise_intermediate_steps(join_list(list(inputs)))
+        return f"Add logs of {steps}, and run the fit again."
     if level == GOOD_LEVEL:
         return "Test your controller in simulation with the exported model."
     if level == DO_NOT_USE:

@@ -24,6 +24,7 @@ from residnet.core.ownership import record_folder
 from residnet.core.progress import log_message
 from residnet.evaluation.data_records import ExcitationFile
 from residnet.evaluation.metrics_file import find_row
+from residnet.evaluation.verdict import advise_intermediate_steps
 from residnet.identification.identified import evaluate_splits, make_candidates
 from residnet.identification.monitoring import (
     ChangeDetector,
@@ -682,7 +683,7 @@ def plan_next_trials(
 def advise_excitation(
     excitation: ExcitationFile | None, steering_inputs: Sequence[str]
 ) -> tuple[str, ...]:
-    """Return a sentence for each input or pair of inputs that the training logs do not excite.
+    """Return a sentence for each input or pair of inputs that the logs do not excite enough.
 
     Args:
         excitation: contents of excitation.json; None if the run has no such file.
@@ -700,6 +701,11 @@ def advise_excitation(
             else "steps between at least three levels"
         )
         sentences.append(f"Not excited: {row.text}; run {manoeuvre} of {row.name}.")
+    sentences += [
+        f"{name} only switches between the ends of its range;"
+        f" run {advise_intermediate_steps(name)}."
+        for name in excitation.relay_inputs
+    ]
     for direction in excitation.directions:
         if not direction.is_excited:
             first, second = direction.inputs

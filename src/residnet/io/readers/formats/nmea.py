@@ -43,6 +43,14 @@ _TIME_PREFIX = re.compile(
 )
 _UNIT_FACTORS = {"rate_of_turn": 1.0 / 60.0}
 """Factors to the unit of a channel by field: NMEA 0183 has the rate of turn in deg/min."""
+_DIRECTION_LETTERS = {
+    "deviation": "dev_dir",
+    "variation": "var_dir",
+    "mag_variation": "mag_var_dir",
+}
+"""Angles of a compass that are negative to the west -> field with the letter E or W."""
+_COMPASS_SENTENCES = ("HDG", "HDM")
+"""Sentences with a magnetic heading."""
 _DAY_NS = 86_400 * 10**9
 _HEAD_BYTES = 1024
 """Number of bytes from which the encoding is detected (a dozen sentences)."""
@@ -60,7 +68,8 @@ class NmeaConfig(RecordingConfig):
 
     A series has the name of its sentence (`RMC`, `HDT`). Fields have the names of pynmea2;
     `latitude` and `longitude` are signed degrees, `rate_of_turn` is in deg/s (deg/min in the
-    sentence).
+    sentence), variations and deviations are positive to the east. HDG and HDM have the additional
+    field `heading_true`.
     """
 
     kind: Literal["nmea"] = "nmea"
@@ -137,6 +146,7 @@ class _SentenceCollector:
         self._ticks = array("q")
         self._day_ns: int | None = None
         self._has_date = False
+        self._variation = np.nan
 
     def add_sentence(self, message: Any, prefix: str, field_filter: FieldFilter) -> None:
         """Append a sentence.
@@ -157,6 +167,14 @@ class _SentenceCollector:
             except ValueError:
                 if not cell:
                     values[name] = float("nan")
+        for angle, letter_field in _DIRECTION_LETTERS.items():
+            if angle in values and getattr(message, letter_field, "") == "W":
+                values[angle] = -values[angle]
+        name = str(message.sentence_type)
+        variation = values.get("mag_variation", values.get("variation", np.nan))
+        self._variation = variation if np.isfinite(variation) else self._variation
+        if name in _COMPASS_SENTENCES:
+            values["variation"] = self._variation
         # positions in signed degrees, NaN without a fix
         if {"lat", "lon"} <= set(names):
             has_fix = bool(message.lat and message.lon) and getattr(message, "status", "A") != "V"
@@ -165,7 +183,6 @@ class _SentenceCollector:
                 (message.latitude, message.longitude) if has_fix else (float("nan"), float("nan"))
             )
             values["latitude"], values["longitude"] = position
-        name = str(message.sentence_type)
         if not field_filter(name) or not values:
             return
         buffer = self.buffers.setdefault(name, _SentenceBuffer(values))
@@ -251,11 +268,46 @@ class _SentenceCollector:
                 else None
             )
             fields = buffer.buffer.fields
+            if name in _COMPASS_SENTENCES:
+                fields, compass_remark = _add_true_heading(name, fields)
+                time_remarks = (*time_remarks, compass_remark)
             sender = _engine_numbers(fields)
             topics[name] = RawSeries(
                 f"nmea/{name}", fields, stamp, arrivals.get(name), sender, time_remarks
             )
         return build_recording(path, topics, (path,), remarks)
+
+
+def _add_true_heading(
+    name: str, fields: dict[str, np.ndarray]
+) -> tuple[dict[str, np.ndarray], Remark]:
+    """Add the field `heading_true` to sentences of a magnetic compass.
+
+    The heading is increased by the deviation and the variation (NMEA 0183, sentence HDG).
+
+    Args:
+        name: type of the sentences.
+        fields: their fields; those of HDM have the variation of the last HDG or RMC sentence.
+
+    Returns:
+        The fields, and a remark on the variation.
+    """
+    heading = fields["heading"] + np.nan_to_num(fields.get("deviation", np.zeros(1)))
+    variation = fields["variation"]
+    if not np.isfinite(variation).any():
+        text = (
+            f"topic {name}: heading is magnetic, and no sentence has the variation; it is used as"
+            " it is, so set `offset` of the heading to the declination"
+        )
+        remark = make_remark("will mislead", "magnetic_heading", text)
+        return {**fields, "heading_true": heading}, remark
+    mean = float(np.nanmean(variation))
+    text = (
+        f"topic {name}: heading is magnetic; its deviation and the variation, {mean:.1f} deg, are"
+        " added"
+    )
+    remark = make_remark("note", "magnetic_heading", text, variation=np.radians(mean))
+    return {**fields, "heading_true": heading + np.nan_to_num(variation, nan=mean)}, remark
 
 
 def _engine_numbers(fields: dict[str, np.ndarray]) -> np.ndarray | None:
