@@ -324,6 +324,19 @@ def test_short_logs_give_each_axis_the_terms_that_a_symmetric_vessel_has() -> No
     assert derived_training(short(paired), "hull_network", facts).mirror
 
 
+def test_least_squares_of_relays_has_a_small_weight(known: Samples, logs: PreparedSplits) -> None:
+    switched = known.z.clone()
+    left = known.names.index("left")
+    switched[:, left] = torch.where(torch.arange(len(known)) // 10 % 2 == 0, 1.0, -1.0)
+    priors = []
+    for z in (known.z, switched):
+        summary = TrainingDataSummary.from_logs(
+            replace(known, z=z), logs["train"], settings().evaluation, 0.2
+        )
+        priors.append((summary.relay_inputs, make_portfolio(summary)["refit"]["hull"]["prior"]))
+    assert priors == [((), 1.0), (("left",), 1e-2)]
+
+
 def test_a_mirror_symmetric_model_has_no_asymmetry(known: Samples) -> None:
     baseline = RegressorsConfig(terms=("1", "u", "r", "left", "right")).build(known.names)
     theta = torch.tensor(
