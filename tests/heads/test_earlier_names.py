@@ -9,6 +9,13 @@ from residnet.core.config import validate_config
 from residnet.heads import HeadConfig
 from residnet.testing import make_example_samples
 
+# networks had no skip connection
+CONFIGS: dict[str, dict[str, object]] = {
+    "mlp": {"kind": "mlp", "skip": "none"},
+    "lstm": {"kind": "lstm", "skip": "none"},
+    "recurrent": {"kind": "recurrent"},
+    "mirrored": {"kind": "mlp", "mirror": True, "skip": "none"},
+}
 EARLIER = {
     "mlp": {"network.0.weight": "net.0.weight", "scale.std": "scale.spread"},
     "lstm": {"networks.0.cell.input_weight": "networks.0.core.w_input"},
@@ -19,9 +26,8 @@ EARLIER = {
 
 @pytest.mark.parametrize("case", EARLIER)
 def test_load_state_dict_accepts_earlier_names(case: str) -> None:
-    config = {"kind": "mlp", "mirror": True} if case == "mirrored" else {"kind": case}
     names = make_example_samples().names
-    head = validate_config(config, HeadConfig, "here").build(names)
+    head = validate_config(CONFIGS[case], HeadConfig, "here").build(names)
     state = {name: torch.randn_like(value) for name, value in head.state_dict().items()}
     earlier = {EARLIER[case].get(name, name): value for name, value in state.items()}
     assert earlier.keys() != state.keys()
