@@ -22,6 +22,7 @@ import residnet
 from residnet.core.config import validate_config
 from residnet.core.errors import DataError
 from residnet.core.log import Log
+from residnet.io.drafting.column_names import match_channels
 from residnet.io.drafting.questions import DraftNotes, Question
 from residnet.io.drafting.tables import draft_tables
 from residnet.io.header_vocabulary import (
@@ -33,6 +34,7 @@ from residnet.io.header_vocabulary import (
     parse_name,
 )
 from residnet.io.readers import ReaderConfig
+from residnet.io.readers.quantities import FieldMap
 from residnet.tasks.inspection import inspect_logs
 
 GERMAN = Style(
@@ -182,6 +184,7 @@ def test_match_depth_channel_of_names(name: str, channel: str) -> None:
         ("ROT_degmin", "rad/s", "deg/min"),
         ("speed (kn)", "m/s", "kn"),
         ("heading deg", "rad", "deg"),
+        ("gz_mdps", "rad/s", "mdeg/s"),
         ("Winkel [Grad]", "rad", "deg"),
         ("n [U/min]", "1/s", "1/min"),
         ("course", "rad", None),
@@ -190,6 +193,28 @@ def test_match_depth_channel_of_names(name: str, channel: str) -> None:
 )
 def test_parse_header_unit_of_names(column: str, expected: str, unit: str | None) -> None:
     assert parse_header_unit(column, expected) == unit
+
+
+def test_letters_of_sides_need_their_pair(tmp_path: Path) -> None:
+    names = ["Azimuth P [deg]", "Azimuth S [deg]", "Pitch P [%]", "Pitch S [%]", "Engine P [%]"]
+    channels = match_channels([*names, "p [deg/s]", "s [m]"], DraftNotes())
+    assert channels.pop("p") == "p [deg/s]"
+    suffixes = ("port", "stbd")
+    expected = [f"{name}_{side}" for name in ("azimuth", "throttle") for side in suffixes]
+    assert [channels.pop(name) for name in expected] == names[:4]
+    assert [*channels] == ["throttle"]
+
+
+def test_an_azimuth_is_unwrapped() -> None:
+    true_angle = np.radians(np.linspace(-30.0, 20.0, 40))
+    recorded = np.degrees(true_angle) % 360.0
+    recorded[7] = np.nan
+    converted = FieldMap(field="a", unit="deg").convert("azimuth_port", recorded)
+    assert np.isnan(converted[7])
+    np.testing.assert_allclose(np.delete(converted, 7), np.delete(true_angle, 7), atol=1e-12)
+    # a range without its end stays as it is
+    steady = FieldMap(field="a", unit="deg").convert("azimuth_port", recorded[:20])
+    assert float(np.nanmin(steady)) > np.pi
 
 
 def test_a_nozzle_in_per_cent_is_no_angle_in_degrees() -> None:

@@ -28,6 +28,8 @@ from residnet.io.readers.quantities import COSINE_SUFFIX, SINE_SUFFIX
 _DRIVE_PATTERN = re.compile(r"^(?:cmd_)?(?:n(?=_|$)|thrust)")
 _PULSE_RANGE = (900.0, 2100.0)
 """Range of the pulses of servos and speed controllers in us."""
+_PORT_LETTER = re.compile(r"(?<![^\W_])P(?![^\W_])")
+"""Letter of the port side as a word of a name."""
 _SPEED_SYMBOL = re.compile(r"[uv]( ?(s|m|c|0|ship|model|tot|total|abs|res|cg|ms))?")
 """Normalised name of a speed next to a drift angle: a symbol, perhaps with an index."""
 
@@ -71,8 +73,9 @@ def match_channels(
             return {**north_east, **other_channels}
     drift_angle = next((column for column in columns if is_drift_angle(column)), None)
     earth_velocities = find_earth_velocities(columns)
+    side_names = _name_sides(columns)
     parsed_names = {
-        column: parse_name(column)
+        column: parse_name(side_names.get(column, column))
         for column in columns
         if column not in (drift_angle, *(earth_velocities or ()))
     }
@@ -110,6 +113,23 @@ def match_channels(
         *(name for name in names if name not in MOTION_AND_WIND_CHANNELS),
     ]
     return {name: names[name] for name in ordered_channels if name in names}
+
+
+def _name_sides(columns: Sequence[str]) -> dict[str, str]:
+    """Return actuators with the letters P and S of their sides -> their names with these words.
+
+    A letter is a side only if another name differs in it alone.
+    """
+    side_names = {}
+    for column in columns:
+        channel = _match_name(column, parse_name(column))
+        if channel is None or channel in MOTION_AND_WIND_CHANNELS:
+            continue
+        opposite = _PORT_LETTER.sub("S", column)
+        if opposite != column and opposite in columns:
+            side_names[column] = _PORT_LETTER.sub("port", column)
+            side_names[opposite] = _PORT_LETTER.sub("starboard", column)
+    return side_names
 
 
 def _pair_speed_with_drift_angle(
@@ -236,7 +256,7 @@ def _match_name(column: str, parsed: ParsedName) -> str | None:
     channel = match_state_channel(parsed) or match_input_channel(parsed)
     if channel is None and parsed.has_all("pitch") and parse_header_unit(column, "-") == "%":
         # a pitch in per cent is that of a propeller's blades
-        channel = match_input_channel(parse_name(f"propeller {column}"))
+        channel = match_input_channel(parse_name(f"propeller {parsed.text}"))
     return channel
 
 

@@ -163,7 +163,7 @@ class Conversion(Config):
         """Convert values to residnet's unit, sign and frame.
 
         Args:
-            name: name of the channel; `psi` is also unwrapped.
+            name: name of the channel; `psi` and azimuths of thrusters are also unwrapped.
             raw_values: values [T] of the source.
 
         Returns:
@@ -176,7 +176,25 @@ class Conversion(Config):
         )
         gain = frame_factor * self.sign * to_si(self.unit, CHANNEL_UNITS.get(name)) * self.scale
         values = gain * (raw_values - self.offset) + frame_offset
+        if name.removeprefix("cmd_").startswith("azimuth"):
+            return unwrap_azimuth(values)
         return mask_interpolated_headings(values) if name == "psi" else values
+
+
+def unwrap_azimuth(azimuth: np.ndarray) -> np.ndarray:
+    """Unwrap the azimuth of a thruster [T] in rad if it crosses the end of its range.
+
+    Resampling would interpolate from 359 to 1 deg over 180 deg. The median is in [-pi, pi].
+    """
+    is_finite = np.isfinite(azimuth)
+    measured = azimuth[is_finite]
+    if not (np.abs(np.diff(measured)) > np.pi).any():
+        return azimuth
+    unwrapped = azimuth.copy()
+    continuous = np.unwrap(measured)
+    turns = np.round(np.median(continuous) / (2.0 * np.pi))
+    unwrapped[is_finite] = continuous - 2.0 * np.pi * turns
+    return unwrapped
 
 
 _STEP_TOLERANCE = 0.2
