@@ -35,6 +35,7 @@ from residnet.quality import (
 )
 from residnet.quality.actuators import estimate_delay
 from residnet.quality.findings import run_checks
+from residnet.quality.frames import is_course_over_ground
 from residnet.quality.kinematics import estimate_position_causes
 from residnet.quality.records import InspectionFile
 from residnet.quality.statistics import LogStatistics
@@ -255,6 +256,31 @@ def test_estimate_position_causes_separates_clocks(boat: str, delays: tuple[floa
         estimates.append((surge_delay, sizes.get("lag_psi", 0.0) - common))
         assert not any(name.startswith("gain") for name in causes)
     assert np.array(estimates) == pytest.approx(np.tile(delays, (4, 1)), abs=0.03, rel=0.05)
+
+
+# the drift of the tanker is too small against the noise of its sway velocity
+@pytest.mark.parametrize("boat", ["catamaran", "tanker"])
+def test_a_course_is_told_from_a_delayed_heading(boat: str) -> None:
+    t = np.arange(3.0, 150.0, 0.2)
+    for seed in range(3):
+        random = np.random.default_rng(seed)
+        motion = simulate_motion(BOATS[boat], random, duration=156.0)
+        channels = {name: motion.sample(name, t) for name in ("x", "y", "u", "v", "r")}
+        course = motion.sample("psi", t) + np.arctan2(channels["v"], channels["u"])
+        channels |= {
+            name: channels[name] + std * random.standard_normal(t.size)
+            for name, std in {"x": 0.05, "y": 0.05, "u": 0.02, "v": 0.02, "r": 0.003}.items()
+        }
+        angles = [course, *(motion.sample("psi", t - delay) for delay in (0.0, 0.5, 1.0, -0.7))]
+        logs = [Log(boat, t, {**channels, "psi": angle}) for angle in angles]
+        is_course = [is_course_over_ground(LogStatistics(log)) for log in logs]
+        assert is_course == [boat == "catamaran"] + 4 * [False]
+        if not is_course[0]:
+            continue
+        # one cause instead of a wrong sway velocity and delays
+        found = {f.code for f in inspect_log(logs[0]).findings if f.level == "will mislead"}
+        assert "course" in found
+        assert not any(code.startswith(("gain", "lag")) for code in found)
 
 
 @pytest.mark.parametrize(

@@ -374,7 +374,7 @@ def course(log: Log) -> np.ndarray:
     return np.asarray(log["psi"] + np.arctan2(log["v"], np.maximum(log["u"], 1e-3)))
 
 
-_COURSE = ("gain_v", "frames")
+_COURSE = ("course", "gain_v", "frames")
 fault("course as heading", *_COURSE, ships=())(lambda s, log, g: changed(log, psi=course(log)))
 fault("course swapped", *_COURSE, ships=())(
     lambda s, log, g: changed(log, psi=course(log), course=log["psi"])

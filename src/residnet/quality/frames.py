@@ -350,11 +350,71 @@ def _report_jumps(
         )
 
 
+_COURSE_STEP = 2.0
+"""Time in s over which the increments of psi, r and the drift are compared."""
+_MAX_COURSE_DELAY = 3.0
+"""Largest delay in s of a heading that is compared with a course."""
+_N_COURSE_DELAYS = 61
+"""Number of delays that are compared."""
+_MIN_COURSE_MARGIN = 20.0
+"""Smallest difference of the BIC by which psi is the course and not a delayed heading."""
+_MAX_COURSE_SHARE = 0.25
+"""Largest share of the squared increments of psi beyond r that the drift leaves unexplained."""
+
+
+def is_course_over_ground(log: LogStatistics) -> bool:
+    """Return whether psi is the course over ground, the heading plus the drift atan2(v, u).
+
+    The increments of psi are those of the drift and the integral of r if psi is a course, and those
+    of the integral at another time if the heading has another clock. Drift and yaw rate of a vessel
+    are nearly proportional, hence both hypotheses are compared by their BIC.
+    """
+    if not {"psi", "u", "v", "r"} <= {*log}:
+        return False
+    rates = interpolate_gaps(log.t, log["r"])
+    turned = np.append(0.0, np.cumsum(0.5 * np.diff(log.t) * (rates[1:] + rates[:-1])))
+    drift = np.unwrap(np.arctan2(log.smoothed("v"), log.smoothed("u")))
+    is_inside = (log.t - log.t[0] > _MAX_COURSE_DELAY) & (log.t[-1] - log.t > _MAX_COURSE_DELAY)
+    samples = np.flatnonzero(is_inside)[:: max(round(_COURSE_STEP / log.sampling_interval), 1)]
+
+    def residual_square(expected: np.ndarray) -> float:
+        increments = np.diff((log["psi"] - expected)[samples])
+        return float(np.nanvar(increments)) if np.isfinite(increments).any() else math.inf
+
+    if np.isfinite(np.diff(log["psi"][samples])).sum() < MIN_SAMPLES:
+        return False
+    course_square = residual_square(turned + drift)
+    delays = np.linspace(-_MAX_COURSE_DELAY, _MAX_COURSE_DELAY, _N_COURSE_DELAYS)
+    delay_square = min(
+        residual_square(np.interp(log.t - delay, log.t, turned)) for delay in delays.tolist()
+    )
+    margin = samples.size * math.log(max(delay_square, 1e-300) / max(course_square, 1e-300))
+    return margin > _MIN_COURSE_MARGIN and course_square < _MAX_COURSE_SHARE * residual_square(
+        turned
+    )
+
+
+@check(
+    "grid",
+    "course",
+    fix="take psi from the compass, or subtract the drift atan2(v, u) from it",
+    required_channels=(*_PLANAR_MOTION, "r"),
+    on_subsample=True,
+)
+def check_course(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report a course over ground in place of the heading."""
+    if log.cached(is_course_over_ground):
+        text = "psi is the course over ground: beyond r it turns with the drift angle of u, v"
+        yield make_finding(text, {})
+
+
 @check("grid", "position_causes", required_channels=_PLANAR_MOTION, on_subsample=True)
 def check_position_causes(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report the causes of differences between position and velocities in correct frames."""
     frame_agreement = log.cached(compare_frames)
     if frame_agreement is None or not frame_agreement.is_consistent:
+        return
+    if log.cached(is_course_over_ground):
         return
     causes = log.cached(estimate_position_causes)
     if "gain_v" in causes and causes["gain_v"].is_gross and (text := describe_unrelated_sway(log)):
@@ -520,6 +580,8 @@ def check_yaw_drift(log: LogStatistics, make_finding: Check) -> Iterator[Finding
 @check("grid", "yaw_causes", required_channels=_YAW_MOTION, on_subsample=True)
 def check_yaw_causes(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report sign, gain and lag of r against psi."""
+    if log.cached(is_course_over_ground):
+        return
     yield from make_cause_findings(log.cached(estimate_yaw_causes), YAW_LIMITS, log, make_finding)
 
 
