@@ -129,7 +129,8 @@ def make_cause_findings(
             limit.min_time_steps * log.sampling_interval,
             limit.min_speed_share * log.rms_speed,
         )
-        if magnitude < 0.3 * min_size:
+        # a lag below one sample is a convention of the recorder
+        if magnitude < max(0.3 * min_size, limit.min_time_steps * log.sampling_interval):
             continue
         is_leading = "trail" in limit.text and cause.estimates[0] < 0.0
         text = limit.text.replace("trail", "lead") if is_leading else limit.text

@@ -16,6 +16,7 @@ filter. Terms of second and third order are selected beside a lag as nuisances.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -73,6 +74,9 @@ _MIN_DELAY_SHARE = 0.5
 """Difference of pose and velocities over the effect of a delay below which this is not searched."""
 _MAX_ROUNDING_SHARE = 1e-3
 """Unexplained share of the squared differences below which no delay is searched."""
+_MAX_RECTANGLE_SHARE = 0.1
+"""Largest squared difference from the rectangle rule over that from the trapezoidal rule at which a
+pose is that of a simulation by Euler's method."""
 _MIN_COMMON_SHARE = 0.7
 """Smallest number of increments of a hypothesis over the largest one."""
 _MIN_SQUARED_SCALE = 0.01
@@ -140,6 +144,7 @@ class _IncrementModel:
         pose_noise: standard deviation of the noise of the pose.
         rate_noise: standard deviation of the noise of the velocity [T - 1].
         columns: effect of each cause of unit size on the increments, arrays [T - 1].
+        rate_factors: measured channels [T] whose product is the rate of the pose.
     """
 
     measured_pose: np.ndarray
@@ -148,6 +153,31 @@ class _IncrementModel:
     pose_noise: float
     rate_noise: np.ndarray
     columns: dict[str, list[np.ndarray]]
+    rate_factors: tuple[np.ndarray, ...]
+
+    def integrate_by_rectangles(self) -> _IncrementModel | None:
+        """Return the model with the rectangle rule of a simulation; None if this fits no better.
+
+        A simulation by Euler's method adds rates at the start of each step, or rates of which some
+        are already those of its end. The trapezoidal integral differs from this by half a step,
+        which is no delay of a clock.
+        """
+        increments = np.diff(self.measured_pose)
+        integrals = [
+            self.dt
+            * math.prod(factor[end] for factor, end in zip(self.rate_factors, ends, strict=True))
+            for ends in itertools.product(
+                (slice(None, -1), slice(1, None)), repeat=len(self.rate_factors)
+            )
+        ]
+        squares = [
+            np.nanmean(np.abs(increments - integral) ** 2)
+            for integral in (self.integrated_increments, *integrals)
+        ]
+        best = int(np.argmin(squares[1:]))
+        if squares[1 + best] >= _MAX_RECTANGLE_SHARE * squares[0]:
+            return None
+        return replace(self, integrated_increments=integrals[best])
 
     def compute_misfit(self) -> float:
         """Return the mean squared residual of the increments, with all causes of the model.
@@ -290,6 +320,7 @@ def _model_heading(log: LogStatistics, channels: Channels, block: int = 1) -> _I
         log.noise_std("psi"),
         rate_noise,
         columns,
+        (channels["r"],),
     )
 
 
@@ -351,14 +382,15 @@ def _model_positions(log: LogStatistics, channels: Channels, block: int = 1) -> 
     speed = np.hypot(np.nan_to_num(channels["u"]), np.nan_to_num(channels["v"]))[block_ends]
     heading_noise_velocity = log.noise_std("psi") * 0.5 * (speed[1:] + speed[:-1])
     rate_noise = np.hypot(max(log.noise_std("u"), log.noise_std("v")), heading_noise_velocity)
-    velocity = heading_rotation * (channels["u"] + 1j * channels["v"])
+    velocity = channels["u"] + 1j * channels["v"]
     return _IncrementModel(
         log["x"][block_ends] + 1j * log["y"][block_ends],
-        _integrate_blocks(log.t, velocity, block),
+        _integrate_blocks(log.t, heading_rotation * velocity, block),
         dt,
         max(log.noise_std("x"), log.noise_std("y")),
         rate_noise,
         columns,
+        (heading_rotation, velocity),
     )
 
 
@@ -433,7 +465,11 @@ def _compare_clocks(
         clocks: lag -> channels with its clock.
     """
     channels = _select_channels(log, *names)
-    regression = _explain_increments(make_model(log, channels))
+    model = make_model(log, channels)
+    rectangle_model = model.integrate_by_rectangles()
+    if rectangle_model is not None:
+        return _explain_increments(rectangle_model).causes
+    regression = _explain_increments(model)
     # a delay is not mistaken for a scale of surge, a constant angle or a constant velocity
     is_unlike = all(name in _CAUSES_UNLIKE_DELAYS for name in regression.causes)
     residual_square = float(np.nan_to_num(regression.squares).mean()) if regression.causes else 0.0
