@@ -111,7 +111,7 @@ def print_rollouts(repeats: int) -> None:
     """Print the share of the matrix products in a rollout."""
     x0, w = torch.zeros(_BATCH, 6), torch.randn(_BATCH, _STEPS, 2)
     for hidden in (100, 24):
-        model = make_model(LstmConfig(hidden_size=hidden, readout=0))
+        model = make_model(LstmConfig(hidden_size=hidden, readout=0, skip="none"))
         sizes = ((_BATCH, 5), (_BATCH, hidden), (5, 4 * hidden), (hidden, 4 * hidden), (hidden, 3))
         factors = [torch.randn(size) for size in sizes]
         with torch.no_grad():
@@ -145,7 +145,7 @@ def print_by_rows(
 ) -> None:
     """Print times of free runs and gradients by number of rows, each on its device."""
     for hidden in (24, 100):
-        model = make_model(LstmConfig(hidden_size=hidden, readout=0))
+        model = make_model(LstmConfig(hidden_size=hidden, readout=0, skip="none"))
         for count in rows:
             texts = []
             for name, device in device_of_way.items():
@@ -220,7 +220,7 @@ def print_epochs(repeats: int) -> None:
         return torch.stack(outputs, dim=1)
 
     for hidden in (24, 100):
-        head = LstmConfig(hidden_size=hidden).build(NAMES).to(torch.float32).train()
+        head = LstmConfig(hidden_size=hidden, skip="none").build(NAMES).to(torch.float32).train()
         optimiser = torch.optim.AdamW(head.parameters())
         cell = nn.LSTMCell(5, hidden)
         readout = nn.Linear(hidden, 3)
