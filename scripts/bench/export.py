@@ -34,7 +34,10 @@ from residnet.export.torchscript import AotiModel
 from residnet.export.vessel import ExportedVessel
 
 HERE = Path(__file__).parent
-SIZES = {"mlp": {"hidden": (64, 64)}, "lstm": {"hidden_size": 64}}
+SIZES = {
+    "mlp": {"hidden": (64, 64), "skip": "none"},
+    "lstm": {"hidden_size": 64, "skip": "none"},
+}
 
 
 def time_step(step: Callable[[], Any], count: int = 200) -> tuple[float, float]:

@@ -42,7 +42,10 @@ _STEPS = {"steps": 100, "one_step": {"epochs": 1, "window": "2 s"}, "multi_step"
 HEADS: dict[str, dict[str, Any]] = {
     "plsr": {"heads": {"plsr": {"kind": "plsr", "choose": "one_step"}}},
     "ridge": {"heads": {"ridge": {"kind": "ridge", "choose": "one_step"}}},
-    "mlp": {"heads": {"mlp": {"kind": "mlp", "hidden": [32, 32]}}, "training": {"mlp": _STEPS}},
+    "mlp": {
+        "heads": {"mlp": {"kind": "mlp", "hidden": [32, 32], "skip": "none"}},
+        "training": {"mlp": _STEPS},
+    },
 }
 _IN_MEMORY = """
 import runpy, torch
