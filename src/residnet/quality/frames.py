@@ -371,18 +371,18 @@ def is_course_over_ground(log: LogStatistics) -> bool:
     """
     if not {"psi", "u", "v", "r"} <= {*log}:
         return False
+    is_inside = (log.t - log.t[0] > _MAX_COURSE_DELAY) & (log.t[-1] - log.t > _MAX_COURSE_DELAY)
+    samples = np.flatnonzero(is_inside)[:: max(round(_COURSE_STEP / log.sampling_interval), 1)]
+    if np.isfinite(np.diff(log["psi"][samples])).sum() < MIN_SAMPLES:
+        return False
     rates = interpolate_gaps(log.t, log["r"])
     turned = np.append(0.0, np.cumsum(0.5 * np.diff(log.t) * (rates[1:] + rates[:-1])))
     drift = np.unwrap(np.arctan2(log.smoothed("v"), log.smoothed("u")))
-    is_inside = (log.t - log.t[0] > _MAX_COURSE_DELAY) & (log.t[-1] - log.t > _MAX_COURSE_DELAY)
-    samples = np.flatnonzero(is_inside)[:: max(round(_COURSE_STEP / log.sampling_interval), 1)]
 
     def residual_square(expected: np.ndarray) -> float:
         increments = np.diff((log["psi"] - expected)[samples])
         return float(np.nanvar(increments)) if np.isfinite(increments).any() else math.inf
 
-    if np.isfinite(np.diff(log["psi"][samples])).sum() < MIN_SAMPLES:
-        return False
     course_square = residual_square(turned + drift)
     delays = np.linspace(-_MAX_COURSE_DELAY, _MAX_COURSE_DELAY, _N_COURSE_DELAYS)
     delay_square = min(
