@@ -23,7 +23,6 @@ from residnet.core.stretches import find_runs
 from residnet.io.split import hash_rows, row_sampling_interval
 from residnet.preprocessing.channel_values import estimate_noise_std, nan_median, nan_std
 from residnet.preprocessing.statistics import MIN_SAMPLES
-from residnet.quality.clock import MIN_UNIX_TIME
 from residnet.quality.consensus import (
     Consensus,
     find_consensus,
@@ -51,6 +50,8 @@ from residnet.regression.pair_symmetry import assess_pair_symmetry
 
 # smallest number of consecutive equal rows that is no coincidence
 _MIN_COPIED_ROWS = 20
+_MIN_UNIX_TIME = 1e8
+"""Time from which stamps are seconds since 1970."""
 
 
 class LogSet:
@@ -316,11 +317,11 @@ def check_continued_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]
 def check_overlapping_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     """Report logs that overlap in time."""
     start_times, end_times = np.array([(log.t[0], log.t[-1]) for log in logs.logs]).T
-    for i, a in enumerate(logs.logs if float(end_times.max()) > MIN_UNIX_TIME else ()):
+    for i, a in enumerate(logs.logs if float(end_times.max()) > _MIN_UNIX_TIME else ()):
         overlap_durations = np.minimum(a.t[-1], end_times[i + 1 :]) - np.maximum(
             a.t[0], start_times[i + 1 :]
         )
-        is_dated = np.minimum(a.t[0], start_times[i + 1 :]) > MIN_UNIX_TIME
+        is_dated = np.minimum(a.t[0], start_times[i + 1 :]) > _MIN_UNIX_TIME
         for j in np.flatnonzero(is_dated & (overlap_durations > 0.0)).tolist():
             b = logs.logs[i + 1 + j]
             overlap_duration = float(overlap_durations[j])

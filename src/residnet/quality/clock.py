@@ -24,9 +24,6 @@ if TYPE_CHECKING:
 _MAX_JITTER_SHARE = 0.05
 # longest time step across which the grid interpolates, in sampling intervals, with rounding
 _MAX_BRIDGED_STEPS = 3.0 * (1.0 + 1e-6)
-# time stamps from this value on are seconds since 1970
-MIN_UNIX_TIME = 1e8
-
 
 _CLOCK_RESTART_FIX = "sort the rows, or split the log where its clock restarts"
 
@@ -90,21 +87,6 @@ def check_sampling_rate(log: LogStatistics, make_finding: Check) -> Iterator[Fin
     )
 
 
-@check("clock", "dropped_samples", "note", "the grid interpolates across them")
-def check_dropped_samples(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report single missing samples, which the grid interpolates."""
-    dt = np.diff(log.t)
-    short_gaps = dt[
-        (dt > 1.5 * log.sampling_interval) & (dt <= _MAX_BRIDGED_STEPS * log.sampling_interval)
-    ]
-    if short_gaps.size:
-        text = (
-            f"{short_gaps.size} single samples or pairs are missing (steps up to"
-            f" {short_gaps.max():.3g} s)"
-        )
-        yield make_finding(text, {"count": short_gaps.size, "longest": short_gaps.max()})
-
-
 _MAX_HARMLESS_GAP = 0.1
 """Step in s over which velocities of a vessel hardly change, at any rate of the recorder."""
 
@@ -134,21 +116,6 @@ def check_gaps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
         "t": log.t[longest_index],
     }
     yield make_finding(text, figures, level=level, fix=fix, sample_mask=is_gap)
-
-
-@check(
-    "clock",
-    "clock_start",
-    "note",
-    "times count from the start of the log's clock; no action is needed",
-)
-def check_clock_start(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report a clock that does not start at 0."""
-    if abs(log.t[0]) > log.sampling_interval:
-        clock_text = "Unix time" if log.t[0] > MIN_UNIX_TIME else "not at 0"
-        yield make_finding(
-            f"time starts at {log.t[0]:.10g} s ({clock_text})", {"start": float(log.t[0])}
-        )
 
 
 _DATE_COLUMN_PATTERN = re.compile(r"date|time|stamp|utc|gps|clock|epoch", re.IGNORECASE)

@@ -62,21 +62,12 @@ def report_missing_motion(log: LogStatistics, make_finding: Check) -> Iterator[F
         except ResidnetError as error:
             yield make_finding(f"it cannot be fitted: {error}", level="will mislead")
         else:
-            derivation_text = "follow from position and heading by a smoother"
-            derivation_text = (
-                "are integrated from the velocities"
-                if "integrated" in completed.meta
-                else derivation_text
-            )
-            if not dof.fixed_states:
-                is_single = len(missing_names) == 1
-                if is_single:
-                    derivation_text = derivation_text.replace("follow", "follows", 1)
-                    derivation_text = derivation_text.replace("are int", "is int", 1)
-                pronoun = "it" if is_single else "they"
-                yield make_finding(f"no {', '.join(missing_names)}: {pronoun} {derivation_text}")
-            else:
-                yield make_finding(f"no {', '.join(missing_names)}: {dof.description}")
+            derivation = "they follow from position and heading by a smoother"
+            if "integrated" in completed.meta:
+                derivation = "they are integrated from the velocities"
+            if dof.fixed_states:
+                derivation = dof.description
+            yield make_finding(f"no {', '.join(missing_names)}: {derivation}")
     if "p" in log and not dof.has_roll:
         text = "p of the roll is measured and not modelled: a model that rolls needs an angle phi"
         yield make_finding(f"{text} that varies", code="roll")
