@@ -120,6 +120,41 @@ def test_velocities_of_another_run_stop_the_draft(tmp_path: Path) -> None:
         read_drafted([path], DraftNotes())
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_receiver_at_the_bow_changes_no_unit_or_sign_of_sway(tmp_path: Path, sign: float) -> None:
+    paths = []
+    for seed in (1, 2):
+        motion = true_motion(seed)
+        table = {name: motion.sample(name, TIMES) for name in ("x", "y", "psi", "u", "v", "r")}
+        # the sway velocity of the receiver is opposite to that of the vessel's centre
+        table["x"] += 12.0 * np.cos(table["psi"])
+        table["y"] += 12.0 * np.sin(table["psi"])
+        table["v"] *= sign
+        headers = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
+        columns = {f"{name} [{unit}]": table[name] for name, unit in headers.items()}
+        paths.append(tmp_path / f"run{seed}.csv")
+        pd.DataFrame({"t [s]": TIMES, **columns}).to_csv(paths[-1], index=False)
+        receiver_sway = motion.sample("v", TIMES) + 12.0 * table["r"]
+        assert np.corrcoef(receiver_sway, motion.sample("v", TIMES))[0, 1] < -0.5
+    entry = read_drafted(paths, DraftNotes()).reader["channels"]["v"]
+    expected = {"column": "v [m/s]", "unit": "m/s"} | ({"sign": -1} if sign < 0.0 else {})
+    assert entry == expected
+
+
+def test_positions_named_enu_are_east_and_north(tmp_path: Path) -> None:
+    motion = true_motion(1)
+    table = {"t": TIMES, "pos_enu/x": motion.sample("y", TIMES)}
+    table |= {
+        "pos_enu/y": motion.sample("x", TIMES),
+        "yaw": 0.5 * np.pi - motion.sample("psi", TIMES),
+    }
+    path = tmp_path / "run.csv"
+    pd.DataFrame(table).to_csv(path, index=False)
+    channels = draft_tables([path], DraftNotes())[0]["channels"]
+    assert channels["x"]["column"] == "pos_enu/y"
+    assert channels["psi"] == {"column": "yaw", "unit": "rad", "frame": "enu"}
+
+
 def test_a_reset_of_the_position_is_no_contradiction(tmp_path: Path) -> None:
     motion = true_motion(1)
     velocities = compute_velocities(motion)

@@ -205,6 +205,12 @@ def test_letters_of_sides_need_their_pair(tmp_path: Path) -> None:
     assert [*channels] == ["throttle"]
 
 
+def test_a_speed_through_water_is_the_surge_velocity() -> None:
+    names = ["Heading [deg]", "SOG [kn]", "COG [deg]", "STW [kn]", "Rudder [deg]"]
+    assert match_channels(names, DraftNotes())["u"] == "STW [kn]"
+    assert match_channels(names[:3], DraftNotes())["u"] == "SOG [kn]"
+
+
 def test_an_azimuth_is_unwrapped() -> None:
     true_angle = np.radians(np.linspace(-30.0, 20.0, 40))
     recorded = np.degrees(true_angle) % 360.0

@@ -28,6 +28,7 @@ _ROS_POSE_PATTERNS = {
     **{"qw": r"orientation\W*w", "psi": r"orientation\W*yaw"},
 }
 """Ends of column names of geometry_msgs/Pose, and of its yaw in PlotJuggler."""
+_ENU_PATTERN = re.compile(r"(?:^|[\W_])enu(?:$|[\W_])", re.IGNORECASE)
 _NED_PATTERN = re.compile(r"(?:^|[\W_])(?:ned|frd)(?:$|[\W_])", re.IGNORECASE)
 
 
@@ -36,7 +37,8 @@ def _choose_candidate_frames(
 ) -> tuple[PoseFrame, ...]:
     """Return possible frames of position and heading from their names, the most probable first.
 
-    A ROS pose has a heading from east (REP 103), unless a text contains NED.
+    A ROS pose has a heading from east (REP 103), unless a text contains NED. The axes of positions
+    with ENU in their names are those of a ROS pose.
 
     Args:
         names: channel -> column.
@@ -47,6 +49,7 @@ def _choose_candidate_frames(
         for name, pattern in _ROS_POSE_PATTERNS.items()
         if name in names
     )
+    is_ros_pose |= any(_ENU_PATTERN.search(names[name]) for name in ("x", "y") if name in names)
     has_heading = {"qw", "psi"} & set(names)
     return (
         POSE_FRAMES

@@ -404,7 +404,7 @@ class ChannelMapper:
         tables = []
         for table in self._logs:
             columns = dict(table.columns)
-            for name, fit in ((n, fit_to_motion(self._logs, self._motions, n)) for n in ("u", "v")):
+            for name, fit in ((n, self._fit_velocity(n)) for n in ("u", "v")):
                 unit = parse_header_unit(self._names[name], "m/s") or fit.matching_unit("m/s")
                 factor = to_si(unit) if unit else 1.0
                 sign = -1.0 if fit.is_significant and fit.factor < 0.0 else 1.0
@@ -578,8 +578,7 @@ class ChannelMapper:
         if self._is_earth_fixed and name in ("u", "v"):
             entry["frame"] = "ned"
         if name in ("u", "v", "r") and {"x", "y", "psi"} <= set(self._names):
-            fit = fit_to_motion(self._logs, self._motions, name)
-            return entry | self._settle_rate(name, fit, "position and heading")
+            return entry | self._settle_rate(name, self._fit_velocity(name), "position and heading")
         if name == "r" and "psi" in self._names:
             fit = fit_rate_to_angle(self._logs, "psi", self._psi_unit, name, self._pose_frame)
             return entry | self._settle_rate(name, fit, "headings")
@@ -617,6 +616,41 @@ class ChannelMapper:
         )
         self._draft_notes.add_guess(key, text)
         return {"offset": float(f"{offset.angle / factor:.3g}")}
+
+    def _fit_velocity(self, name: str) -> ScaleFit:
+        """Regress a velocity from position and heading on its column.
+
+        A receiver forward of the vessel's centre adds its lever arm times the yaw rate to the sway
+        velocity, which may change its size and sign. Hence another factor of v than that of its
+        unit is compared with a lever arm.
+
+        Args:
+            name: `u`, `v` or `r`.
+        """
+        fit = fit_to_motion(self._logs, self._motions, name)
+        if name != "v" or "u" not in self._names or not fit.is_significant:
+            return fit
+        surge_fit = fit_to_motion(self._logs, self._motions, "u")
+        unit = parse_header_unit(self._names["v"], "m/s") or surge_fit.matching_unit("m/s")
+        if unit is None:
+            return fit
+        factors = (to_si(unit), -to_si(unit), fit.factor)
+        squares = np.zeros(3)
+        for table, motion in zip(self._logs, self._motions, strict=True):
+            if motion is None or "v" not in table.columns:
+                continue
+            is_finite = np.isfinite(table.columns["v"])
+            column = np.interp(motion.t, table.t[is_finite], table.columns["v"][is_finite])
+            sway, v, yaw_rate = (
+                values - values.mean() for values in (motion.sway_velocity, column, motion.yaw_rate)
+            )
+            for number, factor in enumerate(factors):
+                excess = sway - factor * v
+                if number < 2:
+                    norm = max(float(yaw_rate @ yaw_rate), 1e-300)
+                    excess = excess - float(excess @ yaw_rate) / norm * yaw_rate
+                squares[number] += float(excess @ excess)
+        return fit._replace(factor=factors[int(np.argmin(squares))])
 
     def _conventional_sign(self, name: str) -> int:
         """Return -1 for v and r of tables with a ROS pose (positive to port, REP 103), else 1."""
@@ -687,8 +721,10 @@ class ChannelMapper:
             text = f"the header has no unit; {reference} give {measured_unit}"
             self._draft_notes.add_guess(key, f"{text} (correlation {fit.correlation:.2f})")
         elif header_unit and measured_unit and fit.correlation >= _OVERRULING_CORRELATION:
-            ratio = abs(fit.factor) / to_si(header_unit, expected_unit)
-            if to_si(measured_unit) != to_si(header_unit, expected_unit) and not 0.6 < ratio < 1.6:
+            header_factor = to_si(header_unit, expected_unit)
+            ratio = abs(fit.factor) / header_factor
+            is_other_unit = to_si(measured_unit) != header_factor and not 0.6 < ratio < 1.6
+            if is_other_unit:
                 text = (
                     f"the header has {header_unit}, {reference} give {measured_unit} (factor"
                     f" {ratio:.3g})"

@@ -105,8 +105,9 @@ def match_channels(
         for name in {"u", "v"} & names.keys():
             del names[name]
     elif "u" not in names and speeds and ("v" in names or not (has_position and has_heading)):
-        names["u"] = speeds[0]
-        text = f"'{speeds[0]}' is assumed the surge velocity, not the speed"
+        # a speed over ground contains drift and current, that of a log along the keel does not
+        names["u"] = min(speeds, key=lambda column: "ground" in parsed_names[column].concepts)
+        text = f"'{names['u']}' is assumed the surge velocity, not the speed"
         draft_notes.add_guess((*CHANNELS_KEY, "u"), text)
     ordered_channels = [
         *MOTION_AND_WIND_CHANNELS,

@@ -39,6 +39,8 @@ _MAX_NODES = 300
 """Largest number of nodes of a log in that comparison; bounds its computing time."""
 _NODE_STEP = 0.5
 """Smallest step between nodes in s."""
+_MAX_LEVER_ARM_SHARE = 0.05
+"""Largest lever arm of a receiver over the mean distance of a log."""
 _MIN_JUMP_RATIO = 15.0
 """Smallest ratio of a jump of the position to the median of unexplained steps."""
 _N_WINDOWS = 12
@@ -428,9 +430,9 @@ class Contradiction(NamedTuple):
 def measure_contradiction(logs: Sequence[MeasuredVelocities]) -> Contradiction | None:
     """Compare displacements with integrals of u, v in body axes over windows of each log.
 
-    A heading offset and a scale (for all logs), and a current (for each log) are fitted, so that
-    they are no contradiction. Windows with a jump of the position, such as a reset of its origin,
-    are not used.
+    A heading offset, a scale and a lever arm of the receiver (for all logs), and a current (for
+    each log) are fitted, so that they are no contradiction. Windows with a jump of the position,
+    such as a reset of its origin, are not used.
 
     Args:
         logs: logs with u and v in body axes in m/s.
@@ -440,6 +442,7 @@ def measure_contradiction(logs: Sequence[MeasuredVelocities]) -> Contradiction |
     """
     displacements: list[complex] = []
     integrals: list[complex] = []
+    rotations: list[complex] = []
     durations: list[float] = []
     log_numbers: list[int] = []
     for number, log in enumerate(logs):
@@ -447,6 +450,7 @@ def measure_contradiction(logs: Sequence[MeasuredVelocities]) -> Contradiction |
         track = log.position[:, 0] + 1j * log.position[:, 1]
         bounds = np.linspace(0, log.t.size - 1, _N_WINDOWS + 1).astype(int)
         dt = np.diff(log.t)
+        axis = np.exp(1j * log.heading)
         increments = 0.5 * dt * (velocity[1:] + velocity[:-1])
         jumps = np.flatnonzero(_is_jump(np.diff(track), increments))
         for first, last in itertools.pairwise(bounds.tolist()):
@@ -456,16 +460,21 @@ def measure_contradiction(logs: Sequence[MeasuredVelocities]) -> Contradiction |
             if np.isfinite(integral + displacement) and last > first and not has_jump:
                 displacements.append(displacement)
                 integrals.append(integral)
+                rotations.append(axis[last] - axis[first])
                 durations.append(log.t[last] - log.t[first])
                 log_numbers.append(number)
     distance = float(np.abs(displacements).sum()) if displacements else 0.0
     if len(displacements) < _N_WINDOWS or distance <= 0.0:
         return None
     response = np.array(displacements)
-    columns = np.zeros((response.size, 1 + len(logs)), dtype=np.complex128)
+    columns = np.zeros((response.size, 2 + len(logs)), dtype=np.complex128)
     columns[:, 0] = integrals
     columns[np.arange(response.size), 1 + np.array(log_numbers)] = durations
+    columns[:, -1] = rotations
     solution = np.linalg.lstsq(columns, response, rcond=1e-10)[0]
+    if abs(solution[-1]) > _MAX_LEVER_ARM_SHARE * distance / len(logs):
+        columns[:, -1] = 0.0
+        solution = np.linalg.lstsq(columns, response, rcond=1e-10)[0]
     residual = response - columns @ solution
     gain = complex(solution[0])
     spread = float(np.sqrt(np.mean(np.abs(residual) ** 2) / max(response.size - 3, 1)))
