@@ -136,9 +136,18 @@ def test_a_receiver_at_the_bow_changes_no_unit_or_sign_of_sway(tmp_path: Path, s
         pd.DataFrame({"t [s]": TIMES, **columns}).to_csv(paths[-1], index=False)
         receiver_sway = motion.sample("v", TIMES) + 12.0 * table["r"]
         assert np.corrcoef(receiver_sway, motion.sample("v", TIMES))[0, 1] < -0.5
-    entry = read_drafted(paths, DraftNotes()).reader["channels"]["v"]
+    result = read_drafted(paths, DraftNotes())
     expected = {"column": "v [m/s]", "unit": "m/s"} | ({"sign": -1} if sign < 0.0 else {})
-    assert entry == expected
+    assert result.reader["channels"]["v"] == expected
+    log = next(iter(result.logs.values()))
+    (frames,) = inspect_log(log).find_by_code("frames")
+    assert frames.level == "note"
+    # a reversed v without a lever arm is still named
+    centre = {axis: true_motion(1).sample(axis, TIMES) for axis in ("x", "y")}
+    reversed_sway = log.replace(channels={**log.channels, **centre, "v": -log["v"]})
+    (frames,) = inspect_log(reversed_sway).find_by_code("frames")
+    assert frames.level == "will mislead"
+    assert "v positive to port" in frames.text
 
 
 def test_positions_named_enu_are_east_and_north(tmp_path: Path) -> None:

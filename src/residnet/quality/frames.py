@@ -200,7 +200,11 @@ _MAX_SPEED_RATIO = 5.0
 
 
 def compare_frames(log: LogStatistics) -> FrameAgreement | None:
-    """Compare position and velocities; None with fewer than 50 samples in motion."""
+    """Compare position and velocities; None with fewer than 50 samples in motion.
+
+    If a lever arm of the receiver explains a difference better than a reversed v, the declared
+    convention is compared at the vessel's centre.
+    """
     averaged_rates = log.cached(compute_averaged_rates)
     is_finite = np.isfinite(averaged_rates.ground_velocity)
     for values in averaged_rates.body_velocity.values():
@@ -224,6 +228,15 @@ def compare_frames(log: LogStatistics) -> FrameAgreement | None:
         )
         for name, (ground_values, body_values) in velocity_pairs.items()
     }
+    # a receiver at the bow sways as a reversed v does, because v and r are nearly proportional
+    arm = np.nan_to_num(1j * (averaged_rates.yaw_rate * np.exp(1j * log["psi"]))[is_finite])
+    regressors = np.stack((declared_velocity, arm), axis=1)
+    lever_arm = np.linalg.lstsq(regressors, ground_velocity, rcond=1e-10)[0][1]
+    centre_velocity = ground_velocity - lever_arm * arm
+    norms = float(np.linalg.norm(centre_velocity)) * float(np.linalg.norm(declared_velocity))
+    overlap_of_centre = complex(np.vdot(declared_velocity, centre_velocity)) / max(norms, 1e-300)
+    if abs(overlap_of_centre) > abs(overlaps["v reversed"]) > abs(overlaps["as declared"]):
+        overlaps["as declared"] = overlap_of_centre
     return FrameAgreement(
         overlaps, float(np.linalg.norm(declared_velocity) / np.linalg.norm(ground_velocity))
     )
