@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 SIGN_LEVEL = 0.05
 """Significance level of the test for a wrong sign."""
@@ -23,6 +22,8 @@ _MAX_RATIO = 4.0
 """Largest ratio of gains that is searched; a larger one is a failed actuator."""
 _N_RATIOS = 25
 """Number of ratios of gains in the grid search, spaced logarithmically."""
+_MIN_LOG_INTERVAL = 1e-3
+"""Interval of the logarithm of a ratio at which its search ends."""
 _MIN_ASTERN_SHARE = 0.05
 """Share of samples of each sign from which thrust astern has coefficients of its own.
 
@@ -214,13 +215,37 @@ def _minimize_over_ratios(compute_deviance: Callable[[float], float]) -> float:
     start = min(candidates, key=compute_deviance)
     sign = float(np.sign(start))
     spacing = 2.0 * log_limit / (_N_RATIOS - 1)
-    optimum = scipy.optimize.minimize_scalar(
-        lambda log_size: compute_deviance(sign * float(np.exp(log_size))),
-        bounds=(np.log(abs(start)) - spacing, np.log(abs(start)) + spacing),
-        method="bounded",
-        options={"xatol": 1e-3},
+    log_size = _minimize_by_golden_section(
+        lambda log_size: compute_deviance(sign * math.exp(log_size)),
+        math.log(abs(start)) - spacing,
+        math.log(abs(start)) + spacing,
     )
-    return sign * float(np.exp(optimum.x))
+    return sign * math.exp(log_size)
+
+
+def _minimize_by_golden_section(
+    objective: Callable[[float], float], lower: float, upper: float
+) -> float:
+    """Return the minimum of a unimodal function (Kiefer 1953); scipy.optimize is slow to import."""
+    section = 0.5 * (math.sqrt(5.0) - 1.0)
+    left = upper - section * (upper - lower)
+    right = lower + section * (upper - lower)
+    left_value = objective(left)
+    right_value = objective(right)
+    while upper - lower > _MIN_LOG_INTERVAL:
+        if left_value < right_value:
+            upper = right
+            right = left
+            right_value = left_value
+            left = upper - section * (upper - lower)
+            left_value = objective(left)
+        else:
+            lower = left
+            left = right
+            left_value = right_value
+            right = lower + section * (upper - lower)
+            right_value = objective(right)
+    return 0.5 * (lower + upper)
 
 
 @dataclass(frozen=True)
