@@ -8,6 +8,7 @@ import pytest
 from residnet.core.log import Log
 from residnet.quality import inspect_log
 from residnet.quality.kinematic_findings import POSITION_LIMITS, YAW_LIMITS
+from residnet.quality.kinematics import _compute_condition_index
 
 
 def simulate_boat(*, is_explicit: bool, dt: float, yaw_bias: float = 0.0) -> Log:
@@ -55,3 +56,12 @@ def test_inspect_log_finds_a_bias_in_a_simulation() -> None:
     report = inspect_log(simulate_boat(is_explicit=True, dt=0.5, yaw_bias=0.01))
     drift = next(finding for finding in report.findings if finding.code == "yaw_drift")
     assert drift.figures["bias"] == pytest.approx(-0.01, rel=0.02)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9, 0.999])
+def test_condition_index_of_two_columns_follows_from_their_correlation(correlation: float) -> None:
+    # a heading delay and a gain of sway are such columns in a zigzag of one period
+    first, second = np.eye(5)[:2]
+    mixed = correlation * first + np.sqrt(1.0 - correlation**2) * second
+    index = _compute_condition_index(np.column_stack((3.0 * first, 0.01 * mixed)))
+    assert index == pytest.approx(np.sqrt((1.0 + correlation) / (1.0 - correlation)))

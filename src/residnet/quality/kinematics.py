@@ -62,6 +62,10 @@ _CAUSES_UNLIKE_DELAYS = ("gain_u", "heading", "lever_arm", "current", "bias", "r
 """Causes that a regression does not select in place of a delay."""
 _MIN_CLOCK_ADVANTAGE = 20.0
 """Smallest difference of the BIC by which the data distinguish two hypotheses."""
+_MAX_CONDITION_INDEX = 30.0
+"""Largest condition index of the causes beside a delay. Above it they cannot be separated: in a
+zigzag of one period a delay of the heading is a gain of sway with a delay of u and v (Belsley, Kuh
+and Welsch 1980, Regression Diagnostics, sec. 3.2)."""
 _MAX_SHIFT = 3.0
 """Largest delay in s that is tried."""
 _SHIFT_STEPS = (0.3, 1.0)
@@ -218,6 +222,8 @@ class _Explanation(NamedTuple):
         response_square: mean squared norm of the whitened increments before the regression.
         min_deviation: lower bound on the standard deviation of the increments in the whitening.
         n_parameters: number of columns of the regression.
+        condition_index: ratio of the largest to the smallest singular value of the columns, which
+            are scaled to unit length.
     """
 
     causes: dict[str, KinematicCause]
@@ -226,6 +232,7 @@ class _Explanation(NamedTuple):
     response_square: float
     min_deviation: float
     n_parameters: int
+    condition_index: float = 1.0
 
     @property
     def has_gross_gain(self) -> bool:
@@ -562,7 +569,10 @@ def _shift_clock(
     name: str,
     clocks: Mapping[str, tuple[str, ...]],
 ) -> _ClockHypothesis | None:
-    """Return a hypothesis with the most likely delay of one more clock; None without a delay."""
+    """Return a hypothesis with the most likely delay of one more clock.
+
+    The result is None without a delay, or if the causes cannot be separated.
+    """
     n_samples = _find_most_likely_shift(log, make_model, hypothesis.channels, clocks[name])
     if n_samples == 0 and name in hypothesis.explanation.causes:
         # in noise, the regression shows delays of slow motions that single steps do not show
@@ -594,7 +604,7 @@ def _shift_clock(
         if bics[1] >= bics[0]:
             break
         trial = _ClockHypothesis(explanation, channels, shifts)
-    return trial
+    return trial if trial.explanation.condition_index <= _MAX_CONDITION_INDEX else None
 
 
 def _clock_sign(name: str) -> float:
@@ -832,10 +842,28 @@ def _explain_increments(
     residuals = y - cause_columns @ coefficients
     squares_by_component = (residuals**2).reshape(retained_indices.size, -1)
     squares[retained_indices] = squares_by_component.sum(axis=1)
-    n_parameters = int(np.count_nonzero(coefficients))
+    is_selected = coefficients != 0.0
+    n_parameters = int(np.count_nonzero(is_selected))
     dimension = squares_by_component.shape[1]
     response_square = dimension * float(np.mean(y**2))
-    return _Explanation(causes, squares, dimension, response_square, min_deviation, n_parameters)
+    return _Explanation(
+        causes,
+        squares,
+        dimension,
+        response_square,
+        min_deviation,
+        n_parameters,
+        _compute_condition_index(cause_columns[is_inlier][:, is_selected]),
+    )
+
+
+def _compute_condition_index(columns: np.ndarray) -> float:
+    """Return the condition number of columns [N, k] scaled to unit length; 1 without columns."""
+    if columns.shape[1] == 0:
+        return 1.0
+    scaled_columns = columns / np.linalg.norm(columns, axis=0)
+    eigenvalues = np.linalg.eigvalsh(scaled_columns.T @ scaled_columns)
+    return math.sqrt(float(eigenvalues[-1]) / max(float(eigenvalues[0]), 1e-300))
 
 
 def _orthogonal_matching_pursuit(
