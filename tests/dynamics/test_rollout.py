@@ -48,7 +48,8 @@ def starts(batch: int) -> Tensor:
 
 def lstm_model() -> HybridDynamics:
     torch.manual_seed(0)
-    model = linear(head=LstmConfig(hidden_size=8).build(("u", "v", "r", "tau_x", "tau_n")))
+    config = LstmConfig(hidden_size=8, skip="none")
+    model = linear(head=config.build(("u", "v", "r", "tau_x", "tau_n")))
     with torch.no_grad():
         model.head.scale.std.fill_(0.3)  # type: ignore[operator, union-attr]
     return model.double().eval()

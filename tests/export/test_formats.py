@@ -357,7 +357,7 @@ def test_a_changed_weight_and_a_wrong_rollout_are_found() -> None:
     made.check_parity(ScriptedModel(module, torch.float32), "the module", torch.float32)
     other = exported("lstm")
     with torch.no_grad():
-        other.model.head.networks[0].readout[0].bias[2] += 1e-3  # type: ignore[union-attr, index]
+        other.model.head.network.networks[0].readout[0].bias[2] += 1e-3  # type: ignore[union-attr, index]
     told = r"model mine: the module differs .* allowed 1e-05"
     with pytest.raises(ExportError, match=told) as said:
         other.check_parity(ScriptedModel(module, torch.float32), "the module", torch.float32)

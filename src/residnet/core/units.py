@@ -286,14 +286,21 @@ def _suggest_unit(unit: str, expected: str | None) -> str | None:
     close_spellings = [
         spelling
         for spelling in difflib.get_close_matches(unit_text, allowed_spellings, n=6, cutoff=0.6)
-        if sorted(spelling) == sorted(unit_text) or _differs_in_one_word(spelling, unit_text)
+        if _has_swapped_letters(spelling, unit_text) or _differs_in_one_word(spelling, unit_text)
     ]
     # swapped letters are more likely than a different word
     close_spellings = [
-        spelling for spelling in close_spellings if sorted(spelling) == sorted(unit_text)
+        spelling for spelling in close_spellings if _has_swapped_letters(spelling, unit_text)
     ] or close_spellings
     factors = {_UNITS[name][1] for spelling in close_spellings for name in exact[spelling]}
     return exact[close_spellings[0]][0] if len(factors) == 1 else None
+
+
+def _has_swapped_letters(spelling: str, text: str) -> bool:
+    """Return whether the parts of two quotients have the same letters in any order."""
+    return [sorted(part) for part in spelling.split("/")] == [
+        sorted(part) for part in text.split("/")
+    ]
 
 
 def _differs_in_one_word(spelling: str, text: str) -> bool:

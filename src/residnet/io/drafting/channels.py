@@ -61,6 +61,10 @@ from residnet.preprocessing.channel_values import NEGLIGIBLE_MOTION_SHARE
 
 _OVERRULING_CORRELATION = 0.9
 """Smallest correlation for which an estimated factor overrules the header."""
+_MIN_FACTOR_RATIO = 0.6
+"""Smallest ratio of an estimated factor to that of a unit at which both agree."""
+_MAX_FACTOR_RATIO = 1.6
+"""Largest such ratio."""
 _MIN_BODY_CONSISTENCY = 0.85
 """Smallest consistency with position and heading of u and v that are certainly in body axes."""
 _MAX_WIND_SPREAD_RATIO = 0.8
@@ -621,7 +625,7 @@ class ChannelMapper:
         """Regress a velocity from position and heading on its column.
 
         A receiver forward of the vessel's centre adds its lever arm times the yaw rate to the sway
-        velocity, which may change its size and sign. Hence another factor of v than that of its
+        velocity, which may change its size and sign. Hence a factor of v that contradicts its
         unit is compared with a lever arm.
 
         Args:
@@ -632,7 +636,7 @@ class ChannelMapper:
             return fit
         surge_fit = fit_to_motion(self._logs, self._motions, "u")
         unit = parse_header_unit(self._names["v"], "m/s") or surge_fit.matching_unit("m/s")
-        if unit is None:
+        if unit is None or _MIN_FACTOR_RATIO < fit.factor / to_si(unit) < _MAX_FACTOR_RATIO:
             return fit
         factors = (to_si(unit), -to_si(unit), fit.factor)
         squares = np.zeros(3)
@@ -723,8 +727,8 @@ class ChannelMapper:
         elif header_unit and measured_unit and fit.correlation >= _OVERRULING_CORRELATION:
             header_factor = to_si(header_unit, expected_unit)
             ratio = abs(fit.factor) / header_factor
-            is_other_unit = to_si(measured_unit) != header_factor and not 0.6 < ratio < 1.6
-            if is_other_unit:
+            is_same_scale = _MIN_FACTOR_RATIO < ratio < _MAX_FACTOR_RATIO
+            if to_si(measured_unit) != header_factor and not is_same_scale:
                 text = (
                     f"the header has {header_unit}, {reference} give {measured_unit} (factor"
                     f" {ratio:.3g})"
