@@ -75,7 +75,7 @@ def read_measured_hosts(seed: int) -> list[Host]:
         )  # fmt: skip
         for start in range(0, len(files) - _LOGS_PER_HOST + 1, _LOGS_PER_HOST):
             logs = [reader.read(file) for file in files[start : start + _LOGS_PER_HOST]]
-            hosts.append(Host(ship, logs, fit.signals.columns, fit.prepare.masks))
+            hosts.append(Host(ship, logs, fit.signals.regressor_columns, fit.prepare.masks))
     return [hosts[i] for i in random.permutation(len(hosts))][:_MAX_MEASURED_HOSTS]
 
 

@@ -54,10 +54,13 @@ class ErrorEstimate:
 
     @property
     def standard_error(self) -> float:
-        """Standard error; it contains the effect of smoothness on errors that depend on it."""
-        if self.is_independent_of_smoothness:
-            return self.statistical_error
-        return float(np.hypot(self.growth * self.statistical_error, self.change))
+        """Standard error; it contains the change of the value under less smoothness.
+
+        Without that change the intervals of clocks of small boats are too short: smoothing delays a
+        yaw rate that changes within few steps.
+        """
+        growth = 1.0 if self.is_independent_of_smoothness else self.growth
+        return float(np.hypot(growth * self.statistical_error, self.change))
 
     @property
     def is_determined(self) -> bool:
@@ -69,13 +72,11 @@ class ErrorEstimate:
 
     @property
     def is_significant(self) -> bool:
-        """Whether the error differs from zero by 3.5 standard errors and the effect of smoothness.
+        """Whether the error differs from zero by 3.5 standard errors.
 
         An error can be significant although no sensor determines its size.
         """
-        total = float(np.hypot(self.statistical_error, self.change))
-        limit = _MIN_T_STATISTIC * max(self.standard_error, total)
-        return self._has_information and abs(self.value) > limit
+        return self._has_information and abs(self.value) > _MIN_T_STATISTIC * self.standard_error
 
     @property
     def _has_information(self) -> bool:
