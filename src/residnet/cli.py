@@ -198,7 +198,9 @@ def new(
     ],
     output_file: Annotated[
         Path | None,
-        typer.Option("--out", metavar="CONFIG", help="Config to write; default: my_boat.yaml."),
+        typer.Option(
+            "--out", "-o", metavar="CONFIG", help="Config to write; default: my_boat.yaml."
+        ),
     ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an existing config.")

@@ -15,6 +15,7 @@ from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.io.readers import ReaderConfig
 from residnet.io.readers.base import LogReader
+from residnet.io.readers.text_tables import coerce_numeric
 
 
 def build(
@@ -95,6 +96,20 @@ def test_delimiter_decimal_comma_byte_order_mark_and_spaces(tmp_path: Path) -> N
     log = read(tmp_path, "\ufefft; u ;v\n0,5; 1,25;2\n1,0;1,5;3\n", delimiter=";", decimal=",")
     np.testing.assert_array_equal(log.t, [0.5, 1.0])
     np.testing.assert_array_equal(log["u"], [1.25, 1.5])
+
+
+@pytest.mark.parametrize(
+    ("cells", "angles"),
+    [
+        (["P12.3", "S05.0", "", "S00.0"], [-12.3, 5.0, np.nan, 0.0]),
+        (["0", "PORT 3", "STBD 4", "p1,5"], [0.0, -3.0, 4.0, -1.5]),
+    ],
+)
+def test_sides_of_rudder_angles_are_signs(cells: list[str], angles: list[float]) -> None:
+    table = coerce_numeric(pd.DataFrame({"rudder": cells}), "," if "p1,5" in cells else ".")
+    np.testing.assert_array_equal(table["rudder"], angles)
+    names = pd.DataFrame({"name": ["P12", "POLAR 5", "S1A"]})
+    assert coerce_numeric(names)["name"].tolist() == ["P12", "POLAR 5", "S1A"]
 
 
 def test_numbers_are_read_to_the_last_bit(tmp_path: Path) -> None:

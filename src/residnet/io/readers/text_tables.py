@@ -52,6 +52,7 @@ _MAX_UNIT_LINES = 3
 _CHUNK_ROWS = 20_000
 _COMMENT_PREFIX = re.compile(r"\s*(?:#|%|//)\s+")
 _FRACTION = rf"\s*-?\d+{{}}\d+(?:[eE][-+]?\d+)?\s*(?:{UNIT})?"
+_SIDE = re.compile(r"^(?P<side>[PS])?(?:ORT|TBD|TB)?\s*(?P<number>\d+(?:[.,]\d*)?)$", re.IGNORECASE)
 _EXTRA_COLUMN = "beyond the last column"
 
 
@@ -287,7 +288,8 @@ def _coerce_column(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
         or not cells.dropna().map(lambda cell: isinstance(cell, str | float | int)).all()
     ):
         return cells, ""
-    unit, unitless_cells = _strip_unit(cells)
+    signed_cells = _replace_sides(cells)
+    unit, unitless_cells = _strip_unit(signed_cells)
     # a word among the first cells rejects the column before all cells are copied
     head = unitless_cells.iloc[:_N_SAMPLED_CELLS].map(normalize_number)
     if pd.to_numeric(head, errors="coerce").isna().sum() != head.isna().sum():
@@ -298,9 +300,21 @@ def _coerce_column(cells: pd.Series, decimal: str) -> tuple[pd.Series, str]:
     normalized = unitless_cells.map(normalize_number)
     values = pd.to_numeric(normalized, errors="coerce")
     is_numeric = (
-        unit or separator_counts != {1}
+        unit or signed_cells is not cells or separator_counts != {1}
     ) and values.isna().sum() == normalized.isna().sum()
     return (values, unit) if is_numeric else (cells, "")
+
+
+def _replace_sides(cells: pd.Series) -> pd.Series:
+    """Replace the sides of cells such as `P12.3` and `S05.0` by signs, positive to starboard."""
+    texts = cells.dropna().astype("string").str.strip()
+    texts = texts[texts.str.contains(r"\w")]
+    parts = texts.iloc[:_N_SAMPLED_CELLS].str.extract(_SIDE)
+    if not len(parts) or parts["number"].isna().any() or parts["side"].isna().all():
+        return cells
+    parts = texts.str.extract(_SIDE)
+    signed_texts = parts["side"].str.upper().eq("P").map({True: "-", False: ""}) + parts["number"]
+    return signed_texts.fillna(texts).astype(object).reindex(cells.index)
 
 
 def _strip_unit(cells: pd.Series) -> tuple[str, pd.Series]:
