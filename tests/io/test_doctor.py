@@ -38,7 +38,7 @@ from residnet.quality.findings import run_checks
 from residnet.quality.frames import is_course_over_ground
 from residnet.quality.kinematics import estimate_position_causes
 from residnet.quality.records import InspectionFile
-from residnet.quality.statistics import LogStatistics
+from residnet.quality.statistics import LogStatistics, estimate_resolution
 
 LOG = wavy()
 PSI, T = LOG["psi"], LOG.t
@@ -450,6 +450,14 @@ def test_frozen_and_interpolated_checks_accept_few_printed_digits(
         monkeypatch.setattr(values, "printed_resolution", lambda _: None)
     codes = {finding.code for finding in inspect_log(log, ()).findings}
     assert bool({"frozen", "interpolated"} & codes) != has_few_digits
+
+
+def test_resolution_of_a_channel_whose_changes_are_many_steps() -> None:
+    # exactly linear stretches of a noise-free heading are then no sign of an interpolation
+    heading = np.cumsum(0.5 + 0.2 * np.sin(0.04 * np.arange(1200))).round(2)
+    assert estimate_resolution(heading) == pytest.approx(0.01)
+    noise = np.random.default_rng(1).normal(size=1200)
+    assert estimate_resolution(heading + noise) == 0.0
 
 
 @pytest.mark.parametrize(("n_lost", "fix"), [(4, "no action is needed"), (40, "split the log")])

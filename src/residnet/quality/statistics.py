@@ -387,8 +387,10 @@ def printed_resolution(values: np.ndarray) -> np.ndarray | None:
 
 def estimate_resolution(values: np.ndarray) -> float:
     """Return the quantisation step of a channel; 0 if its values have no common step."""
-    nonzero_changes = np.abs(np.diff(values))
-    nonzero_changes = nonzero_changes[np.isfinite(nonzero_changes) & (nonzero_changes > 0.0)]
+    # second differences: the first ones of a position at speed have many steps
+    rounding_error = 1e-12 * float(np.nanmax(np.abs(values), initial=0.0))
+    nonzero_changes = np.abs(np.diff(values, 2))
+    nonzero_changes = nonzero_changes[nonzero_changes > rounding_error]
     if nonzero_changes.size < MIN_SAMPLES:
         return 0.0
     min_step = nan_quantiles(nonzero_changes, 0.01)[0]
