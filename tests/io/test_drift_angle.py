@@ -130,47 +130,30 @@ def test_the_unit_of_a_drift_angle_is_no_unit_of_a_velocity(tmp_path: Path) -> N
     assert not any("m/s" in text for text in texts)
 
 
-def test_the_symbol_u_is_the_speed_or_the_surge_velocity_by_the_track(tmp_path: Path) -> None:
+def test_the_symbol_u_next_to_a_drift_angle_is_marked_as_the_speed(tmp_path: Path) -> None:
     trip = TRUTH[0]
     beta = np.degrees(np.arctan2(-trip.v, trip.u))
-    track = {"t": trip.t, "x [m]": trip.x, "y [m]": trip.y, "psi [deg]": np.degrees(trip.psi)}
     speed = {"u [m/s]": np.hypot(trip.u, trip.v), "beta [deg]": beta, "rudder": trip.delta}
-    channels, _ = draft(track | speed, tmp_path / "speed.csv")
-    assert channels["speed"]["column"] == "u [m/s]"
-    channels, text = draft(track | speed | {"u [m/s]": trip.u}, tmp_path / "surge.csv")
-    assert channels["u"]["column"] == "u [m/s]"
-    assert "'beta [deg]' is not read: 'u [m/s]' is the surge velocity" in text
     channels, text = draft({"t": trip.t, "r": trip.r} | speed, tmp_path / "no_track.csv")
     assert channels["speed"]["column"] == "u [m/s]"
     assert "'u [m/s]' next to the drift angle 'beta [deg]' is assumed the speed" in text
 
 
-@pytest.mark.parametrize(
-    ("is_other_motion", "text"),
-    [(True, "does not follow position and heading"), (False, "does not move")],
-)
-def test_a_drift_angle_of_another_time_or_at_zero_is_left_out(
-    is_other_motion: bool, text: str, tmp_path: Path
+@pytest.mark.parametrize("kind", ["another clock", "frozen", "another angle"])
+def test_an_angle_that_is_not_the_drift_angle_of_the_track_is_left_out(
+    kind: str, tmp_path: Path
 ) -> None:
     trip = TRUTH[0]
-    beta = np.degrees(np.arctan2(-trip.v.to_numpy(), trip.u.to_numpy()))
-    beta = 12.0 * np.sin(0.9 * trip.t) if is_other_motion else 0.0 * beta
+    beta = {
+        "another clock": 12.0 * np.sin(0.9 * trip.t),
+        "frozen": 0.0 * trip.t,
+        "another angle": 60.0 * np.sin(trip.t),
+    }[kind]
     table = {"t": trip.t, "x [m]": trip.x, "y [m]": trip.y, "psi [deg]": np.degrees(trip.psi)}
-    table |= {"V": np.hypot(trip.u, trip.v), "beta": beta, "rudder": trip.delta}
+    table |= {"V [m/s]": np.hypot(trip.u, trip.v), "beta [deg]": beta, "rudder": trip.delta}
     channels, notes = draft(table, tmp_path / "trip.csv")
     assert not {"speed", "drift_angle", "u", "v"} & channels.keys()
-    assert f"'beta' {text}" in notes
-    assert "'V' and 'beta' are left out: u and v follow from position and heading" in notes
-
-
-def test_an_angle_that_is_no_drift_angle_is_left_out(tmp_path: Path) -> None:
-    trip = TRUTH[0]
-    table = {"t": trip.t, "x [m]": trip.x, "y [m]": trip.y, "psi [deg]": np.degrees(trip.psi)}
-    beta = 60.0 * np.sin(trip.t)
-    table |= {"V [m/s]": np.hypot(trip.u, trip.v), "beta [deg]": beta, "rudder": trip.delta}
-    channels, text = draft(table, tmp_path / "pod.csv")
-    assert not {"speed", "drift_angle", "u", "v"} & channels.keys()
-    assert "'V [m/s]' and 'beta [deg]' are left out: as speed and drift angle they differ" in text
+    assert "'V [m/s]' and 'beta [deg]' are left out: as speed and drift angle they" in notes
 
 
 def test_measured_velocities_take_precedence(tmp_path: Path) -> None:

@@ -11,13 +11,12 @@ from residnet.core.units import to_si
 from residnet.io.drafting.channels import ChannelMapper
 from residnet.io.drafting.motion_regression import MIN_CORRELATION, PoseFrame, RawTable
 from residnet.io.drafting.questions import CHANNELS_KEY, DraftNotes
-from residnet.io.drafting.velocities import (
-    MeasuredVelocities,
-    choose_drift_angle,
-    resolve_drift_angle,
-)
-from residnet.io.header_vocabulary import guess_unit_from_size, parse_header_unit
+from residnet.io.drafting.velocities import BODY_AXES, compute_unexplained_share
+from residnet.io.header_vocabulary import infer_unit
 from residnet.io.readers.quantities import SPEED_CHANNELS
+
+_MAX_UNEXPLAINED_SHARE = 0.95
+"""Unexplained share of the sway velocity above which the drift angle is of another motion."""
 
 
 class DriftAngle(NamedTuple):
@@ -27,15 +26,13 @@ class DriftAngle(NamedTuple):
         speed_column: column of the speed.
         angle_column: column of the drift angle.
         unit: unit of the drift angle.
-        sign: 1 if the drift angle is positive with the flow from port, -1 otherwise.
-        is_speed: whether the first column is the speed; otherwise it is the surge velocity.
+        sign: 1 if the drift angle is assumed positive with the flow from port, -1 otherwise.
     """
 
     speed_column: str
     angle_column: str
     unit: str
     sign: int
-    is_speed: bool
 
 
 def derive_drift_velocities(
@@ -50,7 +47,7 @@ def derive_drift_velocities(
     Args:
         names: channel -> column, perhaps with `speed` and `drift_angle`.
         logs: tables.
-        draft_notes: receives guesses, notes and the question for the meaning of the speed.
+        draft_notes: receives guesses and notes.
         degrees_per_count: unit of the columns x and y, see `ChannelMapper`.
         candidate_frames: possible frames, see `ChannelMapper`.
 
@@ -61,104 +58,49 @@ def derive_drift_velocities(
     if not names.keys() >= {*SPEED_CHANNELS}:
         return dict(names), list(logs), None
     other_names = {name: column for name, column in names.items() if name not in SPEED_CHANNELS}
-    measured: list[MeasuredVelocities] = []
-    if {"x", "y", "psi"} <= other_names.keys():
-        reference = ChannelMapper(
-            other_names, logs, DraftNotes(), degrees_per_count, candidate_frames
-        )
-        reference.choose_frame()
-        measured = reference.measure_velocities((*SPEED_CHANNELS,), logs)
+    speed_column = names["speed"]
+    angle_column = names["drift_angle"]
     tables = [table for table in logs if table.columns.keys() >= {*SPEED_CHANNELS}]
-    drift = _interpret_drift_angle(names, tables, measured, draft_notes)
-    if drift is None:
-        return other_names, list(logs), None
+    angles = np.concatenate([table.columns["drift_angle"] for table in tables])
+    scaling = infer_unit("drift_angle", angle_column, angles)
+    unit = str(scaling.settings["unit"])
+    has_pose = {"x", "y", "psi"} <= other_names.keys()
+    # with a pose the sign follows from the sway velocity, see `restore_drift_angle`
+    sign = 1 if has_pose else _find_drift_direction(tables, angle_column, draft_notes)
     derived = []
     for table in logs:
         columns = dict(table.columns)
         if columns.keys() >= {*SPEED_CHANNELS}:
             speed = columns.pop("speed")
-            angle = drift.sign * columns.pop("drift_angle") * to_si(drift.unit, "rad")
-            u, v = resolve_drift_angle(speed, angle)
-            columns |= {"u": u, "v": v} if drift.is_speed else {"u": speed}
+            angle = sign * columns.pop("drift_angle") * to_si(unit, "rad")
+            columns |= {"u": speed * np.cos(angle), "v": -speed * np.sin(angle)}
         derived.append(RawTable(table.t, columns))
-    if not drift.is_speed:
-        text = f"'{drift.angle_column}' is not read: '{drift.speed_column}' is the surge velocity"
-        draft_notes.add_note(CHANNELS_KEY, text)
-        return {**other_names, "u": drift.speed_column}, derived, None
-    return {**other_names, **dict.fromkeys(("u", "v"), drift.speed_column)}, derived, drift
-
-
-def _interpret_drift_angle(
-    names: Mapping[str, str],
-    tables: Sequence[RawTable],
-    measured: Sequence[MeasuredVelocities],
-    draft_notes: DraftNotes,
-) -> DriftAngle | None:
-    """Choose unit and direction of a drift angle, and the meaning of the speed next to it.
-
-    Position and heading determine them. Without these the direction is that in which the stern
-    swings out in turns.
-
-    Args:
-        names: channel -> column, with `speed` and `drift_angle`.
-        tables: tables with both columns.
-        measured: motion of the tables with position and heading, and both columns.
-        draft_notes: receives guesses, notes and the question for the meaning of the speed.
-
-    Returns:
-        The interpretation; None if the columns contradict position and heading.
-    """
-    speed_column = names["speed"]
-    angle_column = names["drift_angle"]
-    key = (*CHANNELS_KEY, "drift_angle")
-    header_unit = parse_header_unit(angle_column, "rad")
-    # the symbol u is that of the surge velocity, U and V are those of the speed
-    can_be_surge = speed_column.strip().startswith("u")
-    is_speed = True
-    if measured:
-        units = [header_unit] if header_unit else ["deg", "rad"]
-        choice = choose_drift_angle(measured, units, can_be_surge=can_be_surge)
-        if not choice.is_consistent:
+    if has_pose:
+        reference = ChannelMapper(
+            other_names, derived, DraftNotes(), degrees_per_count, candidate_frames
+        )
+        reference.choose_frame()
+        measured = reference.measure_velocities(("u", "v"), derived)
+        share = compute_unexplained_share(measured, ("v",), BODY_AXES.components)
+        if measured and share > _MAX_UNEXPLAINED_SHARE:
             text = (
                 f"'{speed_column}' and '{angle_column}' are left out: as speed and drift angle they"
-                f" differ from position and heading by {100.0 * choice.unexplained_share:.0f} %"
+                " do not follow the sway velocity from position and heading (unexplained"
+                f" {100.0 * share:.0f} %): a frozen sensor, another angle or another clock?"
             )
             draft_notes.add_note(CHANNELS_KEY, text)
-            return None
-        problem = ""
-        if choice.slope.is_constant:
-            problem = "does not move, but position and heading show sway"
-        elif choice.slope.is_unrelated:
-            problem = (
-                "does not follow position and heading (slope of the sway velocity"
-                f" {choice.slope.value:.2f} instead of 1): a frozen sensor, or another clock?"
-            )
-        if problem:
-            text = f"'{angle_column}' {problem}; '{speed_column}' and '{angle_column}' are left out"
-            text += ": u and v follow from position and heading"
-            draft_notes.add_note(CHANNELS_KEY, text)
-            return None
-        unit = choice.unit
-        sign = choice.slope.sign
-        is_speed = choice.is_speed
-        unit_reason = f"the header has no unit; position and heading are most consistent in {unit}"
-        can_be_surge &= choice.is_ambiguous
-    else:
-        angles = np.concatenate([table.columns["drift_angle"] for table in tables])
-        unit, unit_reason = guess_unit_from_size("drift_angle", angles)
-        unit = header_unit or unit
-        sign = _find_drift_direction(tables, angle_column, draft_notes)
-    if header_unit is None:
-        draft_notes.add_guess(key, unit_reason)
-    if can_be_surge:
-        options = ("speed", "surge velocity")
-        reason = f"'{speed_column}' next to the drift angle '{angle_column}' is assumed the speed"
-        question = f"meaning of '{speed_column}' next to the drift angle '{angle_column}'"
-        answer = draft_notes.ask_question(
-            (*CHANNELS_KEY, "speed"), question, options[0], reason, options
+            return other_names, derived, None
+    if scaling.reason:
+        draft_notes.add_guess((*CHANNELS_KEY, "drift_angle"), scaling.reason)
+    # the symbol u is that of the surge velocity, U and V are those of the speed
+    if speed_column.strip().startswith("u"):
+        text = (
+            f"'{speed_column}' next to the drift angle '{angle_column}' is assumed the speed; if it"
+            " is the surge velocity, call its channel u and delete the channel drift_angle"
         )
-        is_speed = answer == options[0]
-    return DriftAngle(speed_column, angle_column, unit, sign, is_speed)
+        draft_notes.add_guess((*CHANNELS_KEY, "speed"), text)
+    drift = DriftAngle(speed_column, angle_column, unit, sign)
+    return {**other_names, **dict.fromkeys(("u", "v"), speed_column)}, derived, drift
 
 
 def _find_drift_direction(
@@ -174,30 +116,24 @@ def _find_drift_direction(
         angle_column: column of the drift angle, for the guess.
         draft_notes: receives the guess.
     """
-    key = (*CHANNELS_KEY, "drift_angle")
-    product = angle_energy = rate_energy = 0.0
-    for table in tables:
-        if "r" not in table.columns:
-            continue
-        is_finite = np.isfinite(table.columns["drift_angle"]) & np.isfinite(table.columns["r"])
-        angle = table.columns["drift_angle"][is_finite]
-        rate = table.columns["r"][is_finite]
-        product += float(angle @ rate)
-        angle_energy += float(angle @ angle)
-        rate_energy += float(rate @ rate)
-    energy = np.sqrt(angle_energy * rate_energy)
-    correlation = product / energy if energy > 0.0 else 0.0
-    if abs(correlation) < MIN_CORRELATION:
-        text = f"'{angle_column}' is assumed positive with the flow from port: v = -U sin(beta)"
-        draft_notes.add_guess(key, text)
-        return 1
-    direction = "port" if correlation > 0.0 else "starboard"
-    text = (
-        f"'{angle_column}' is positive with the flow from {direction}: so the stern swings out in"
-        f" turns (correlation with the yaw rate {correlation:.2f})"
-    )
-    draft_notes.add_guess(key, text)
-    return 1 if correlation > 0.0 else -1
+    pairs = [
+        np.stack((table.columns["drift_angle"], table.columns["r"]))
+        for table in tables
+        if "r" in table.columns
+    ]
+    samples = np.concatenate([np.zeros((2, 0)), *pairs], axis=1)
+    angle, rate = samples[:, np.isfinite(samples).all(axis=0)]
+    energy = float(np.linalg.norm(angle) * np.linalg.norm(rate))
+    correlation = float(angle @ rate) / energy if energy > 0.0 else 0.0
+    text = f"'{angle_column}' is assumed positive with the flow from port: v = -U sin(beta)"
+    if abs(correlation) >= MIN_CORRELATION:
+        text = (
+            f"'{angle_column}' is positive with the flow from"
+            f" {'port' if correlation > 0.0 else 'starboard'}: so the stern swings out in turns"
+            f" (correlation with the yaw rate {correlation:.2f})"
+        )
+    draft_notes.add_guess((*CHANNELS_KEY, "drift_angle"), text)
+    return -1 if correlation <= -MIN_CORRELATION else 1
 
 
 def restore_drift_angle(

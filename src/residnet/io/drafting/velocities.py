@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, cast
@@ -13,8 +11,6 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.frames import rotate
-from residnet.core.units import to_si
-from residnet.preprocessing.channel_values import NEGLIGIBLE_MOTION_SHARE
 from residnet.preprocessing.compatibility.hypotheses import (
     MIN_MARGIN,
     Hypothesis,
@@ -31,8 +27,6 @@ _MIN_IMPROVEMENT = 0.5
 """Largest ratio of unexplained shares from which a meaning replaces the one of the names."""
 _CONSISTENT_SHARE = 0.1
 """Unexplained share below which columns have the meaning of their names."""
-_MIN_MEANING_RATIO = 0.9
-"""Ratio of unexplained shares below which the data decide between speed and surge velocity."""
 _MAX_COMPARED_LOGS = 2
 """Largest number of logs in the comparison by evidence, those with most yaw."""
 _MAX_NODES = 300
@@ -45,8 +39,6 @@ _MIN_JUMP_RATIO = 15.0
 """Smallest ratio of a jump of the position to the median of unexplained steps."""
 _N_WINDOWS = 12
 """Windows of a log over which velocities are integrated."""
-_MAX_UNRELATED_SLOPE = 0.5
-"""Slope between two records of the sway velocity below which they are not of the same motion."""
 _MIN_HEADING_OFFSET = np.radians(2.0)
 """Heading offset in rad below which none is reported."""
 _MAX_HEADING_OFFSET = np.radians(40.0)
@@ -72,64 +64,6 @@ SPEED_AS_V = Meaning(("surge", "speed"), "v is the speed")
 SPEED_AS_U = Meaning(("speed", "sway"), "u is the speed")
 _PAIR_MEANINGS = (BODY_AXES, EARTH_AXES, EXCHANGED_EARTH_AXES, SPEED_AS_V)
 _SINGLE_MEANINGS = {"u": (BODY_AXES,), "v": (BODY_AXES, SPEED_AS_V)}
-
-
-class SwaySlope(NamedTuple):
-    """Regression of the sway velocity from positions on that from a speed and a drift angle.
-
-    Attributes:
-        value: slope; 1 for a drift angle that is positive with the flow from port.
-        standard_error: standard error by the residuals of windows of all logs.
-        size_ratio: ratio of the standard deviations of regressor and response.
-    """
-
-    value: float
-    standard_error: float
-    size_ratio: float
-
-    @property
-    def is_constant(self) -> bool:
-        """Whether the drift angle gives no sway while the vessel sways."""
-        return self.size_ratio < NEGLIGIBLE_MOTION_SHARE
-
-    @property
-    def is_unrelated(self) -> bool:
-        """Whether the slope is certainly far from that of either direction."""
-        return abs(self.value) + 2.0 * self.standard_error < _MAX_UNRELATED_SLOPE
-
-    @property
-    def sign(self) -> int:
-        """-1 if the slope is significantly negative, otherwise 1."""
-        return -1 if self.value < -2.0 * self.standard_error else 1
-
-
-class DriftAngleChoice(NamedTuple):
-    """Interpretation of a speed and a drift angle that suits the motion best.
-
-    Attributes:
-        unit: unit of the drift angle.
-        slope: regression of the sway velocity from positions on that from both columns.
-        is_speed: whether the other column is the speed; otherwise it is the surge velocity.
-        unexplained_share: unexplained share of u and v from both columns.
-        other_share: unexplained share of the best interpretation with the other meaning of the
-            column; infinite without another meaning.
-    """
-
-    unit: str
-    slope: SwaySlope
-    is_speed: bool
-    unexplained_share: float
-    other_share: float
-
-    @property
-    def is_consistent(self) -> bool:
-        """Whether the columns follow the motion."""
-        return self.unexplained_share < _MAX_UNEXPLAINED_SHARE
-
-    @property
-    def is_ambiguous(self) -> bool:
-        """Whether speed and surge velocity explain the motion almost equally well."""
-        return self.other_share < self.unexplained_share / _MIN_MEANING_RATIO
 
 
 @dataclass(frozen=True)
@@ -212,7 +146,7 @@ def choose_meaning(logs: Sequence[MeasuredVelocities]) -> MeaningChoice:
     names = [name for name in ("u", "v") if name in logs[0].columns]
     meanings = _PAIR_MEANINGS if len(names) == 2 else _SINGLE_MEANINGS[names[0]]
     shares = {
-        meaning: _compute_unexplained_share(logs, names, meaning.components) for meaning in meanings
+        meaning: compute_unexplained_share(logs, names, meaning.components) for meaning in meanings
     }
     ranking = sorted(shares, key=lambda meaning: shares[meaning])
     best = ranking[0]
@@ -240,70 +174,6 @@ def choose_meaning(logs: Sequence[MeasuredVelocities]) -> MeaningChoice:
     )
     margin = evidence[ranking[1]] - evidence[ranking[0]]
     return MeaningChoice(ranking[0], ranking[1], margin, text)
-
-
-def resolve_drift_angle(
-    speed: np.ndarray, drift_angle: np.ndarray, *, is_speed: bool = True
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return surge and sway velocity [T] of a vessel with a drift angle.
-
-    Args:
-        speed: speed [T], or surge velocity.
-        drift_angle: drift angle [T] in rad, positive with the flow from port (SNAME 1952).
-        is_speed: whether `speed` is the speed.
-    """
-    if is_speed:
-        return speed * np.cos(drift_angle), -speed * np.sin(drift_angle)
-    return speed, -speed * np.tan(drift_angle)
-
-
-def choose_drift_angle(
-    logs: Sequence[MeasuredVelocities], units: Sequence[str], *, can_be_surge: bool
-) -> DriftAngleChoice:
-    """Choose unit and direction of a drift angle, and the meaning of the speed next to it.
-
-    Args:
-        logs: logs with the columns `speed` and `drift_angle`, at least one.
-        units: possible units of the drift angle.
-        can_be_surge: whether the speed may be the surge velocity.
-    """
-    choices = []
-    for unit, is_speed in itertools.product(units, (True, False)[: 1 + can_be_surge]):
-        candidates = []
-        for log in logs:
-            u, v = resolve_drift_angle(
-                log.columns["speed"],
-                log.columns["drift_angle"] * to_si(unit, "rad"),
-                is_speed=is_speed,
-            )
-            candidates.append(dataclasses.replace(log, columns={"u": u, "v": v}))
-        share = _compute_unexplained_share(candidates, ("u", "v"), BODY_AXES.components)
-        slope = _regress_sway(candidates)
-        choices.append(DriftAngleChoice(unit, slope, is_speed, share, np.inf))
-    best = min(choices, key=lambda choice: choice.unexplained_share)
-    others = [choice.unexplained_share for choice in choices if choice.is_speed != best.is_speed]
-    return best._replace(other_share=min(others, default=np.inf))
-
-
-def _regress_sway(logs: Sequence[MeasuredVelocities]) -> SwaySlope:
-    """Regress the sway velocity from positions on the column v, with a mean for each log."""
-    regressors = []
-    responses = []
-    for log in logs:
-        column, reference = _select_pairs(log, "v", "sway")
-        windows = np.arange(column.size) * _N_WINDOWS // max(column.size, 1)
-        for window in range(_N_WINDOWS if column.size else 0):
-            regressors.append((column - column.mean())[windows == window])
-            responses.append((reference - reference.mean())[windows == window])
-    energies = [sum(float(part @ part) for part in parts) for parts in (regressors, responses)]
-    products = [float(x @ y) for x, y in zip(regressors, responses, strict=True)]
-    slope = sum(products) / max(energies[0], 1e-300)
-    # residuals of successive samples are correlated, those of windows hardly
-    scores = [
-        product - slope * float(x @ x) for product, x in zip(products, regressors, strict=True)
-    ]
-    error = math.sqrt(sum(score**2 for score in scores)) / max(energies[0], 1e-300)
-    return SwaySlope(slope, error, math.sqrt(energies[0] / max(energies[1], 1e-300)))
 
 
 def _fit_factors(
@@ -337,7 +207,7 @@ def _select_pairs(
     return column[is_valid], reference[is_valid]
 
 
-def _compute_unexplained_share(
+def compute_unexplained_share(
     logs: Sequence[MeasuredVelocities], names: Sequence[str], components: tuple[str, str]
 ) -> float:
     """Return the RMS residual of the columns over their RMS."""
