@@ -292,7 +292,7 @@ class ChannelMapper:
         names = [name for name in ("u", "v") if name in self._names]
         if not names:
             return
-        choice = MeaningChoice(BODY_AXES, BODY_AXES, np.inf, "")
+        choice = MeaningChoice(BODY_AXES, BODY_AXES, 0.0, "")
         as_named = self._try_heading_frame(self._names)
         # a vessel that sways as much as it surges has a frame with its velocities only
         is_consistent = as_named._score_consistency(as_named._motions) > _MIN_BODY_CONSISTENCY
@@ -341,7 +341,7 @@ class ChannelMapper:
             return choice.meaning
         options = (choice.meaning.description, choice.runner_up.description)
         columns = " and ".join(f"'{self._names[name]}'" for name in names)
-        question = f"meaning of {columns} (the margin {choice.margin:.0f} decides nothing)"
+        question = f"meaning of {columns}"
         answer = self._draft_notes.ask_question(
             (*CHANNELS_KEY, names[-1]), question, options[0], choice.text, options
         )

@@ -5,36 +5,21 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.frames import rotate
-from residnet.preprocessing.compatibility.hypotheses import (
-    MIN_MARGIN,
-    Hypothesis,
-    choose_stretch,
-    compare,
-)
-from residnet.preprocessing.compatibility.sensors import Sensor, SensorKind
 
 MAX_CONTRADICTION = 0.1
 """Largest share of the distance by which integrated velocities may leave the positions."""
 _MAX_UNEXPLAINED_SHARE = 0.35
 """Largest unexplained share of the columns under a meaning that replaces the one of the names."""
-_MIN_IMPROVEMENT = 0.5
-"""Largest ratio of unexplained shares from which a meaning replaces the one of the names."""
+_MAX_SHARE_RATIO = 0.5
+"""Largest ratio of unexplained shares of two meanings that are distinguished."""
 _CONSISTENT_SHARE = 0.1
 """Unexplained share below which columns have the meaning of their names."""
-_MAX_COMPARED_LOGS = 2
-"""Largest number of logs in the comparison by evidence, those with most yaw."""
-_MAX_NODES = 300
-"""Largest number of nodes of a log in that comparison; bounds its computing time."""
-_NODE_STEP = 0.5
-"""Smallest step between nodes in s."""
-_MAX_LEVER_ARM_SHARE = 0.05
-"""Largest lever arm of a receiver over the mean distance of a log."""
 _MIN_JUMP_RATIO = 15.0
 """Smallest ratio of a jump of the position to the median of unexplained steps."""
 _N_WINDOWS = 12
@@ -91,19 +76,20 @@ class MeaningChoice(NamedTuple):
     Attributes:
         meaning: most likely meaning.
         runner_up: second most likely meaning.
-        margin: difference of the BIC between both; infinite if it was not needed.
+        share_ratio: unexplained share of the first meaning over that of the second; 0 if the names
+            were not contradicted.
         text: reasons, one line.
     """
 
     meaning: Meaning
     runner_up: Meaning
-    margin: float
+    share_ratio: float
     text: str
 
     @property
     def is_ambiguous(self) -> bool:
         """Whether the user must choose."""
-        return self.margin < MIN_MARGIN
+        return self.share_ratio > _MAX_SHARE_RATIO
 
 
 def make_measured_velocities(
@@ -137,8 +123,8 @@ def make_measured_velocities(
 def choose_meaning(logs: Sequence[MeasuredVelocities]) -> MeaningChoice:
     """Choose the meaning of the columns u and v.
 
-    The columns are regressed on the components of the motion from positions. If these contradict
-    the names of the columns, the meanings are compared by their evidence.
+    The columns are regressed on the components of the motion from positions. Another meaning than
+    that of the names must leave at most half as much unexplained.
 
     Args:
         logs: logs with the same columns, at least one.
@@ -154,26 +140,18 @@ def choose_meaning(logs: Sequence[MeasuredVelocities]) -> MeaningChoice:
         len(meanings) < 2
         or best == BODY_AXES
         or shares[BODY_AXES] < _CONSISTENT_SHARE
-        or shares[best] > min(_MAX_UNEXPLAINED_SHARE, _MIN_IMPROVEMENT * shares[BODY_AXES])
+        or shares[best] > min(_MAX_UNEXPLAINED_SHARE, _MAX_SHARE_RATIO * shares[BODY_AXES])
     ):
-        return MeaningChoice(BODY_AXES, best, np.inf, "")
-    evidence = _compare_by_evidence(logs, names, {best, BODY_AXES, *ranking[1:2]})
-    ranking = sorted(evidence, key=lambda meaning: evidence[meaning])
-    columns_text = " and ".join(names)
+        return MeaningChoice(BODY_AXES, best, 0.0, "")
     alternatives = "; ".join(
-        f"{meaning.description}: BIC {evidence[meaning] - evidence[ranking[0]]:+.0f}, unexplained"
-        f" {100.0 * shares[meaning]:.1f} %"
-        for meaning in ranking[1:]
+        f"{meaning.description}: {100.0 * shares[meaning]:.1f} %" for meaning in ranking[1:]
     )
+    subject = "u and v are " if len(names) == 2 else ""
     text = (
-        f"{columns_text} are {ranking[0].description} (unexplained"
-        f" {100.0 * shares[ranking[0]]:.1f} %); alternatives: {alternatives}"
-        if len(names) == 2
-        else f"{ranking[0].description} (unexplained {100.0 * shares[ranking[0]]:.1f} %);"
-        f" alternatives: {alternatives}"
+        f"{subject}{best.description} (unexplained {100.0 * shares[best]:.1f} %; alternatives:"
+        f" {alternatives})"
     )
-    margin = evidence[ranking[1]] - evidence[ranking[0]]
-    return MeaningChoice(ranking[0], ranking[1], margin, text)
+    return MeaningChoice(best, ranking[1], shares[best] / max(shares[ranking[1]], 1e-12), text)
 
 
 def _fit_factors(
@@ -220,49 +198,6 @@ def compute_unexplained_share(
             residual += float(((column - factors[name] * reference) ** 2).sum())
             total += float((column**2).sum())
     return float(np.sqrt(residual / total)) if total > 0.0 else 1.0
-
-
-def _compare_by_evidence(
-    logs: Sequence[MeasuredVelocities], names: Sequence[str], meanings: set[Meaning]
-) -> dict[Meaning, float]:
-    """Return the BIC of each meaning beyond the best one, summed over the logs with most yaw."""
-    liveliness = [float(np.nanstd(np.gradient(log.heading, log.t))) for log in logs]
-    order = np.argsort(liveliness)[::-1][:_MAX_COMPARED_LOGS]
-    totals = dict.fromkeys(meanings, 0.0)
-    for index in order.tolist():
-        log = logs[index]
-        step = max(float(np.median(np.diff(log.t))), _NODE_STEP)
-        stride = max(round(step / float(np.median(np.diff(log.t)))), 1)
-        activity = (np.gradient(log.heading, log.t)) ** 2
-        start, stop = choose_stretch(log.t, activity, step, _MAX_NODES)
-        rows = np.flatnonzero((log.t >= start) & (log.t <= stop))[::stride]
-        t = log.t[rows]
-        hypotheses = {}
-        for meaning in meanings:
-            factors = _fit_factors(logs, names, meaning.components)
-            kinds = dict(zip(("u", "v"), meaning.components, strict=True))
-            hypotheses[meaning.description] = Hypothesis(
-                [
-                    Sensor("position", t, log.position[rows]),
-                    Sensor("heading", t, log.heading[rows], min_noise_std=1e-3),
-                    *(
-                        Sensor(
-                            cast("SensorKind", kinds[name]),
-                            t,
-                            log.columns[name][rows],
-                            name=name,
-                            factor=factors[name],
-                            min_noise_std=0.005 * float(np.nanstd(log.columns[name]) + 1e-9),
-                        )
-                        for name in names
-                    ),
-                ]
-            )
-        ranking = compare(hypotheses, stride * float(np.median(np.diff(log.t))))
-        margins = {ranked.name: ranked.margin for ranked in ranking}
-        for meaning in meanings:
-            totals[meaning] += margins[meaning.description]
-    return totals
 
 
 class HeadingOffset(NamedTuple):
@@ -342,9 +277,6 @@ def measure_contradiction(logs: Sequence[MeasuredVelocities]) -> Contradiction |
     columns[np.arange(response.size), 1 + np.array(log_numbers)] = durations
     columns[:, -1] = rotations
     solution = np.linalg.lstsq(columns, response, rcond=1e-10)[0]
-    if abs(solution[-1]) > _MAX_LEVER_ARM_SHARE * distance / len(logs):
-        columns[:, -1] = 0.0
-        solution = np.linalg.lstsq(columns, response, rcond=1e-10)[0]
     residual = response - columns @ solution
     gain = complex(solution[0])
     spread = float(np.sqrt(np.mean(np.abs(residual) ** 2) / max(response.size - 3, 1)))
