@@ -559,13 +559,17 @@ class _DraftLogs:
                 for name, entry in channels.items()
                 if name in state_channels or name in renamed_inputs
             }
-            draft_notes.rename_keys(
-                CHANNELS_KEY,
-                {
-                    name: renamed_inputs.get(name, name)
-                    for name in (*state_channels, *renamed_inputs)
-                },
-            )
+            depth = len(CHANNELS_KEY)
+
+            def rename_channel(key: Key) -> Key | None:
+                if key[:depth] != CHANNELS_KEY or len(key) == depth:
+                    return key
+                name = key[depth]
+                if name not in state_channels and name not in renamed_inputs:
+                    return None
+                return (*CHANNELS_KEY, renamed_inputs.get(name, name), *key[depth + 1 :])
+
+            draft_notes.replace_keys(rename_channel)
         for logs in (self.logs, self.complete_logs):
             for path, log in logs.items():
                 renamed_channels = {

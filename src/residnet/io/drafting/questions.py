@@ -5,7 +5,6 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, final
 
 import yaml
@@ -137,43 +136,22 @@ class DraftNotes:
         self.guessed_values += other_notes.guessed_values
         self.notes += other_notes.notes
 
+    def replace_keys(self, new_key: Callable[[Key], Key | None]) -> None:
+        """Replace the keys of guesses and notes; entries whose new key is None are dropped."""
+        for entries in (self.guessed_values, self.notes):
+            replaced = [(new_key(key), text) for key, text in entries]
+            entries[:] = [(key, text) for key, text in replaced if key is not None]
+
     def discard_key(self, key: Key) -> None:
         """Discard the guesses and notes of a key, and its children, that the config lacks."""
-        depth = len(key)
-        self.guessed_values = [item for item in self.guessed_values if item[0][:depth] != key]
-        self.notes = [item for item in self.notes if item[0][:depth] != key]
+        self.replace_keys(lambda entry: None if entry[: len(key)] == key else entry)
 
     def move_key(self, old_key: Key, new_key: Key) -> None:
         """Move the guesses and notes of a key and its children to another key."""
         depth = len(old_key)
-        self.guessed_values, self.notes = (
-            [
-                ((*new_key, *key[depth:]) if key[:depth] == old_key else key, text)
-                for key, text in entries
-            ]
-            for entries in (self.guessed_values, self.notes)
+        self.replace_keys(
+            lambda entry: (*new_key, *entry[depth:]) if entry[:depth] == old_key else entry
         )
-
-    def rename_keys(self, parent: Key, names: Mapping[str, str]) -> None:
-        """Rename the children of a key in guesses and notes, and drop entries of other children.
-
-        Args:
-            parent: key of a mapping.
-            names: child -> new name.
-        """
-
-        def rename_entries(entries: list[tuple[Key, str]]) -> list[tuple[Key, str]]:
-            renamed = []
-            for key, text in entries:
-                if len(key) > len(parent) and key[: len(parent)] == parent:
-                    if key[len(parent)] not in names:
-                        continue
-                    key = (*parent, names[key[len(parent)]], *key[len(parent) + 1 :])
-                renamed.append((key, text))
-            return renamed
-
-        self.guessed_values = rename_entries(self.guessed_values)
-        self.notes = rename_entries(self.notes)
 
     def comments_at(self, key: Key) -> list[str]:
         """Return the comments on a key of the config, guesses first."""
@@ -192,63 +170,31 @@ def dump_commented_yaml(
         comments: function from the path of a key to its comment lines.
         head_lines: comment lines at the top.
     """
-    lines = [line for text in head_lines for line in _wrap_comment(text, "")]
-    return "\n".join([*lines, *_format_entries(content, (), comments)]) + "\n"
+    # mappings and lists of scalars are written in flow style
+    text = yaml.safe_dump(
+        content, default_flow_style=None, width=_LINE_WIDTH, sort_keys=False, allow_unicode=True
+    )
+    comments_by_line: dict[int, list[str]] = {0: list(head_lines)}
 
+    def collect_comments(node: yaml.Node, parent: Key) -> None:
+        if isinstance(node, yaml.MappingNode):
+            for key_node, value_node in node.value:
+                key = (*parent, str(key_node.value))
+                texts = comments_by_line.setdefault(key_node.start_mark.line, [])
+                texts += comments(key)
+                collect_comments(value_node, key)
 
-def _format_entries(
-    content: Mapping[str, Any], parent_path: tuple[str, ...], comments: CommentLookup
-) -> list[str]:
-    """Return the YAML lines of a mapping; short values are written in flow style on one line."""
+    collect_comments(yaml.compose(text), ())
     lines = []
-    indent = "  " * len(parent_path)
-    for key, value in content.items():
-        path = (*parent_path, str(key))
-        lines += [line for text in comments(path) for line in _wrap_comment(text, indent)]
-        nested_lines = (
-            _format_entries(value, path, comments) if isinstance(value, Mapping) and value else []
-        )
-        if nested_lines and any(
-            isinstance(nested_value, Mapping) for nested_value in value.values()
-        ):
-            # never on one line, whose text takes most of the time of a draft's text
-            lines += [f"{indent}{_format_flow(key)}:", *nested_lines]
-            continue
-        flow_text = _format_flow(value)
-        fits_on_line = len(indent) + len(str(key)) + 2 + len(flow_text) <= _LINE_WIDTH
-        has_comments = any(line.lstrip().startswith("#") for line in nested_lines)
-        if nested_lines and (has_comments or not fits_on_line):
-            lines += [f"{indent}{_format_flow(key)}:", *nested_lines]
-            continue
-        if isinstance(value, list) and value and not fits_on_line:
-            lines += [
-                f"{indent}{_format_flow(key)}:",
-                *(f"{indent}  - {_format_flow(item)}" for item in value),
-            ]
-        else:
-            lines.append(f"{indent}{_format_flow(key)}: {flow_text}")
-    return lines
-
-
-def _format_flow(value: Any) -> str:
-    return _format_text_flow(value) if type(value) is str else _format_any_flow(value)
-
-
-@lru_cache(maxsize=4096)
-def _format_text_flow(text: str) -> str:
-    """Format a text; keys occur again and again."""
-    return _format_any_flow(text)
-
-
-def _format_any_flow(value: Any) -> str:
-    text: str = yaml.safe_dump(
-        value, default_flow_style=True, width=10**6, sort_keys=False, allow_unicode=True
-    )
-    return text.strip().removesuffix("...").strip()
-
-
-def _wrap_comment(text: str, indent: str) -> list[str]:
-    lines = textwrap.wrap(
-        " ".join(text.split()), _LINE_WIDTH - len(indent) - 2, break_long_words=False
-    )
-    return [f"{indent}# {line}" for line in lines]
+    for number, line in enumerate(text.splitlines()):
+        indent = " " * (len(line) - len(line.lstrip()))
+        for comment in comments_by_line.get(number, ()):
+            lines += textwrap.wrap(
+                " ".join(comment.split()),
+                _LINE_WIDTH,
+                initial_indent=f"{indent}# ",
+                subsequent_indent=f"{indent}# ",
+                break_long_words=False,
+            )
+        lines.append(line)
+    return "\n".join([*lines, ""])
