@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from residnet.core.names import CHANNEL_UNITS
+from residnet.io.drafting.motion_regression import RawTable, estimate_rudder_gain
 from residnet.io.drafting.pose_search import extract_pose
 from residnet.io.drafting.questions import CHANNELS_KEY, DraftNotes
 from residnet.io.header_vocabulary import MOTION_CHANNELS, match_input_channel, parse_name
@@ -91,10 +92,11 @@ def find_actuator_fields(
         candidate_fields = fields_by_channel[channel]
         has_publishers = len({f for _, f in candidate_fields}) == 1 and len(candidate_fields) > 1
         if has_publishers and channel in ("delta", "cmd_delta"):
-            candidate_fields.sort(
-                key=_rank_publishers(channel, recordings[0], candidate_fields, plan, draft_notes)
+            followed = _find_followed_field(
+                channel, recordings[0], candidate_fields, plan, draft_notes
             )
-            followed_publisher = _publisher_of(candidate_fields[0][0])
+            candidate_fields.sort(key=lambda entry: entry != followed)
+            followed_publisher = _publisher_of(followed[0])
         elif has_publishers and followed_publisher:
             candidate_fields.sort(key=lambda entry: _publisher_of(entry[0]) != followed_publisher)
             if _publisher_of(candidate_fields[0][0]) == followed_publisher:
@@ -128,17 +130,16 @@ def _publisher_of(topic: str) -> str:
     return topic.strip("/").split("/", 1)[0]
 
 
-def _rank_publishers(
+def _find_followed_field(
     channel: str,
     recording: Recording,
     fields: Sequence[tuple[str, str]],
     plan: ChannelPlan,
     draft_notes: DraftNotes,
-) -> Callable[[tuple[str, str]], float]:
-    """Return the sort key of commands of one rudder by several topics: the followed one first.
+) -> tuple[str, str]:
+    """Return which of the commands of one rudder by several topics the vessel follows.
 
-    The vessel follows the command whose regression explains most of the changes of its yaw rate
-    over a second; the yaw rate itself is another regressor.
+    It is the one with the most significant effect on the yaw rate; without a pose the first one.
 
     Args:
         channel: channel of the rudder.
@@ -148,36 +149,27 @@ def _rank_publishers(
         draft_notes: receives the guess.
     """
     pose = None
-    if len(fields) > 1 and plan.position is not None and plan.heading is not None:
+    if plan.position is not None and plan.heading is not None:
         pose = extract_pose(recording, plan.position, plan.heading)
     if pose is None:
-        return lambda _: 0.0
-    is_known = np.isfinite(pose.columns["psi"])
-    t = pose.t[is_known]
-    yaw_rate = np.gradient(np.unwrap(pose.columns["psi"][is_known]), t)
-    horizon = max(1, round(1.0 / float(np.median(np.diff(t)))))
-    change = yaw_rate[horizon:] - yaw_rate[:-horizon]
-    explained: dict[tuple[str, str], float] = {}
+        return fields[0]
+    yaw_rate = np.gradient(pose.columns["psi"], pose.t)
+    significances = {}
     for topic, field in fields:
         series = recording.series[topic]
-        rows = np.maximum(np.searchsorted(series.clock, t, side="right") - 1, 0)
-        command = series[field][rows][:-horizon]
-        regressors = np.stack((np.ones(command.size), yaw_rate[:-horizon], command), axis=1)
-        usable = np.isfinite(regressors).all(axis=1) & np.isfinite(change)
-        solution = np.linalg.lstsq(regressors[usable], change[usable], rcond=None)[0]
-        residual = change[usable] - regressors[usable] @ solution
-        explained[topic, field] = 1.0 - float(
-            np.var(residual) / max(np.var(change[usable]), 1e-300)
-        )
-    followed = max(fields, key=lambda source: explained[source])
-    shares = ", ".join(f"{topic} {explained[topic, field]:.2f}" for topic, field in fields)
+        rows = np.maximum(np.searchsorted(series.clock, pose.t, side="right") - 1, 0)
+        table = RawTable(pose.t, {channel: series[field][rows]})
+        gain, standard_error = estimate_rudder_gain([table], channel, {0: yaw_rate})
+        significances[topic, field] = abs(gain) / standard_error
+    followed = max(fields, key=lambda source: significances[source])
+    text = ", ".join(f"{topic} {ratio:.0f}" for (topic, _), ratio in significances.items())
     draft_notes.add_guess(
         (*CHANNELS_KEY, channel),
         f"{fields[0][1]} is written by {' and '.join(topic for topic, _ in fields)};"
-        f" {followed[0]} is used, because it explains the yaw rate best (explained share of its"
-        f" changes: {shares})",
+        f" {followed[0]} is used, because its effect on the yaw rate is the most significant"
+        f" (in standard errors: {text})",
     )
-    return lambda source: -explained[source]
+    return followed
 
 
 _MOOS_MESSAGE_TYPE = "moos/Variables"
