@@ -11,18 +11,14 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.layout import SIX_DOF_LAYOUT
-from residnet.io.drafting.channel_map import draft_channel_map
-from residnet.io.drafting.column_names import match_channels, rename_pulsed_drives
+from residnet.io.drafting.column_names import match_channels
 from residnet.io.drafting.motion_columns import (
-    choose_quaternion_order,
-    find_depth_channels,
     find_quaternions,
-    is_vertical_axis_up,
 )
 from residnet.io.drafting.motion_regression import RawTable
 from residnet.io.drafting.motion_sources import MIN_MOTION_ROWS, MotionSources, median_series_step
 from residnet.io.drafting.questions import CHANNELS_KEY, READER_KEY, UNMAPPED_FIELDS, DraftNotes
-from residnet.io.drafting.vertical import draft_vertical_motion, project_on_horizontal
+from residnet.io.drafting.tables import draft_columns
 from residnet.io.header_vocabulary import MOTION_CHANNELS, match_state_channel, parse_name
 from residnet.io.readers.quantities import QUATERNION, SPEED_CHANNELS
 from residnet.io.readers.recording import Recording
@@ -63,30 +59,15 @@ def find_named_table(
             and bool((np.diff(tables[0].columns[name]) > 0.0).all())
         )
     ]
-    attitudes = find_quaternions(fields)
-    compound_fields = {field for attitude in attitudes for field in attitude.values()}
-    simple_fields = [name for name in fields if name not in compound_fields]
-    names = match_channels(simple_fields, draft_notes)
-    names = rename_pulsed_drives(names, [table.columns for table in tables])
-    names |= find_depth_channels(simple_fields, names)
-    if "psi" not in names:
-        names |= choose_quaternion_order(attitudes, [table.columns for table in tables])
+    channel_notes = DraftNotes()
+    names, entries = draft_columns(
+        recordings[0].path, fields, tables, channel_notes, match_channels, has_heading=True
+    )
     has_attitude = "psi" in names or "qw" in names
     has_position = {"x", "y"} <= {*names} or {"latitude", "longitude"} <= {*names}
     if not (has_attitude and has_position):
         return None
-    logs = [
-        RawTable(table.t, {name: table.columns[field] for name, field in names.items()})
-        for table in tables
-    ]
-    columns = [table.columns for table in tables]
-    entries = draft_channel_map(
-        names,
-        project_on_horizontal(simple_fields, columns, logs, names),
-        draft_notes,
-        is_up_positive=is_vertical_axis_up(simple_fields, names, columns),
-    )
-    entries |= draft_vertical_motion(simple_fields, columns, logs, entries, draft_notes)
+    draft_notes.extend(channel_notes)
     used_columns = {entry["column"] for entry in entries.values()} | {*names.values()}
     unused_fields = [name for name in fields if name not in used_columns]
     if unused_fields:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -95,67 +95,37 @@ def draft_tables(
         name for name in common_columns if name in numeric_columns and name not in clock.columns
     ]
     refuse_minute_columns(main_preview.path, common_numeric)
-    attitudes = find_quaternions(common_numeric)
-    compound_columns = {column for attitude in attitudes for column in attitude.values()}
-    sin_cos_pairs = find_sin_cos_pairs(
-        common_numeric, [preview.numeric_columns for preview in previews]
-    )
-    compound_columns |= {column for pair in sin_cos_pairs.values() for column in pair}
-    simple_columns = [name for name in common_numeric if name not in compound_columns]
-    has_sin_cos_heading = any(
-        match_state_channel(parse_name(stem)) == "psi" for stem in sin_cos_pairs
-    )
-    column_by_channel = match_columns_of_one_vessel(
-        simple_columns,
-        main_preview.numeric_columns,
-        draft_notes,
-        has_heading=has_heading or has_sin_cos_heading or bool(attitudes),
-    )
-    if select:
-        drop_ais_turn_rate(column_by_channel, main_preview, draft_notes)
-    column_by_channel = rename_pulsed_drives(
-        column_by_channel, [preview.numeric_columns for preview in previews]
-    )
-    column_by_channel = add_sin_cos_channels(column_by_channel, sin_cos_pairs)
-    _drop_incomplete_roll(column_by_channel, previews, draft_notes)
-    column_by_channel |= find_depth_channels(simple_columns, column_by_channel)
-    refuse_unparsed_positions(main_preview, column_by_channel)
-    if "psi" not in column_by_channel:
-        column_by_channel |= choose_quaternion_order(
-            attitudes, [preview.numeric_columns for preview in previews]
+    logs = _build_raw_tables(previews, common_numeric, errors, step)
+
+    def match_columns(
+        columns: Sequence[str], draft_notes: DraftNotes, *, has_heading: bool
+    ) -> dict[str, str]:
+        names = match_columns_of_one_vessel(
+            columns, main_preview.numeric_columns, draft_notes, has_heading=has_heading
         )
+        if select:
+            drop_ais_turn_rate(names, main_preview, draft_notes)
+        return names
+
+    column_by_channel, channels = draft_columns(
+        main_preview.path,
+        common_numeric,
+        logs,
+        draft_notes,
+        match_columns,
+        _collect_texts(main_preview),
+        has_heading=has_heading,
+    )
+    refuse_unparsed_positions(main_preview, column_by_channel)
     if not column_by_channel:
         raise DataError(
             f"{main_preview.path}: no column has the name of a channel"
             f" ({', '.join(common_numeric[:12])});"
             f" {_suggest_table_fix(main_preview, clock, common_numeric)}"
         )
-    logs = _build_raw_tables(previews, column_by_channel, errors, step)
-    tables = [preview.numeric_columns for preview in previews]
-    refuse_vertical_y(main_preview.path, simple_columns, tables, column_by_channel)
-    channels = draft_channel_map(
-        column_by_channel,
-        project_on_horizontal(simple_columns, tables, logs, column_by_channel),
-        draft_notes,
-        _collect_texts(main_preview),
-        is_up_positive=is_vertical_axis_up(
-            simple_columns,
-            column_by_channel,
-            tables,
-        ),
-    )
-    channels |= draft_vertical_motion(
-        simple_columns,
-        tables,
-        logs,
-        channels,
-        draft_notes,
-    )
-    column_by_channel |= {
-        name: entry["column"] for name, entry in channels.items() if name in VERTICAL_CHANNELS
-    }
     for channel, entry in channels.items():
-        if _is_recorded_on_change(channel, logs):
+        is_input = channel not in (*MOTION_AND_WIND_CHANNELS, *QUATERNION, *MAX_COORDINATES)
+        if is_input and _is_recorded_on_change(entry["column"], logs):
             entry["hold"] = True
             text = "recorded when it changes: zero-order hold between the values"
             draft_notes.add_guess((*CHANNELS_KEY, channel), text)
@@ -168,6 +138,77 @@ def draft_tables(
     _note_tests_of_files(files, draft_notes)
     _note_unused_columns(main_preview, column_by_channel, clock, draft_notes, {*select})
     return {**reader_config, "channels": channels}, errors
+
+
+def draft_columns(
+    path: Path,
+    columns: Sequence[str],
+    logs: Sequence[RawTable],
+    draft_notes: DraftNotes,
+    match_columns: Callable[..., dict[str, str]],
+    texts: Sequence[str] = (),
+    *,
+    has_heading: bool,
+) -> tuple[dict[str, str], dict[str, dict[str, Any]]]:
+    """Draft the channel map of columns from their names, units, values and physics.
+
+    Args:
+        path: first file, for errors.
+        columns: names of the columns of numbers.
+        logs: tables with these columns, some of which may be missing.
+        draft_notes: receives guesses and notes.
+        match_columns: function like `match_channels`.
+        texts: names of all columns, and cells, which may contain the name of a frame.
+        has_heading: whether other files may have the heading.
+
+    Returns:
+        Channel -> column, and channel -> entry; both empty if no name is that of a channel.
+
+    Raises:
+        DataError: if the axes or the velocities are no motion of a vessel.
+    """
+    tables = [log.columns for log in logs]
+    attitudes = find_quaternions(columns)
+    sin_cos_pairs = find_sin_cos_pairs(columns, tables)
+    compound_columns = {column for attitude in attitudes for column in attitude.values()}
+    compound_columns |= {column for pair in sin_cos_pairs.values() for column in pair}
+    simple_columns = [name for name in columns if name not in compound_columns]
+    has_heading |= bool(attitudes)
+    has_heading |= any(match_state_channel(parse_name(stem)) == "psi" for stem in sin_cos_pairs)
+    names = match_columns(simple_columns, draft_notes, has_heading=has_heading)
+    names = rename_pulsed_drives(names, tables)
+    names = add_sin_cos_channels(names, sin_cos_pairs)
+    for name in ("phi", "p"):
+        # roll is optional for a model, so that it is left out rather than the tables without it
+        if any(names.get(name, columns[0]) not in table for table in tables):
+            draft_notes.add_note(CHANNELS_KEY, f"empty in some files, left out: {names.pop(name)}")
+    names |= find_depth_channels(simple_columns, names)
+    if "psi" not in names:
+        names |= choose_quaternion_order(attitudes, tables)
+    if not names:
+        return {}, {}
+    refuse_vertical_y(path, simple_columns, tables, names)
+    mapped_logs = [
+        RawTable(
+            log.t,
+            {
+                channel: log.columns[column]
+                for channel, column in names.items()
+                if column in log.columns
+            },
+        )
+        for log in logs
+    ]
+    entries = draft_channel_map(
+        names,
+        project_on_horizontal(simple_columns, tables, mapped_logs, names),
+        draft_notes,
+        texts,
+        is_up_positive=is_vertical_axis_up(simple_columns, names, tables),
+    )
+    entries |= draft_vertical_motion(simple_columns, tables, mapped_logs, entries, draft_notes)
+    names |= {name: entry["column"] for name, entry in entries.items() if name in VERTICAL_CHANNELS}
+    return names, entries
 
 
 def _compose_reader_config(
@@ -237,20 +278,6 @@ def _find_common_columns(
             " in one word, each with other quantities)"
         )
     return common_columns
-
-
-def _drop_incomplete_roll(
-    column_by_channel: dict[str, str], previews: Sequence[TablePreview], draft_notes: DraftNotes
-) -> None:
-    """Remove roll channels that are empty in some tables.
-
-    Roll is optional for a model, so that it is left out rather than the tables without it.
-    """
-    for name in ("phi", "p"):
-        column = column_by_channel.get(name)
-        if column is not None and any(column not in sheet.numeric_columns for sheet in previews):
-            del column_by_channel[name]
-            draft_notes.add_note(CHANNELS_KEY, f"empty in some files, left out: {column}")
 
 
 def _suggest_table_fix(
@@ -325,56 +352,44 @@ def _collect_texts(preview: TablePreview) -> list[str]:
 
 
 def _build_raw_tables(
-    sheets: Sequence[TablePreview],
-    names: Mapping[str, str],
+    previews: Sequence[TablePreview],
+    columns: Sequence[str],
     errors: dict[Path, ResidnetError],
     step: str | None,
 ) -> list[RawTable]:
-    """Return the mapped columns of each table on its clock, sorted by time and without copies."""
+    """Return columns of each table on its clock, sorted by time and without copies of rows."""
     logs = []
-    for preview in sheets:
+    for preview in previews:
         try:
             clock = detect_clock(preview) if step is None else make_step_clock(preview, step)
         except DataError as error:
             errors[preview.path] = error
             continue
-        columns = {
-            channel: preview.numeric_columns[column]
-            for channel, column in names.items()
-            if column in preview.numeric_columns
-        }
         # tables in reverse order of time are reversed
         direction = -1 if (np.diff(clock.seconds[np.isfinite(clock.seconds)]) < 0.0).all() else 1
-        columns = {channel: values[::direction] for channel, values in columns.items()}
+        values = {
+            name: preview.numeric_columns[name][::direction]
+            for name in columns
+            if name in preview.numeric_columns
+        }
         t = clock.seconds[::direction]
-        is_unique = find_unique_rows(t, columns.values()) if columns else t == t
+        is_unique = find_unique_rows(t, values.values()) if values else t == t
         logs.append(
-            RawTable(t[is_unique], {name: values[is_unique] for name, values in columns.items()})
+            RawTable(t[is_unique], {name: column[is_unique] for name, column in values.items()})
         )
     return logs
 
 
-def _is_recorded_on_change(channel: str, logs: Sequence[RawTable]) -> bool:
-    """Return whether an input is recorded when it changes.
-
-    Such a channel has values in less than half of the rows, at irregular intervals.
-    """
-    if channel in (*MOTION_AND_WIND_CHANNELS, *QUATERNION, *MAX_COORDINATES):
+def _is_recorded_on_change(column: str, logs: Sequence[RawTable]) -> bool:
+    """Return whether a column has values in less than half of the rows, at irregular intervals."""
+    tables = [log.columns[column] for log in logs if column in log.columns]
+    filled_rows = [np.flatnonzero(np.isfinite(values)) for values in tables]
+    intervals = np.concatenate([np.zeros(0), *map(np.diff, filled_rows)])
+    n_rows = sum(values.size for values in tables)
+    if not intervals.size or 2 * sum(rows.size for rows in filled_rows) >= n_rows:
         return False
-    filled_rows = [
-        np.flatnonzero(np.isfinite(table.columns[channel]))
-        for table in logs
-        if channel in table.columns
-    ]
-    samples = sum(table.t.size for table in logs if channel in table.columns)
-    intervals = (
-        np.concatenate([np.diff(rows) for rows in filled_rows]) if filled_rows else np.zeros(0)
-    )
-    if not intervals.size or 2 * sum(rows.size for rows in filled_rows) >= samples:
-        return False
-    is_regular = np.abs(intervals - np.median(intervals)) <= INTERVAL_TOLERANCE * np.median(
-        intervals
-    )
+    step = np.median(intervals)
+    is_regular = np.abs(intervals - step) <= INTERVAL_TOLERANCE * step
     return bool(is_regular.mean() < MIN_REGULAR_SHARE)
 
 
