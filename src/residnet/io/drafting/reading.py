@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from residnet.core.config import validate_config
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.layout import DegreesOfFreedom
@@ -33,16 +35,22 @@ from residnet.io.drafting.problems import (
     raise_unreadable,
     rewrite_advice_for_files,
 )
-from residnet.io.drafting.questions import INPUTS_KEY, READER_KEY, DraftNotes, Key
+from residnet.io.drafting.questions import (
+    CHANNELS_KEY,
+    INPUTS_KEY,
+    READER_KEY,
+    DraftNotes,
+    Key,
+)
 from residnet.io.drafting.recordings import draft_recordings
 from residnet.io.drafting.tables import draft_tables
 from residnet.io.drafting.trips import draft_trip_parts, group_by_trip, refuse_topics
 from residnet.io.header_vocabulary import PLANE_PATTERN, parse_header_unit
 from residnet.io.readers import ReaderConfig
 from residnet.io.readers.detect import detect_log_kind, is_channel_reader
-from residnet.io.readers.manoeuvre_kinds import UNKNOWN, resolve_manoeuvre
+from residnet.io.readers.manoeuvre_kinds import UNKNOWN
 from residnet.io.readers.recording import Recording
-from residnet.io.readers.tables import TABLE_KINDS, read_column_names
+from residnet.io.readers.tables import read_column_names
 from residnet.io.split import assign_log_names
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 
@@ -119,7 +127,7 @@ def read_drafted(
         raise_unreadable(result.errors)
     _correct_joined_rates(result)
     _correct_rudder_signs(result)
-    _name_manoeuvres(result)
+    _note_manoeuvres(result)
     return result
 
 
@@ -144,25 +152,13 @@ def _detect_common_kind(paths: Sequence[Path]) -> str:
     return kind_by_path[paths[0]]
 
 
-def _name_manoeuvres(result: DraftResult) -> None:
-    """Infer the kinds of manoeuvres of tables, unless folders name them.
-
-    Args:
-        result: drafted reader and its logs, which receive the kinds.
-    """
-    if "manoeuvre" in result.reader or result.reader["kind"] not in TABLE_KINDS.values():
-        return
-    kinds = {path: resolve_manoeuvre("auto", path, log) for path, log in result.logs.items()}
-    counts = Counter(kind for kind in kinds.values() if kind != UNKNOWN)
-    if not counts:
-        return
-    result.reader["manoeuvre"] = "auto"
-    text = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-    result.draft_notes.add_guess(
-        (*READER_KEY, "manoeuvre"),
-        f"{text} of {len(kinds)} logs, by the names of the files or by rudder angle and heading",
-    )
-    result.logs = {path: log.replace(manoeuvre=kinds[path]) for path, log in result.logs.items()}
+def _note_manoeuvres(result: DraftResult) -> None:
+    """Note the kinds of manoeuvres that the reader infers."""
+    counts = Counter(log.manoeuvre for log in result.logs.values() if log.manoeuvre != UNKNOWN)
+    if counts and result.reader.get("manoeuvre") == "auto":
+        kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+        text = f"{kinds} of {len(result.logs)} logs, by names of files or by rudder and heading"
+        result.draft_notes.add_guess((*READER_KEY, "manoeuvre"), text)
 
 
 def read_mixed_formats(
@@ -199,6 +195,16 @@ def read_mixed_formats(
     return results
 
 
+def _scale_channel(result: DraftResult, name: str, entry: dict[str, Any], factor: float) -> None:
+    """Multiply a channel of all logs by a factor, whose sign is that of its entry."""
+    if factor < 0.0:
+        entry["sign"] = -1 * int(entry.get("sign", 1))
+    for path, log in result.logs.items():
+        if name in log.channels:
+            channels = {**log.channels, name: factor * log[name]}
+            result.logs[path] = log.replace(channels=channels)
+
+
 def _correct_joined_rates(result: DraftResult) -> None:
     """Correct sign and unit of a yaw rate whose heading is in another file of its trip.
 
@@ -210,28 +216,25 @@ def _correct_joined_rates(result: DraftResult) -> None:
     for part_name, part in result.reader.get("parts", {}).items():
         entry = part["channels"].get("r")
         logs = [log for log in result.logs.values() if {"psi", "r"} <= log.channels.keys()]
-        if entry is None or "psi" in part["channels"] or not logs:
+        if entry is None or "psi" in part["channels"]:
             continue
         tables = [RawTable(log.t, {"psi": log["psi"], "r": log["r"]}) for log in logs]
         fit = fit_rate_to_angle(tables, "psi", "rad", "r")
         if not fit.is_significant:
             continue
-        key = (*READER_KEY, "parts", part_name, "channels", "r")
-        factor = 1.0
-        unit = ScaleFit(fit.factor * to_si(entry["unit"]), fit.correlation).matching_unit("rad/s")
+        factor = float(np.sign(fit.factor))
+        text = "positive to port by headings" if factor < 0.0 else ""
+        # the logs are in SI by the unit that was guessed
+        old_factor = to_si(entry["unit"])
+        unit = ScaleFit(fit.factor * old_factor, fit.correlation).matching_unit("rad/s")
         if unit not in (None, entry["unit"]) and not parse_header_unit(entry["column"], "rad/s"):
-            factor = to_si(unit) / to_si(entry["unit"])
+            factor *= to_si(unit) / old_factor
             entry["unit"] = unit
-            text = f"the header has no unit; headings give {unit}"
+            text = f"the header has no unit; headings give {unit} {text}".strip()
+        _scale_channel(result, "r", entry, factor)
+        if text:
+            key = (*READER_KEY, "parts", part_name, "channels", "r")
             result.draft_notes.add_guess(key, f"{text} (correlation {fit.correlation:.2f})")
-        if fit.factor < 0.0:
-            factor = -factor
-            entry["sign"] = -1 * int(entry.get("sign", 1))
-            text = f"positive to port by headings (correlation {fit.correlation:.2f})"
-            result.draft_notes.add_guess(key, text)
-        for path, log in result.logs.items():
-            if factor != 1.0 and "r" in log.channels:
-                result.logs[path] = log.replace(channels={**log.channels, "r": factor * log["r"]})
 
 
 def _correct_rudder_signs(result: DraftResult) -> None:
@@ -242,17 +245,11 @@ def _correct_rudder_signs(result: DraftResult) -> None:
     Args:
         result: drafted reader and its logs.
     """
-    part_settings: dict[Key, Mapping[str, Any]] = {
-        (*READER_KEY, "parts", part_name): part
-        for part_name, part in result.reader.get("parts", {}).items()
-    }
-    part_settings = part_settings or {READER_KEY: result.reader}
-    channels: dict[str, dict[str, Any]] = {}
-    entry_keys: dict[str, Key] = {}
-    for part_key, part in part_settings.items():
-        for name, entry in part.get("channels", {}).items():
-            channels.setdefault(name, entry)
-            entry_keys.setdefault(name, (*part_key, "channels", name))
+    parts = result.reader.get("parts", {})
+    channel_maps = {
+        (*READER_KEY, "parts", part_name, "channels"): part["channels"]
+        for part_name, part in parts.items()
+    } or {CHANNELS_KEY: result.reader.get("channels", {})}
     channel_names = dict.fromkeys(name for log in result.logs.values() for name in log.channels)
     names = [name for name in channel_names if re.match(r"(cmd_)?delta(?!_rate)", name)]
     logs_with_rates = [
@@ -262,9 +259,7 @@ def _correct_rudder_signs(result: DraftResult) -> None:
     ]
     for name in names:
         is_plane = PLANE_PATTERN.match(name) is not None
-        rate, rate_sign, opposite_direction = (
-            ("q", -1.0, "up") if is_plane else ("r", 1.0, "to port")
-        )
+        rate, rate_sign, direction = ("q", -1.0, "up") if is_plane else ("r", 1.0, "to port")
         columns = [name, "theta"] if is_plane else [name]
         usable_logs = [log for log in logs_with_rates if {rate, *columns} <= log.channels.keys()]
         logs = [RawTable(log.t, {column: log[column] for column in columns}) for log in usable_logs]
@@ -272,25 +267,19 @@ def _correct_rudder_signs(result: DraftResult) -> None:
         gain, standard_error = estimate_rudder_gain(
             logs, name, rates, "theta" if is_plane else None
         )
-        key = entry_keys.get(name, INPUTS_KEY)
+        key, entry = next(
+            (((*key, name), part[name]) for key, part in channel_maps.items() if name in part),
+            (INPUTS_KEY, {}),
+        )
+        text = f"positive values of {name} turned the vessel {direction} in the logs"
         if abs(gain) < MIN_STANDARD_ERRORS * standard_error:
-            result.draft_notes.add_guess(
-                key, f"the logs do not determine in which direction {name} turns the vessel"
-            )
-        elif gain < 0.0 and name in channels:
-            channels[name]["sign"] = -1 * int(channels[name].get("sign", 1))
-            text = (
-                f"positive values turned the vessel {opposite_direction} in the logs"
-                f" ({-gain / standard_error:.0f} standard errors): the sign is reversed"
-            )
-            result.draft_notes.add_guess(key, text)
-            for path, log in result.logs.items():
-                if name in log.channels:
-                    negated_channels = {**log.channels, name: -log[name]}
-                    result.logs[path] = log.replace(channels=negated_channels)
-        elif gain < 0.0:
-            text = f"positive values of {name} turned the vessel {opposite_direction} in the logs"
-            result.draft_notes.add_guess(key, text)
+            text = f"the logs do not determine in which direction {name} turns the vessel"
+        elif gain > 0.0:
+            continue
+        elif entry:
+            _scale_channel(result, name, entry, -1.0)
+            text += f" ({-gain / standard_error:.0f} standard errors): the sign is reversed"
+        result.draft_notes.add_guess(key, text)
 
 
 def _complete_turn_rates(log: Log) -> Log | None:

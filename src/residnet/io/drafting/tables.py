@@ -134,7 +134,7 @@ def draft_tables(
             **column_settings.get(entry["column"], {}),
         }
     reader_config = _compose_reader_config(main_preview, clock, names, select, draft_notes)
-    reader_config |= draft_manoeuvre_setting(files, draft_notes)
+    reader_config |= {"manoeuvre": "auto"} | draft_manoeuvre_setting(files, draft_notes)
     _note_tests_of_files(files, draft_notes)
     _note_unused_columns(main_preview, column_by_channel, clock, draft_notes, {*select})
     return {**reader_config, "channels": channels}, errors
