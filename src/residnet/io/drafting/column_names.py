@@ -28,6 +28,8 @@ from residnet.io.readers.quantities import COSINE_SUFFIX, SINE_SUFFIX
 _DRIVE_PATTERN = re.compile(r"^(?:cmd_)?(?:n(?=_|$)|thrust)")
 _PULSE_RANGE = (900.0, 2100.0)
 """Range of the pulses of servos and speed controllers in us."""
+_NAME_END = re.compile(r"\W*[\[(].*|_m$")
+"""Unit at the end of a name."""
 _PORT_LETTER = re.compile(r"(?<![^\W_])P(?![^\W_])")
 """Letter of the port side as a word of a name."""
 _SPEED_SYMBOL = re.compile(r"[uv]( ?(s|m|c|0|ship|model|tot|total|abs|res|cg|ms))?")
@@ -54,28 +56,11 @@ def match_channels(
     Returns:
         Channel -> column.
     """
-    column_by_bare_name = {
-        re.sub(r"\W*[\[(].*|_m$", "", column).strip().lower(): column for column in columns
-    }
-    if {"n", "e"} <= set(column_by_bare_name):
-        north_east = {"x": column_by_bare_name["n"], "y": column_by_bare_name["e"]}
-        other_notes = DraftNotes()
-        other_channels = match_channels(
-            [name for name in columns if name not in north_east.values()],
-            other_notes,
-            has_heading=has_heading,
-        )
-        if not {"x", "y", "latitude", "longitude"} & set(other_channels):
-            # next to a column E, N is no shaft speed
-            draft_notes.extend(other_notes)
-            text = f"'{north_east['x']}' and '{north_east['y']}' are assumed north and east"
-            draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
-            return {**north_east, **other_channels}
     drift_angle = next((column for column in columns if is_drift_angle(column)), None)
     earth_velocities = find_earth_velocities(columns)
-    side_names = _name_sides(columns)
+    words = _spell_out_letters(columns)
     parsed_names = {
-        column: parse_name(side_names.get(column, column))
+        column: parse_name(words.get(column, column))
         for column in columns
         if column not in (drift_angle, *(earth_velocities or ()))
     }
@@ -116,21 +101,26 @@ def match_channels(
     return {name: names[name] for name in ordered_channels if name in names}
 
 
-def _name_sides(columns: Sequence[str]) -> dict[str, str]:
-    """Return actuators with the letters P and S of their sides -> their names with these words.
+def _spell_out_letters(columns: Sequence[str]) -> dict[str, str]:
+    """Return columns with letters of directions -> their names with these words.
 
-    A letter is a side only if another name differs in it alone.
+    Two columns N and E are north and east. A letter of actuators is a side only if another name
+    differs in it alone.
     """
-    side_names = {}
+    lengths = [column for column in columns if find_mismatched_unit(column, "m") is None]
+    names = {_NAME_END.sub("", column).strip().lower(): column for column in lengths}
+    words = {}
+    if {"n", "e"} <= names.keys() and not {"x", "y"} & names.keys():
+        words = {names["n"]: "north", names["e"]: "east"}
     for column in columns:
         channel = _match_name(column, parse_name(column))
         if channel is None or channel in MOTION_AND_WIND_CHANNELS:
             continue
         opposite = _PORT_LETTER.sub("S", column)
         if opposite != column and opposite in columns:
-            side_names[column] = _PORT_LETTER.sub("port", column)
-            side_names[opposite] = _PORT_LETTER.sub("starboard", column)
-    return side_names
+            words[column] = _PORT_LETTER.sub("port", column)
+            words[opposite] = _PORT_LETTER.sub("starboard", column)
+    return words
 
 
 def _pair_speed_with_drift_angle(
@@ -204,17 +194,11 @@ def _assign_columns(
     # precedence: true before magnetic headings, then canonical names (`u` before `vx`), then names
     # with fewer concepts (`heading` before `heading of the second compass`)
     for column in sorted(columns, key=sort_key):
-        channel = (
-            side_velocities.get(column)
-            or wrench.get(column)
-            or _match_name(column, parsed_names[column])
-            or match_force_column(column)
-        )
-        if channel is None:
+        force = match_force_column(column) or wrench.get(column)
+        name = side_velocities.get(column) or _match_name(column, parsed_names[column])
+        if not force and name is None:
             continue
-        channel = (
-            match_force_column(column) or wrench.get(column) or _correct_by_unit(column, channel)
-        )
+        channel = force or _correct_by_unit(column, name or "")
         if channel == "v" and not has_surge and _TOTAL_SPEED_PATTERN.match(column):
             # the capital V is the speed, next to which a sway velocity would have a surge velocity
             channel = "speed"

@@ -98,20 +98,13 @@ def _choose_named_fields(
     Raises:
         DataError: if several series have the same columns.
     """
-    candidates = []
-    for series in recording.series.values():
-        channels = {
-            match_state_channel(parse_name(name)) for name in _name_vector_parts(series.fields)
-        }
-        has_attitude = "psi" in channels or bool(find_quaternions([*series.fields]))
-        has_position = {"x", "y"} <= channels or {"latitude", "longitude"} <= channels
-        if (
-            not series.message_type
-            and len(series) >= MIN_MOTION_ROWS
-            and has_attitude
-            and has_position
-        ):
-            candidates.append(series)
+    candidates = [
+        series
+        for series in recording.series.values()
+        if not series.message_type
+        and len(series) >= MIN_MOTION_ROWS
+        and all(_find_pose_columns([*_name_vector_parts(series.fields)]))
+    ]
     if len({frozenset(series.fields) for series in candidates}) < len(candidates):
         table_names = ", ".join(series.name for series in candidates)
         raise DataError(
@@ -121,21 +114,18 @@ def _choose_named_fields(
         )
     if len(candidates) > 1:
         return {}, ""
-    if candidates:
-        topic = candidates[0].name
-        fields = _name_vector_parts(candidates[0].fields)
-        combined = _find_named_topics(recording) if needs_pose else {}
-        if not _velocity_channels(combined) <= _velocity_channels(fields):
-            return combined, _find_base_topic(recording, combined)
-        return {name: (topic, field) for name, field in fields.items()}, topic
-    sources = _find_named_topics(recording) if needs_pose else {}
-    return sources, _find_base_topic(recording, sources) if sources else ""
+    sources, topic = _find_named_topics(recording) if needs_pose else ({}, "")
+    for series in candidates:
+        fields = _name_vector_parts(series.fields)
+        # other series are read where they have velocities that the one with the pose lacks
+        if not _find_velocities(sources) - _find_velocities(fields):
+            return {name: (series.name, field) for name, field in fields.items()}, series.name
+    return sources, topic
 
 
-def _velocity_channels(names: Iterable[str]) -> set[str | None]:
+def _find_velocities(names: Iterable[str]) -> set[str | None]:
     """Return the velocities of the planar motion among the names of fields."""
-    channels = {match_state_channel(parse_name(name)) for name in names}
-    return channels & {"u", "v", "r"}
+    return {match_state_channel(parse_name(name)) for name in names} & {"u", "v", "r"}
 
 
 def _convert_entries(
@@ -189,19 +179,19 @@ def _convert_entries(
     return settings
 
 
-def _find_named_topics(recording: Recording) -> dict[str, tuple[str, str]]:
-    """Return the fields of the series without message type: name -> topic and field.
+def _find_named_topics(recording: Recording) -> tuple[dict[str, tuple[str, str]], str]:
+    """Return the fields of the series without message type, and the topic whose clock is used.
 
-    The name of a field that several series have, such as `data`, contains its topic. The result is
-    empty if position or heading are missing, or if the position is in several series.
+    The name of a field that several series have, such as `data`, contains its topic.
+
+    Returns:
+        Name -> topic and field, and the topic of position or heading with more rows; empty if
+        position or heading are missing, or are in several series.
     """
-    series_by_topic = {
-        topic: series
+    names_by_topic = {
+        topic: _name_vector_parts(series.fields)
         for topic, series in recording.series.items()
         if not series.message_type and len(series) > 1
-    }
-    names_by_topic = {
-        topic: _name_vector_parts(series.fields) for topic, series in series_by_topic.items()
     }
     counts = Counter(name for names in names_by_topic.values() for name in names)
     sources = {
@@ -209,18 +199,23 @@ def _find_named_topics(recording: Recording) -> dict[str, tuple[str, str]]:
         for topic, names in names_by_topic.items()
         for name, field in names.items()
     }
-    channels = match_channels([*sources], DraftNotes())
-    position = next(
-        (pair for pair in (("x", "y"), ("latitude", "longitude")) if {*pair} <= channels.keys()),
-        None,
+    pose_topics = [{sources[name][0] for name in names} for names in _find_pose_columns([*sources])]
+    if any(len(topics) != 1 for topics in pose_topics):
+        return {}, ""
+    topics = [topic for group in pose_topics for topic in group]
+    n_rows = [len(recording.series[topic]) for topic in topics]
+    return (sources, topics[int(np.argmax(n_rows))]) if min(n_rows) >= MIN_MOTION_ROWS else ({}, "")
+
+
+def _find_pose_columns(columns: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the columns of the position, and those of the heading or a quaternion."""
+    names = match_channels(columns, DraftNotes())
+    pairs = (("x", "y"), ("latitude", "longitude"))
+    position = next(([*pair] for pair in pairs if {*pair} <= names.keys()), [])
+    attitude = (
+        {"psi": names["psi"]} if "psi" in names else next(iter(find_quaternions(columns)), {})
     )
-    attitude = _attitude_fields(channels, sources)
-    if position is None or not attitude:
-        return {}
-    first_topic, second_topic = (sources[channels[name]][0] for name in position)
-    topics = {sources[name][0] for name in (*(channels[axis] for axis in position), *attitude)}
-    has_rows = all(len(series_by_topic[topic]) >= MIN_MOTION_ROWS for topic in topics)
-    return sources if first_topic == second_topic and has_rows else {}
+    return [names[name] for name in position], [*attitude.values()]
 
 
 _VECTOR_PART_PATTERN = re.compile(r"(?P<stem>.*[^\W\d])(?:\.|\[)(?P<index>\d)\]?")
@@ -269,27 +264,6 @@ def _name_vector_parts(fields: Iterable[str]) -> dict[str, str]:
             labels = tuple(f"{stem}_{axis}" for axis in "xyz"[:length])
         names |= {parts[index]: label for index, label in enumerate(labels)}
     return {name: field for field, name in names.items()}
-
-
-def _attitude_fields(
-    channels: Mapping[str, str], sources: Mapping[str, tuple[str, str]]
-) -> list[str]:
-    """Return the name of the heading, or the names of a quaternion's parts in one topic."""
-    if "psi" in channels:
-        return [channels["psi"]]
-    for parts in find_quaternions([*sources]):
-        if len({sources[name][0] for name in parts.values()}) == 1:
-            return [*parts.values()]
-    return []
-
-
-def _find_base_topic(recording: Recording, sources: Mapping[str, tuple[str, str]]) -> str:
-    """Return the topic of position or heading with more rows."""
-    channels = match_channels([*sources], DraftNotes())
-    position = "x" if "x" in channels else "latitude"
-    names = [channels[position], *_attitude_fields(channels, sources)[:1]]
-    topics = [sources[name][0] for name in names]
-    return max(topics, key=lambda topic: len(recording.series[topic]))
 
 
 def _tabulate_fields(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ import numpy as np
 from residnet.core.errors import DataError, ResidnetError, UsageError
 from residnet.core.names import truncate
 from residnet.core.units import is_unit
-from residnet.io.drafting.problems import UnreadableLogsError, raise_unreadable
+from residnet.io.drafting.problems import raise_unreadable
 from residnet.io.drafting.questions import READER_KEY, DraftNotes
 from residnet.io.readers.base import locate_file, require_file
 from residnet.io.readers.excel_tables import join_excel_sheets, list_sheet_names, read_excel_sheet
@@ -34,20 +34,6 @@ _MAX_FULL_PREVIEWS = 24
 """Number of tables whose values are loaded; of other tables only the first rows are."""
 
 
-class HeaderlessTablesError(UnreadableLogsError):
-    """Tables of the same number of columns, all without column names.
-
-    Attributes:
-        first_error: error of the first table.
-    """
-
-    def __init__(
-        self, first_error: HeaderlessTableError, errors: Mapping[Path, ResidnetError]
-    ) -> None:
-        self.first_error = first_error
-        super().__init__(errors)
-
-
 def preview_named_tables(
     files: Sequence[Path], draft_notes: DraftNotes
 ) -> tuple[list[TablePreview], dict[Path, ResidnetError], Sequence[str]]:
@@ -62,13 +48,19 @@ def preview_named_tables(
         DataError: if no table can be read, or its columns have no names.
     """
     key = (*READER_KEY, "names")
-    if not draft_notes.has_answer(key):
+    if draft_notes.has_answer(key):
+        answer = draft_notes.require_answer(key, "", DataError("the names are empty"))
+    else:
         mocap_body = _ask_mocap_body(files[0], draft_notes)
         try:
             return *preview_tables(files, mocap_body=mocap_body), ()
-        except HeaderlessTablesError as error:
+        except DataError as error:
             refusal = error
-        headerless = refusal.first_error
+        errors = [*getattr(refusal, "errors", {files[0]: refusal}).values()]
+        n_columns = {getattr(error, "n_columns", 0) for error in errors}
+        headerless = errors[0]
+        if not isinstance(headerless, HeaderlessTableError) or len(n_columns) > 1:
+            raise refusal
         text = f"{files[0].name} has {headerless.n_columns} columns without names; names, in order"
         if headerless.proposed_names:
             answer = draft_notes.ask_question(
@@ -79,8 +71,6 @@ def preview_named_tables(
             )
         else:
             answer = draft_notes.require_answer(key, text, refusal)
-    else:
-        answer = draft_notes.require_answer(key, "", DataError("the names are empty"))
     # names with blanks are separated by commas
     separator = r"[,;]" if re.search(r"[,;]", answer) else r"\s+"
     names = [name.strip() for name in re.split(separator, answer) if name.strip()]
@@ -130,36 +120,24 @@ def preview_tables(
         except DataError as error:
             errors[path] = error
     if not previews:
-        first_error = next(iter(errors.values()))
-        n_columns = {getattr(error, "n_columns", 0) for error in errors.values()}
-        if isinstance(first_error, HeaderlessTableError) and len(n_columns) == 1:
-            raise HeaderlessTablesError(first_error, errors)
         raise_unreadable(errors)
-    reader_settings = {
-        tuple(sorted(sheet.reader_settings.items()))
-        for sheet in previews
-        if len(sheet.numeric_columns) > 1
-    }
-    if not reader_settings:
+    numeric_previews = [sheet for sheet in previews if len(sheet.numeric_columns) > 1]
+    if not numeric_previews:
         path = previews[0].path
         names = ", ".join(previews[0].column_names[:12])
         raise DataError(
             f"{path}: fewer than two columns contain numbers (columns: {names}); check the"
             " export of the table"
         )
-    if len({dict(settings_items)["kind"] for settings_items in reader_settings}) > 1:
+    if len({sheet.reader_settings["kind"] for sheet in numeric_previews}) > 1:
         raise UsageError("the tables have several formats, one was expected; give those of one")
     # the most detailed settings: a table of integers, for example, has no decimal sign
-    common_settings = max(
-        reader_settings,
-        key=lambda kind: (len(kind), sum(s.reader_settings == dict(kind) for s in previews)),
+    all_settings = [sheet.reader_settings for sheet in numeric_previews]
+    main_preview = max(
+        numeric_previews,
+        key=lambda sheet: (len(sheet.reader_settings), all_settings.count(sheet.reader_settings)),
     )
-    best_index = next(
-        i
-        for i, s in enumerate(previews)
-        if tuple(sorted(s.reader_settings.items())) == common_settings
-    )
-    return [previews[best_index], *previews[:best_index], *previews[best_index + 1 :]], errors
+    return [main_preview, *(sheet for sheet in previews if sheet is not main_preview)], errors
 
 
 @dataclass(frozen=True)
@@ -286,35 +264,26 @@ def parse_unit_cell(cell: str) -> str:
 
 
 def are_parts_of_recording(sheets: Sequence[pd.DataFrame]) -> bool:
-    """Return whether sheets are parts of one recording.
-
-    They have the same first column, their times overlap by half, and no other column is in two.
-    """
+    """Return whether sheets are parts of one recording: only the column of time is in several."""
     import pandas as pd
 
-    if len(sheets) < 2:
-        return False
     names = [[str(name) for name in sheet.columns] for sheet in sheets]
     other_names = [name for columns in names for name in columns[1:] if name]
-    if len({columns[0] for columns in names}) > 1 or len(set(other_names)) < len(other_names):
-        return False
-    ranges = []
-    for sheet in sheets:
-        times = pd.to_numeric(sheet.iloc[:, 0], errors="coerce").dropna()
-        if times.empty or not times.is_monotonic_increasing:
-            return False
-        ranges.append((float(times.iloc[0]), float(times.iloc[-1])))
-    overlap = min(end for _, end in ranges) - max(start for start, _ in ranges)
-    return overlap > 0.5 * max(end - start for start, end in ranges)
+    return (
+        len(sheets) > 1
+        and len({columns[0] for columns in names}) == 1
+        and len(set(other_names)) == len(other_names)
+        and all(
+            pd.to_numeric(sheet.iloc[:, 0], errors="coerce").dropna().is_monotonic_increasing
+            for sheet in sheets
+        )
+    )
 
 
 def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Load the first sheet with two or more columns of numbers, otherwise the first sheet.
 
     Further sheets of the same recording are joined.
-
-    Raises:
-        DataError: if several sheets have the same columns, such as a sheet for each test.
     """
     names = list_sheet_names(path)
     if list_joined_sheets(path):
@@ -329,18 +298,5 @@ def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]
         return joined_sheets, {"kind": "excel", "sheet": tuple(numeric_sheets)}
     name = next(iter([*numeric_sheets, *names]))
     table = tables[name]
-    groups = (
-        [other for other in numeric_sheets if tables[other].columns.equals(tables[first].columns)]
-        for first in numeric_sheets
-    )
-    similar_sheets = max(groups, key=len, default=[])
-    if len(similar_sheets) > 1:
-        raise DataError(
-            f"{path}: sheets {truncate(', '.join(similar_sheets), 60)} have the same columns, one"
-            " log per file was expected; write each sheet to a file, in Python"
-            " [sheet.to_csv(f'{name}.csv', index=False, header=False) for name, sheet in"
-            f" pandas.read_excel({path.name!r}, sheet_name={similar_sheets!r},"
-            " header=None).items()]"
-        )
     table.attrs["other_sheets"] = tuple(numeric_sheets[1:])
     return table, {"kind": "excel", **({"sheet": name} if name != names[0] else {})}
