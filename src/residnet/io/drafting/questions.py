@@ -176,7 +176,7 @@ def dump_commented_yaml(
     )
     comments_by_line: dict[int, list[str]] = {0: list(head_lines)}
 
-    def collect_comments(node: yaml.Node, parent: Key) -> None:
+    def collect_comments(node: yaml.Node | None, parent: Key) -> None:
         if isinstance(node, yaml.MappingNode):
             for key_node, value_node in node.value:
                 key = (*parent, str(key_node.value))

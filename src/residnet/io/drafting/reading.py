@@ -245,11 +245,11 @@ def _correct_rudder_signs(result: DraftResult) -> None:
     Args:
         result: drafted reader and its logs.
     """
-    parts = result.reader.get("parts", {})
-    channel_maps = {
+    channel_maps: dict[Key, dict[str, Any]] = {
         (*READER_KEY, "parts", part_name, "channels"): part["channels"]
-        for part_name, part in parts.items()
-    } or {CHANNELS_KEY: result.reader.get("channels", {})}
+        for part_name, part in result.reader.get("parts", {}).items()
+    }
+    channel_maps = channel_maps or {CHANNELS_KEY: result.reader.get("channels", {})}
     channel_names = dict.fromkeys(name for log in result.logs.values() for name in log.channels)
     names = [name for name in channel_names if re.match(r"(cmd_)?delta(?!_rate)", name)]
     logs_with_rates = [
