@@ -16,8 +16,6 @@ from residnet.io.drafting.actuator_fields import (
     match_known_command,
     name_bare_numbers,
 )
-from residnet.io.drafting.channel_map import draft_channel_map
-from residnet.io.drafting.column_names import match_channels
 from residnet.io.drafting.motion_regression import (
     POSE_FRAMES,
     RawTable,
@@ -25,7 +23,7 @@ from residnet.io.drafting.motion_regression import (
     fit_to_motion,
     forward_alignment,
 )
-from residnet.io.drafting.motion_sources import MIN_MOTION_ROWS, MotionSources, median_series_step
+from residnet.io.drafting.motion_sources import MotionSources, median_series_step
 from residnet.io.drafting.named_fields import find_named_table
 from residnet.io.drafting.pose_search import find_best_pose
 from residnet.io.drafting.questions import CHANNELS_KEY, READER_KEY, DraftNotes
@@ -33,7 +31,7 @@ from residnet.io.drafting.tables import draft_manoeuvre_setting
 from residnet.io.header_vocabulary import guess_scaling, infer_unit
 from residnet.io.readers.detect import AutoConfig, detect_external_kind
 from residnet.io.readers.messages import extend_with_standard_messages, is_ned_format
-from residnet.io.readers.quantities import SPEED_CHANNELS, ChannelPlan
+from residnet.io.readers.quantities import ChannelPlan
 from residnet.io.readers.recording import ALL_FIELDS, Recording
 from residnet.io.readers.topics import align_clocks
 
@@ -125,58 +123,7 @@ def draft_recordings(
         reason = f"taken by its name; {scaling.reason}" if scaling.reason else "taken by its name"
         draft_notes.add_guess((*CHANNELS_KEY, name), reason)
         channels[name] = {"topic": topic, "field": field, **scaling.settings, "hold": True}
-    if uses_standard_messages and not {"u", "v", "speed"} & {*known_channels, *channels}:
-        channels |= _draft_speed_and_drift(aligned, log, draft_notes)
     return settings | ({"channels": channels} if channels else {}), recordings
-
-
-def _draft_speed_and_drift(
-    recordings: Sequence[Recording], log: Log | None, draft_notes: DraftNotes
-) -> dict[str, dict[str, Any]]:
-    """Draft the channels of a speed and the drift angle next to it in one topic.
-
-    Args:
-        recordings: recordings with aligned clocks.
-        log: log of the first recording from its standard messages; None if they are not sufficient.
-        draft_notes: receives guesses and notes on both channels.
-
-    Returns:
-        Channel `speed` and `drift_angle` -> entry; empty if no topic has both.
-    """
-    for topic, series in recordings[0].series.items():
-        names = match_channels([*series.fields], DraftNotes())
-        if not names.keys() >= {*SPEED_CHANNELS} or len(series) < MIN_MOTION_ROWS:
-            continue
-        pose_names = ("x", "y", "psi")
-        columns = {name: series[names[name]] for name in SPEED_CHANNELS}
-        names = {name: names[name] for name in SPEED_CHANNELS}
-        t = series.clock
-        if log is not None and log.channels.keys() >= {*pose_names}:
-            # the log counts from its first sample, topics from the epoch of the recording
-            epoch = recordings[0].epoch
-            start = 0.0 if epoch is None else (log.meta["epoch_ns"] - epoch) * 1e-9
-            known = {name: np.isfinite(values) for name, values in columns.items()}
-            columns = {
-                name: np.interp(log.t + start, t[known[name]], values[known[name]])
-                for name, values in columns.items()
-            }
-            columns |= {name: log[name] for name in pose_names}
-            names |= {name: f"{name} [{'rad' if name == 'psi' else 'm'}]" for name in pose_names}
-            t = log.t
-        candidate_notes = DraftNotes()
-        entries = draft_channel_map(names, [RawTable(t, columns)], candidate_notes)
-        for key, text in candidate_notes.guessed_values:
-            if key[-1] in SPEED_CHANNELS:
-                draft_notes.add_guess(key, text)
-        for key, text in candidate_notes.notes:
-            if key[-1] in SPEED_CHANNELS:
-                draft_notes.add_note(key, text)
-        return {
-            name: {"topic": topic, "field": entry.pop("column"), **entry}
-            for name, entry in entries.items()
-            if name in SPEED_CHANNELS
-        }
-    return {}
 
 
 def _choose_motion_sources(

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from residnet.core.errors import DataError, ResidnetError, UsageError
+from residnet.core.config import Quantity
+from residnet.core.errors import DataError, UsageError
 from residnet.core.names import truncate
 from residnet.core.units import to_si
 from residnet.io.drafting.problems import UnreadableLogsError, strip_file_name
@@ -97,12 +98,11 @@ def make_step_clock(preview: TablePreview, step: str) -> TableClock:
     Raises:
         UsageError: if the step is no positive time.
     """
-    match = re.fullmatch(r"\s*([\d.eE+-]+)\s*([a-zµ]*)\s*", step)
     try:
-        seconds = float(match[1]) * to_si(match[2] or "s") if match else 0.0
-    except (ValueError, ResidnetError):
+        seconds = Quantity("s").convert(step)
+    except ValueError:
         seconds = 0.0
-    if not 0.0 < seconds < np.inf:
+    if seconds <= 0.0:
         raise UsageError(
             f"the time between two rows '{truncate(step, 40)}' is no time; write it as '0.1 s'"
         )
@@ -160,7 +160,6 @@ def detect_clock(preview: TablePreview) -> TableClock:
         and match_state_channel(parse_name(name)) is None
         and is_increasing(name)
     ]
-    increasing_columns.sort(key=lambda name: _relative_step_spread(preview.numeric_columns[name]))
     clock_column = next(
         filter(is_increasing, numeric_time_columns),
         next(iter([*numeric_time_columns, *increasing_columns]), None),
@@ -173,20 +172,13 @@ def detect_clock(preview: TablePreview) -> TableClock:
                 " or time: {step: 0.1 s} of the reader in a config; in Python"
                 " read_logs(files, time={'step': '0.1 s'})"
             )
-        cells = [
-            str(cell) for cell in preview.text_columns.get(time_columns[0], ()) if cell == cell
-        ]
-        unparsed_cells = [cell for cell in cells if not re.fullmatch(r"[-\d.,]+", cell)]
-        advice = "write numbers, or dates such as 2025-06-17 08:30:00.25"
-        advice = (
-            advice
-            if 2 * len(unparsed_cells) >= len(cells)
-            else "delete such lines, which are no rows"
-        )
-        example = f", such as '{truncate(unparsed_cells[-1])}'" if unparsed_cells else ""
+        cells = preview.text_columns.get(time_columns[0], ())
+        texts = [str(cell) for cell in cells if not re.fullmatch(r"nan|NaT|<NA>|[-\d.,]+", str(cell))]
+        example = f", such as '{truncate(texts[-1])}'" if texts else ""
         raise DataError(
             f"{preview.path}: column '{time_columns[0]}' has times in an unknown notation{example};"
-            f" {advice}"
+            " delete such lines if they are no rows, else write numbers, or dates such as"
+            " 2025-06-17 08:30:00.25"
         )
     values = preview.numeric_columns[clock_column]
     unit = parse_header_unit(clock_column, "s")
@@ -198,12 +190,6 @@ def detect_clock(preview: TablePreview) -> TableClock:
     seconds, interpolation = _repair_preview_clock(preview, values * to_si(unit), to_si(unit))
     guess = ". ".join(filter(None, (guess, interpolation)))
     return TableClock({"column": clock_column, "unit": unit}, seconds, guess, (clock_column,))
-
-
-def _relative_step_spread(values: np.ndarray) -> float:
-    """Return the standard deviation of the steps divided by their median, with two decimals."""
-    time_steps = np.diff(values[np.isfinite(values)])
-    return round(float(np.std(time_steps) / np.median(time_steps)), 2)
 
 
 def _repair_preview_clock(
