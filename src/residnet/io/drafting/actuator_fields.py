@@ -10,7 +10,7 @@ import numpy as np
 
 from residnet.core.names import CHANNEL_UNITS
 from residnet.io.drafting.motion_regression import RawTable, estimate_rudder_gain
-from residnet.io.drafting.pose_search import extract_pose
+from residnet.io.drafting.motion_sources import extract_pose
 from residnet.io.drafting.questions import CHANNELS_KEY, DraftNotes
 from residnet.io.header_vocabulary import MOTION_CHANNELS, match_input_channel, parse_name
 from residnet.io.readers.messages import KNOWN_COMMANDS

@@ -27,11 +27,12 @@ from residnet.io.readers.recording import Recording
 def find_named_table(
     recordings: Sequence[Recording], draft_notes: DraftNotes, *, needs_pose: bool
 ) -> MotionSources | None:
-    """Return the motion and inputs of series without message type, or None.
+    """Return the motion and inputs of series by the names of their fields, or None.
 
-    Such series are MATLAB structs, HDF5 groups and csv files of topics. Their fields have names
-    like columns of a table, and units, signs and frames are determined in the same way. Position,
-    heading and velocities may be in one series or in several.
+    Series without message type are MATLAB structs, HDF5 groups and csv files of topics. Units,
+    signs and frames are determined as those of columns of a table. Position, heading and velocities
+    may be in one series or in several. Series of other message types are used likewise if standard
+    messages give no pose.
 
     Args:
         recordings: recordings with aligned clocks.
@@ -86,11 +87,11 @@ def find_named_table(
 def _choose_named_fields(
     recording: Recording, *, needs_pose: bool
 ) -> tuple[dict[str, tuple[str, str]], str]:
-    """Choose the series without message type that have position and heading.
+    """Choose the series that have position and heading by the names of their fields.
 
     Args:
         recording: recording with aligned clocks.
-        needs_pose: whether several series may be combined.
+        needs_pose: whether several series may be combined, and those with a message type used.
 
     Returns:
         Name -> topic and field, and the topic whose clock is used; empty without such series.
@@ -101,7 +102,8 @@ def _choose_named_fields(
     candidates = [
         series
         for series in recording.series.values()
-        if not series.message_type
+        if (needs_pose or not series.message_type)
+        and not parse_name(series.name).has_all("command")
         and len(series) >= MIN_MOTION_ROWS
         and all(_find_pose_columns([*_name_vector_parts(series.fields)]))
     ]
@@ -180,7 +182,7 @@ def _convert_entries(
 
 
 def _find_named_topics(recording: Recording) -> tuple[dict[str, tuple[str, str]], str]:
-    """Return the fields of the series without message type, and the topic whose clock is used.
+    """Return the fields of all series, and the topic whose clock is used.
 
     The name of a field that several series have, such as `data`, contains its topic.
 
@@ -191,7 +193,7 @@ def _find_named_topics(recording: Recording) -> tuple[dict[str, tuple[str, str]]
     names_by_topic = {
         topic: _name_vector_parts(series.fields)
         for topic, series in recording.series.items()
-        if not series.message_type and len(series) > 1
+        if len(series) > 1
     }
     counts = Counter(name for names in names_by_topic.values() for name in names)
     sources = {

@@ -20,25 +20,20 @@ from residnet.io.drafting.motion_regression import (
     POSE_FRAMES,
     RawTable,
     estimate_motion,
-    fit_to_motion,
-    forward_alignment,
 )
 from residnet.io.drafting.motion_sources import MotionSources, median_series_step
 from residnet.io.drafting.named_fields import find_named_table
-from residnet.io.drafting.pose_search import find_best_pose
 from residnet.io.drafting.questions import CHANNELS_KEY, READER_KEY, DraftNotes
 from residnet.io.drafting.tables import draft_manoeuvre_setting
 from residnet.io.header_vocabulary import guess_scaling, infer_unit
 from residnet.io.readers.detect import AutoConfig, detect_external_kind
-from residnet.io.readers.messages import extend_with_standard_messages, is_ned_format
+from residnet.io.readers.messages import extend_with_standard_messages
 from residnet.io.readers.quantities import ChannelPlan
 from residnet.io.readers.recording import ALL_FIELDS, Recording
 from residnet.io.readers.topics import align_clocks
 
-# smallest consistency (0 to 1) of position, heading and velocities for an unchanged mapping
 _MIN_CONSISTENCY = 0.7
-# median step in s above which a pose with a higher rate is searched
-_MAX_POSE_INTERVAL = 0.6
+"""Smallest cosine between velocities and those of the positions for an unchanged mapping."""
 
 
 def draft_recordings(
@@ -46,9 +41,9 @@ def draft_recordings(
 ) -> tuple[dict[str, Any], dict[Path, Recording]]:
     """Draft a reader for recordings of one format.
 
-    Standard messages map automatically. If their position, heading and velocities are inconsistent,
-    or the rate of the pose is low, other topics and frames are tested unless the format defines its
-    frames. Inputs are found by their names.
+    Standard messages map automatically. Without a pose of theirs, or if it contradicts their
+    velocities, fields are mapped by their names, and their frames are determined as those of
+    tables. Inputs are found by their names.
 
     Args:
         paths: recordings.
@@ -94,7 +89,6 @@ def draft_recordings(
         log,
         MotionSources({}, used_fields, sample_step),
         draft_notes,
-        is_frame_fixed=any(is_ned_format(aligned[0][source.topic]) for source in pose_sources),
     )
     settings |= sources.settings
     settings["clock"] = {"kind": "uniform", "step": f"{float(f'{sources.step:.2g}'):g} s"}
@@ -131,62 +125,28 @@ def _choose_motion_sources(
     log: Log | None,
     standard_sources: MotionSources,
     draft_notes: DraftNotes,
-    *,
-    is_frame_fixed: bool,
 ) -> MotionSources:
-    """Return the sources of position and heading: the standard messages, or better ones.
+    """Return the sources of position and heading: named fields, or the standard messages.
 
     Args:
         recordings: recordings with aligned clocks.
         log: log of the first recording from its standard messages; None if they are not sufficient.
         standard_sources: fields of the standard messages.
         draft_notes: receives guesses and notes.
-        is_frame_fixed: whether the format defines the frame of its poses.
     """
-    has_pose = log is not None and {"x", "y", "psi"} <= set(log.channels)
-    if named_sources := find_named_table(recordings, draft_notes, needs_pose=not has_pose):
-        return named_sources
-    if log is None or not has_pose or not _is_consistent(log, draft_notes):
-        other_sources = None
-        if not (has_pose and is_frame_fixed):
-            min_consistency = _MIN_CONSISTENCY if has_pose else 0.0
-            other_sources = find_best_pose(recordings[0], draft_notes, min_consistency)
-        if other_sources is None and has_pose:
-            text = "position, heading and velocities are inconsistent: check the frames"
-            draft_notes.add_guess(READER_KEY, text)
-        return other_sources or standard_sources
-    if standard_sources.step > _MAX_POSE_INTERVAL and not is_frame_fixed:
-        candidate_notes = DraftNotes()
-        other_sources = find_best_pose(recordings[0], candidate_notes, _MIN_CONSISTENCY)
-        # the new sources have no measured velocities, so that they must have a higher rate
-        if other_sources is not None and other_sources.step < 0.9 * standard_sources.step:
-            draft_notes.extend(candidate_notes)
-            return other_sources
-    return standard_sources
+    has_pose = log is not None and {"x", "y", "psi"} <= log.channels.keys()
+    needs_pose = log is None or not has_pose or not _is_consistent(log)
+    return find_named_table(recordings, draft_notes, needs_pose=needs_pose) or standard_sources
 
 
-def _is_consistent(log: Log, draft_notes: DraftNotes) -> bool:
-    """Return whether position, heading and velocities of a log are consistent.
-
-    A guess is noted if they are inconsistent and no other frame is better.
-    """
-    table = RawTable(log.t, log.channels)
-    motions = [estimate_motion(table, "rad", frame) for frame in POSE_FRAMES]
-    if None in motions:
+def _is_consistent(log: Log) -> bool:
+    """Return whether u and v of a log, if measured, are the velocities of its positions."""
+    motion = estimate_motion(RawTable(log.t, log.channels), "rad", POSE_FRAMES[0])
+    if motion is None or not {"u", "v"} <= log.channels.keys():
         return True
-    scores = []
-    for motion in motions:
-        velocity_fits = [
-            fit_to_motion([table], [motion], name) for name in ("u", "v") if name in log.channels
-        ]
-        velocity_score = sum(f.correlation * np.sign(f.factor) for f in velocity_fits) / 2
-        scores.append(velocity_score if len(velocity_fits) == 2 else forward_alignment([motion]))
-    if scores[0] < _MIN_CONSISTENCY and max(scores) > scores[0] + 0.1:
-        return False
-    if scores[0] < 0.3:
-        if forward_alignment(motions[:1]) > _MIN_CONSISTENCY:
-            # the pose is consistent in itself: the velocities are not in body axes
-            return False
-        text = f"position, heading and velocities are inconsistent ({scores[0]:.2f} of 1)"
-        draft_notes.add_guess(READER_KEY, f"{text}: check the frames")
-    return True
+    velocity = np.interp(motion.t, log.t, log["u"]) + 1j * np.interp(motion.t, log.t, log["v"])
+    reference = motion.surge_velocity + 1j * motion.sway_velocity
+    is_known = np.isfinite(velocity)
+    product = np.vdot(velocity[is_known], reference[is_known]).real
+    norms = np.linalg.norm(velocity[is_known]) * np.linalg.norm(reference[is_known])
+    return bool(product >= _MIN_CONSISTENCY * norms)

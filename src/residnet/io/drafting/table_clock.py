@@ -173,7 +173,9 @@ def detect_clock(preview: TablePreview) -> TableClock:
                 " read_logs(files, time={'step': '0.1 s'})"
             )
         cells = preview.text_columns.get(time_columns[0], ())
-        texts = [str(cell) for cell in cells if not re.fullmatch(r"nan|NaT|<NA>|[-\d.,]+", str(cell))]
+        texts = [
+            str(cell) for cell in cells if not re.fullmatch(r"nan|NaT|<NA>|[-\d.,]+", str(cell))
+        ]
         example = f", such as '{truncate(texts[-1])}'" if texts else ""
         raise DataError(
             f"{preview.path}: column '{time_columns[0]}' has times in an unknown notation{example};"

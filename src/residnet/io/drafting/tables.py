@@ -58,7 +58,7 @@ from residnet.io.readers.base import locate_file
 from residnet.io.readers.clock_repair import find_unique_rows
 from residnet.io.readers.manoeuvre_kinds import match_manoeuvre_name
 from residnet.io.readers.quantities import QUATERNION
-from residnet.io.readers.several_tests import list_joined_sheets, list_vessels
+from residnet.io.readers.several_tests import list_vessels
 from residnet.preprocessing.channel_values import INTERVAL_TOLERANCE, MIN_REGULAR_SHARE
 
 
@@ -315,17 +315,13 @@ def _suggest_table_fix(
 def _note_tests_of_files(files: Sequence[Path], draft_notes: DraftNotes) -> None:
     """Note which files have several tests, each of which is a log."""
     for file in dict.fromkeys(path.parent for path in files if locate_file(path) != path):
-        names = [path.name for path in files if path.parent == file]
-        text = f"{file.name} has {len(names)} tests, a log each: {truncate(', '.join(names), 100)}"
-        if len(names) == 1:
-            text = f"{file.name} is read without the short starts of its recorder"
-        if sheets := list_joined_sheets(file / names[0]):
-            text += f"; the sheets of a test ({', '.join(sheets)}) are joined by their times"
-        vessels = list_vessels([path for path in files if path.parent == file])
-        if vessels:
+        tests = [path for path in files if path.parent == file]
+        names = truncate(", ".join(path.name for path in tests), 100)
+        text = f"{file.name} has {len(tests)} tests, a log each: {names}"
+        if vessels := list_vessels(tests):
             text += (
                 f"; they name several vessels ({truncate(', '.join(vessels), 80)}), and one config"
-                f" describes one: give only its tests, such as {file.name}/{names[0]}"
+                f" describes one: give only its tests, such as {file.name}/{tests[0].name}"
             )
         draft_notes.add_guess(READER_KEY, text)
 
