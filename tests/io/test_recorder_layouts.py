@@ -255,12 +255,12 @@ def test_a_second_compass_is_no_input() -> None:
 
 
 def test_a_name_that_stands_twice(tmp_path: Path) -> None:
-    """The first is taken, and said to be; either can be told by its number."""
+    """The first is taken, and the other one noted; either can be told by its number."""
     path = tmp_path / "log.csv"
     lines = text(COLUMNS)
     path.write_text("\n".join([lines[0].replace("Ost", "Kurs"), *lines[1:]]))
     _, content, marks = drafted(path)
-    assert any("more than once" in said for _, said in marks.guessed_values)
+    assert any("'Kurs.1' may be psi instead of 'Kurs.0'" in said for _, said in marks.notes)
     entry = content["channels"]["psi"]
     assert entry["column"] == "Kurs.0"
     entry |= {"column": "Kurs.1", "unit": "deg"}

@@ -75,7 +75,7 @@ def match_channels(
         draft_notes.add_guess(
             (*CHANNELS_KEY, "psi"), f"'{theta}' is assumed the heading, because there is no other"
         )
-    _rename_single_rudder(names, draft_notes)
+    _rename_single_rudder(names)
     has_heading = (
         has_heading
         or "psi" in names
@@ -176,7 +176,6 @@ def _assign_columns(
     names: dict[str, str] = {}
     duplicates: dict[str, list[str]] = {}
     speeds: list[str] = []
-    copy_suffix = re.compile(r"\.\d+$")
     side_velocities = _match_shaft_speeds(parsed_names)
     wrench = find_wrench_columns(columns)
 
@@ -211,9 +210,6 @@ def _assign_columns(
             speeds.append(column)
         elif channel not in names:
             names[channel] = column
-        elif copy_suffix.sub("", column) == copy_suffix.sub("", names[channel]):
-            text = f"the header has it more than once; '{names[channel]}' is the first one"
-            draft_notes.add_guess((*CHANNELS_KEY, channel), text)
         else:
             duplicates.setdefault(channel, [names[channel]]).append(column)
     return names, duplicates, speeds
@@ -304,19 +300,14 @@ def _resolve_duplicates(
         )
 
 
-def _rename_single_rudder(names: dict[str, str], draft_notes: DraftNotes) -> None:
+def _rename_single_rudder(names: dict[str, str]) -> None:
     """Rename the rudder of one side to the only rudder, if the other side has none."""
     for port, stbd in (("delta_port", "delta_stbd"), ("cmd_delta_port", "cmd_delta_stbd")):
         if (port in names) == (stbd in names):
             continue
         # with a single rudder the side is the direction of positive angles
-        sided_channel = port if port in names else stbd
-        rudder = sided_channel.rpartition("_")[0]
-        column = names.pop(sided_channel)
-        if names.setdefault(rudder, column) != column:
-            draft_notes.add_note(
-                CHANNELS_KEY, f"'{column}' may be {rudder} instead of '{names[rudder]}'"
-            )
+        column = names.pop(port if port in names else stbd)
+        names.setdefault(port.removesuffix("_port"), column)
 
 
 _TOTAL_SPEED_PATTERN = re.compile(r"V\s*(?:[\[(/].*)?$")

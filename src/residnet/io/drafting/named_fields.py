@@ -141,36 +141,27 @@ def _convert_entries(
         base_topic: topic whose clock is used.
     """
     settings: dict[str, Any] = {"standard_messages": False}
-    for position_kind, channel_pair, keys in (
-        ("local", ("x", "y"), ("north", "east")),
-        ("geodetic", ("latitude", "longitude"), ("latitude", "longitude")),
-    ):
-        if set(channel_pair) <= set(entries):
-            first_entry, second_entry = (entries.pop(name) for name in channel_pair)
-            topic, first_field = sources[first_entry["column"]]
-            position_settings = {"kind": position_kind, "topic": topic, keys[0]: first_field}
-            settings["position"] = position_settings | {
-                keys[1]: sources[second_entry["column"]][1],
-                "unit": first_entry["unit"],
-            }
+    vectors = [
+        ("position", "local", ("x", "y"), ("north", "east")),
+        ("position", "geodetic", ("latitude", "longitude"), ("latitude", "longitude")),
+    ]
     if entries.get("u", {}).get("frame") == "ned":
-        north, east = (entries.pop(name) for name in ("u", "v"))
-        topic, north_field = sources[north["column"]]
-        velocity = {"kind": "earth_fixed", "topic": topic, "unit": north["unit"]}
-        velocity |= {"north": north_field, "east": sources[east["column"]][1]}
-        settings["velocity"] = velocity
-    if "psi" in entries:
-        heading = entries.pop("psi")
-        topic, heading_field = sources[heading["column"]]
-        settings["heading"] = {"kind": "angle", "topic": topic, "field": heading_field}
-        settings["heading"] |= {"unit": heading["unit"], "frame": heading.get("frame", "ned")}
+        vectors.append(("velocity", "earth_fixed", ("u", "v"), ("north", "east")))
+    for section, kind, names, keys in vectors:
+        if {*names} <= entries.keys():
+            parts = [entries.pop(name) for name in names]
+            fields = [sources[part["column"]] for part in parts]
+            settings[section] = {"kind": kind, "topic": fields[0][0], "unit": parts[0]["unit"]}
+            settings[section] |= {key: field for key, (_, field) in zip(keys, fields, strict=True)}
+    attitude = {name: entries.pop(name) for name in ("psi", *QUATERNION) if name in entries}
+    fields = [sources[entry["column"]] for entry in attitude.values()]
+    frame = {"frame": attitude.get("psi", attitude.get("qw", {})).get("frame", "ned")}
+    if "psi" in attitude:
+        heading = {"kind": "angle", "field": fields[0][1], "unit": attitude["psi"]["unit"]}
     else:
-        quaternion = {name: entries.pop(name) for name in QUATERNION if name in entries}
-        topic, _ = sources[quaternion["qw"]["column"]]
-        parts = [sources[entry["column"]][1] for entry in quaternion.values()]
-        settings["heading"] = {"kind": "quaternion", "topic": topic, "field": parts}
-        settings["heading"] |= {"frame": quaternion["qw"].get("frame", "ned")}
-        settings["heading"] |= {"roll": len(quaternion) == len(QUATERNION)}
+        heading = {"kind": "quaternion", "field": [field for _, field in fields]}
+        heading["roll"] = len(attitude) == len(QUATERNION)
+    settings["heading"] = {"topic": fields[0][0], **heading, **frame}
     settings["channels"] = {}
     for name, entry in entries.items():
         topic, field = sources[entry.pop("column")]
