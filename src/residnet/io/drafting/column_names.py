@@ -250,12 +250,6 @@ def _find_other_unit(column: str, channel: str) -> str | None:
 def _correct_by_unit(column: str, channel: str) -> str:
     """Return the channel of a column whose unit decides between two meanings of its name."""
     mismatched_unit = _find_other_unit(column, channel)
-    if channel == "n" and mismatched_unit == "m":
-        # north in m, not a shaft speed
-        return "x"
-    if "thrust" in channel and parse_header_unit(column, "1/s"):
-        # a thruster in rpm is a shaft speed, not a force
-        return channel.replace("thrust", "n")
     if _DRIVE_PATTERN.match(channel) and (
         mismatched_unit in ("-", "us") or parse_header_unit(column, "-") == "%"
     ):

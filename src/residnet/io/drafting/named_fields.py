@@ -50,15 +50,11 @@ def find_named_table(
         for recording in recordings
         if base_topic in recording.series
     ]
-    # fields with finite values in all recordings; increasing times are no channels
+    # fields with finite values in all recordings
     fields = [
         name
         for name in sources
         if all(name in table.columns and np.isfinite(table.columns[name]).any() for table in tables)
-        and not (
-            parse_name(name).has_all("time")
-            and bool((np.diff(tables[0].columns[name]) > 0.0).all())
-        )
     ]
     channel_notes = DraftNotes()
     names, entries = draft_columns(

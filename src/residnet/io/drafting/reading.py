@@ -172,17 +172,15 @@ def read_mixed_formats(
         paths: files.
         answers: answers that the user has given in advance, by key.
     """
-    groups: dict[tuple[str, ...], list[Path]] = {}
-    columns_by_path = {
-        path: read_column_names(path) for path in paths if detect_log_kind(path) == "table"
-    }
-    has_trips = bool(group_by_trip([*columns_by_path]))
+    kinds = {path: detect_log_kind(path) for path in paths}
+    tables = [path for path, kind in kinds.items() if kind == "table"]
+    has_trips = bool(group_by_trip(tables))
     if not has_trips:
-        refuse_topics([*columns_by_path])
-    for path in paths:
-        log_kind = detect_log_kind(path)
-        names = columns_by_path[path] if log_kind == "table" and not has_trips else ()
-        groups.setdefault((log_kind, *names), []).append(path)
+        refuse_topics(tables)
+    groups: dict[tuple[str, ...], list[Path]] = {}
+    for path, kind in kinds.items():
+        names = read_column_names(path) if kind == "table" and not has_trips else ()
+        groups.setdefault((kind, *names), []).append(path)
     results = []
     for group in groups.values():
         draft_notes = DraftNotes(answers=answers)

@@ -13,7 +13,6 @@ from residnet.core.config import Quantity
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import truncate
 from residnet.core.units import to_si
-from residnet.io.drafting.problems import UnreadableLogsError, strip_file_name
 from residnet.io.drafting.questions import READER_KEY, DraftNotes
 from residnet.io.drafting.table_preview import TablePreview
 from residnet.io.header_vocabulary import (
@@ -54,16 +53,12 @@ def detect_or_ask_clock(
         try:
             return detect_clock(main_preview), None
         except MissingClockError as missing_clock:
-            message = strip_file_name([main_preview.path], str(missing_clock))
-        error = UnreadableLogsError(
-            {preview.path: DataError(f"{preview.path}: {message}") for preview in previews}
-        )
-    step = draft_notes.require_answer(
-        key,
+            error = missing_clock
+    text = (
         f"{main_preview.path.name} and the other tables have no column of time; time between two"
-        " rows, for example 0.1 s",
-        error,
+        " rows, for example 0.1 s"
     )
+    step = draft_notes.require_answer(key, text, error)
     return make_step_clock(main_preview, step), step
 
 

@@ -397,20 +397,19 @@ def _note_unused_columns(
     selected_columns: set[str],
 ) -> None:
     used_columns = {*names.values(), *clock.columns, *selected_columns}
-    unused_columns = [name for name in preview.numeric_columns if name not in used_columns]
-    if unused_columns:
-        draft_notes.add_note(CHANNELS_KEY, f"{UNMAPPED_COLUMNS}: {', '.join(unused_columns[:20])}")
     texts = [
         f"{name} ('{truncate(str(cells.dropna().iloc[0]), 20)}')"
         for name, cells in preview.text_columns.items()
         if name not in used_columns
     ]
-    if texts:
-        draft_notes.add_note(CHANNELS_KEY, f"{TEXT_COLUMNS}: {', '.join(texts[:12])}")
-    if preview.empty_columns:
-        draft_notes.add_note(
-            CHANNELS_KEY, f"empty columns: {', '.join(preview.empty_columns[:12])}"
-        )
+    unused_columns = {
+        UNMAPPED_COLUMNS: [name for name in preview.numeric_columns if name not in used_columns],
+        TEXT_COLUMNS: texts,
+        "empty columns": preview.empty_columns,
+    }
+    for label, columns in unused_columns.items():
+        if columns:
+            draft_notes.add_note(CHANNELS_KEY, f"{label}: {', '.join(columns[:20])}")
     if preview.other_sheets:
         text = (
             f"sheets that are not read: {', '.join(preview.other_sheets)}; write the columns of one"
