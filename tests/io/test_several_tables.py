@@ -83,10 +83,6 @@ def test_two_sheets_of_each_test_are_joined_by_time(tmp_path: Path) -> None:
     assert [*logs] == ["ZZ_10", "TC_35"]
     assert [log.manoeuvre for log in logs.values()] == ["zigzag", "turning_circle"]
     assert_is_test(logs["TC_35"], 400)
-    notes = DraftNotes()
-    draft_tables(list_tests(file), notes)
-    text = "sheets of a test (ZZ 10 motion, ZZ 10 control) are joined"
-    assert any(text in guess for _, guess in notes.guessed_values)
     # sheets of different tests
     book = openpyxl.load_workbook(file)
     book["TC 35 control"].title = "TC 20 control"

@@ -66,6 +66,9 @@ def match_channels(
     }
     names, duplicates, speeds = _assign_columns([*parsed_names], parsed_names, draft_notes)
     _resolve_duplicates(names, duplicates, columns, draft_notes)
+    if words.get(names.get("x", "")) == "north":
+        text = f"'{names['x']}' is assumed north, next to a column of the letter E"
+        draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
     has_position = bool({"x", "y", "latitude", "longitude"} & names.keys())
     theta = next(
         (column for column in parsed_names if "theta" in parsed_names[column].text.split()), None

@@ -272,7 +272,7 @@ def _correct_rudder_signs(result: DraftResult) -> None:
         text = f"positive values of {name} turned the vessel {direction} in the logs"
         if abs(gain) < MIN_STANDARD_ERRORS * standard_error:
             text = f"the logs do not determine in which direction {name} turns the vessel"
-        elif gain > 0.0:
+        elif gain >= 0.0:
             continue
         elif entry:
             _scale_channel(result, name, entry, -1.0)
