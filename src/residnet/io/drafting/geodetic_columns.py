@@ -105,8 +105,8 @@ def convert_positions_to_degrees(
         for name, column in columns.items()
     }
     hemisphere_columns = {name: _find_hemisphere_column(preview, name) for name in columns}
-    letter_o, reason = _guess_letter_o(
-        preview, hemisphere_columns["longitude"] or columns["longitude"]
+    letter_o = _ask_letter_o(
+        preview, hemisphere_columns["longitude"] or columns["longitude"], draft_notes
     )
     parsed_positions = _parse_positions(cells, letter_o)
     if parsed_positions is None:
@@ -126,7 +126,6 @@ def convert_positions_to_degrees(
             )
     if letter_o is not None:
         settings[columns["longitude"]]["letter_o"] = letter_o
-        draft_notes.add_guess((*CHANNELS_KEY, "longitude"), reason)
     converted = {
         **preview.numeric_columns,
         **{columns[name]: values for name, values in degrees.items()},
@@ -173,36 +172,28 @@ def _parse_positions(
     return None
 
 
-def _guess_letter_o(preview: TablePreview, column: str) -> tuple[LetterO | None, str]:
-    """Guess the meaning of the letter O as a hemisphere.
+def _ask_letter_o(preview: TablePreview, column: str, draft_notes: DraftNotes) -> LetterO | None:
+    """Return the meaning of the letter O as a hemisphere; None if no longitude has it.
 
-    With W in other cells it means east, with E west. Otherwise the language of the column names
-    decides: east in German and Dutch, west in Spanish, French, Italian and Portuguese.
-
-    Returns:
-        The meaning and the reason; None if no longitude has the letter O.
+    It means east in German and Dutch, west in Romance languages: other cells or the language of the
+    column names decide.
     """
     cells = preview.text_columns.get(column)
     if cells is None:
-        return None, ""
-    first_and_last_letters = (
-        cells.dropna().astype("string").str.upper().str.extract(r"^\s*([EOW])?.*?([EOW])?\s*$")
-    )
-    letters = {
-        str(letter)
-        for position in first_and_last_letters
-        for letter in first_and_last_letters[position].dropna().unique()
-    }
+        return None
+    letters = {*cells.dropna().astype("string").str.upper().str.extractall("([EOW])")[0]}
     if "O" not in letters:
-        return None, ""
-    if len(letters) > 1:
-        other_letter = min(letters - {"O"})
-        return ("east" if "W" in letters else "west"), f"other cells have {other_letter}"
+        return None
     is_germanic = any(
         GERMANIC_PATTERN.search(normalize_name(name)) for name in preview.column_names
     )
-    meaning: LetterO = "east" if is_germanic else "west"
-    return meaning, f"the letter O is assumed {meaning}, by the language of the column names"
+    is_east = "W" in letters or ("E" not in letters and is_germanic)
+    meaning: LetterO = "east" if is_east else "west"
+    reason = f"the letter O is assumed {meaning}; it is east in German and Dutch"
+    key = (*CHANNELS_KEY, "longitude")
+    question = "meaning of the letter O as a hemisphere"
+    answer = draft_notes.ask_question(key, question, meaning, reason, ("west", "east"))
+    return "east" if answer == "east" else "west"
 
 
 def _find_hemisphere_column(preview: TablePreview, name: str) -> str | None:
