@@ -16,7 +16,6 @@ from residnet.core.layout import SIX_DOF_LAYOUT, DegreesOfFreedom
 from residnet.core.log import Log
 from residnet.io.drafting.questions import DraftNotes
 from residnet.io.drafting.tables import draft_tables
-from residnet.io.drafting.vertical import refuse_vertical_y
 from residnet.io.readers.several_tests import list_tests
 from residnet.io.sources import MeasuredLogs, list_input_files, read_split_logs
 from residnet.io.split import SplitConfig
@@ -285,16 +284,3 @@ def test_a_vessel_that_dives_by_heave_is_planar_and_one_that_pitches_is_not() ->
     pitching = dive | {"theta": -0.1 * np.cos(slope), "z": 5.0 + np.cumsum(0.01 * np.cos(slope))}
     pitching |= {"u": np.full(len(TRUTH), 1.0), "w": np.zeros(len(TRUTH))}
     assert DegreesOfFreedom.from_channels(pitching).velocities == SIX_DOF_LAYOUT.velocities
-
-
-def test_a_track_with_y_up_is_refused_and_a_dive_is_not(tmp_path: Path) -> None:
-    angle = np.linspace(0.0, 12.0, 400)
-    flat = np.full(400, 0.12)
-    half = -0.5 * angle
-    table = {"time": angle, "pos_x": np.sin(angle), "pos_y": flat, "pos_z": -np.cos(angle)}
-    table |= {"rot_x": 0.0 * half, "rot_y": np.sin(half), "rot_z": 0.0 * half}
-    table |= {"rot_w": np.cos(half), "fan": np.sin(0.3 * angle), "rudder": np.cos(0.2 * angle)}
-    pd.DataFrame(table).to_csv(tmp_path / "hover.csv", index=False)
-    with pytest.raises(ResidnetError, match=r"hover\.csv: column 'pos_y' is almost constant"):
-        residnet.read_logs(tmp_path)
-    refuse_vertical_y(tmp_path, [*table], [table | {"pos_x": angle}], {"x": "pos_x", "y": "pos_y"})

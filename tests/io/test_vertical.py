@@ -22,42 +22,45 @@ def simulate(tilt: float) -> tuple[Rotation, np.ndarray, np.ndarray]:
     return attitude, body, position
 
 
-@pytest.mark.parametrize(("tilt", "has_heave"), [(0.4, True), (0.4, False), (0.01, True)])
-def test_velocities_of_a_tilted_vessel_are_projected(tilt: float, *, has_heave: bool) -> None:
+NAMES = {"z": "depth", "phi": "roll [rad]", "theta": "pitch [rad]"}
+
+
+def make_log(attitude: Rotation, velocity: np.ndarray, position: np.ndarray) -> RawTable:
+    """Return a log with roll and pitch in rad, depth and velocities [T, 3]."""
+    _, pitch, roll = attitude.as_euler("ZYX").T
+    columns = {"phi": roll, "theta": pitch, "z": position[:, 2]}
+    return RawTable(T, columns | dict(zip(("u", "v", "w"), velocity.T, strict=True)))
+
+
+@pytest.mark.parametrize("tilt", [0.4, 0.01])
+def test_velocities_of_a_tilted_vessel_are_projected(tilt: float) -> None:
     attitude, body, position = simulate(tilt)
-    quaternion = dict(zip(("qx", "qy", "qz", "qw"), attitude.as_quat().T, strict=True))
-    log = RawTable(T, {**quaternion, "u": body[:, 0], "v": body[:, 1]})
-    table = {"position_z": position[:, 2]} | ({"linear_z": body[:, 2]} if has_heave else {})
-    (projected,) = project_on_horizontal([*table], [table], [log], {})
+    log = make_log(attitude, body, position)
+    projected = project_on_horizontal(log, NAMES)
     if tilt < 0.1:
         assert projected is log
         return
     yaw = attitude.as_euler("ZYX")[:, 0]
     expected = Rotation.from_euler("Z", -yaw[:, None]).apply(attitude.apply(body))
     for column, name in enumerate(("u", "v")):
-        # without heave velocity, the depth is differentiated
-        error = np.abs(projected.columns[name] - expected[:, column])[5:-5].max()
-        assert error < (1e-9 if has_heave else 0.02)
+        np.testing.assert_allclose(projected.columns[name], expected[:, column], atol=1e-9)
 
 
 def test_velocities_in_the_world_frame_are_not_projected() -> None:
     attitude, body, position = simulate(0.4)
-    world = attitude.apply(body)
-    quaternion = dict(zip(("qx", "qy", "qz", "qw"), attitude.as_quat().T, strict=True))
-    log = RawTable(T, {**quaternion, "u": world[:, 0], "v": world[:, 1]})
-    table = {"position_z": position[:, 2], "linear_z": world[:, 2]}
-    (projected,) = project_on_horizontal([*table], [table], [log], {})
-    assert projected is log
+    log = make_log(attitude, attitude.apply(body), position)
+    projected = project_on_horizontal(log, NAMES)
+    for name in ("u", "v"):
+        np.testing.assert_array_equal(projected.columns[name], log.columns[name])
 
 
 def test_velocities_are_projected_by_angles_in_degrees() -> None:
     attitude, body, position = simulate(0.4)
-    yaw, pitch, roll = attitude.as_euler("ZYX").T
-    tilt = {"phi": np.degrees(roll), "theta": np.degrees(pitch)}
-    log = RawTable(T, {**tilt, "u": body[:, 0], "v": body[:, 1]})
-    table = {"depth_m": position[:, 2], "heave_mps": body[:, 2]}
-    names = {"phi": "roll_deg", "theta": "pitch_deg"}
-    (projected,) = project_on_horizontal([*table], [table], [log], names)
+    log = make_log(attitude, body, position)
+    in_degrees = {name: np.degrees(log.columns[name]) for name in ("phi", "theta")}
+    names = {"z": "depth_m", "phi": "roll_deg", "theta": "pitch_deg"}
+    projected = project_on_horizontal(RawTable(T, log.columns | in_degrees), names)
+    yaw = attitude.as_euler("ZYX")[:, 0]
     expected = Rotation.from_euler("Z", -yaw[:, None]).apply(attitude.apply(body))
     np.testing.assert_allclose(projected.columns["u"], expected[:, 0], atol=1e-9)
     np.testing.assert_allclose(projected.columns["v"], expected[:, 1], atol=1e-9)

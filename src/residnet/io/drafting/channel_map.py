@@ -8,10 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from residnet.io.drafting.channels import ChannelMapper
+from residnet.core.layout import DegreesOfFreedom
+from residnet.core.names import CHANNEL_UNITS
+from residnet.core.units import to_si
+from residnet.io.drafting.channels import QUATERNION_HEADING, ChannelMapper
 from residnet.io.drafting.drift_angle import derive_drift_velocities, restore_drift_angle
 from residnet.io.drafting.motion_regression import POSE_FRAMES, ROS_POSE_FRAMES, PoseFrame, RawTable
 from residnet.io.drafting.questions import CHANNELS_KEY, DraftNotes
+from residnet.io.drafting.vertical import project_on_horizontal
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
     QUATERNION,
@@ -19,6 +23,7 @@ from residnet.io.readers.quantities import (
     complete_quaternion,
     normalize_quaternion,
     project_fixes,
+    quaternion_tilt,
     quaternion_yaw,
 )
 
@@ -93,14 +98,22 @@ def draft_channel_map(
         angle_columns[channel_columns[name]] = pair
     if quaternion_columns:
         derived_angles["psi"] = tuple(name for name in QUATERNION if name in quaternion_columns)
-        channel_columns["psi"] = "heading of the quaternion [rad]"
+        channel_columns["psi"] = QUATERNION_HEADING
+        # with a depth, roll and pitch determine the vertical motion
+        tilt_names = ("phi", "theta") if "z" in names else ()
+        derived_angles |= dict.fromkeys(tilt_names, QUATERNION)
+        channel_columns |= {name: f"{name} of the quaternion [rad]" for name in tilt_names}
     logs = [_add_derived_angles(raw, derived_angles) for raw in logs]
     channel_columns, logs, degrees_per_count = _project_fixes(channel_columns, logs, draft_notes)
     channel_columns, logs, drift = derive_drift_velocities(
         channel_columns, logs, draft_notes, degrees_per_count, candidate_frames
     )
     entries = ChannelMapper(
-        channel_columns, logs, draft_notes, degrees_per_count, candidate_frames
+        channel_columns,
+        [project_on_horizontal(raw, channel_columns) for raw in logs],
+        draft_notes,
+        degrees_per_count,
+        candidate_frames,
     ).draft_entries()
     entries = restore_drift_angle(entries, drift, draft_notes)
     if degrees_per_count:
@@ -118,6 +131,7 @@ def draft_channel_map(
         draft_notes.move_key((*CHANNELS_KEY, name), (*CHANNELS_KEY, name + COSINE_SUFFIX))
     if not quaternion_columns:
         return entries
+    entries = _drop_surface_heave(entries, logs, draft_notes)
     psi = entries.pop("psi")
     entries |= {
         name: {"column": quaternion_columns[name], "unit": "-"}
@@ -150,13 +164,58 @@ def _add_derived_angles(table: RawTable, derived_angles: Mapping[str, tuple[str,
     for name, parts in derived_angles.items():
         if columns.keys() >= {*parts}:
             part_values = [columns[part] for part in parts]
-            is_quaternion = "qw" in parts
-            columns[name] = (
-                quaternion_yaw(*normalize_quaternion(*complete_quaternion(part_values)))
-                if is_quaternion
-                else np.arctan2(*part_values[::-1])
-            )
+            if "qw" not in parts:
+                columns[name] = np.arctan2(*part_values[::-1])
+                continue
+            quaternion = normalize_quaternion(*complete_quaternion(part_values))
+            roll, pitch = quaternion_tilt(*quaternion)
+            angles = {"phi": np.unwrap(roll), "theta": pitch, "psi": quaternion_yaw(*quaternion)}
+            columns[name] = angles[name]
     return RawTable(table.t, columns)
+
+
+def _drop_surface_heave(
+    entries: Mapping[str, dict[str, Any]], logs: Sequence[RawTable], draft_notes: DraftNotes
+) -> dict[str, dict[str, Any]]:
+    """Return entries without derived roll and pitch, and without heave unless a vessel dives.
+
+    Args:
+        entries: channel -> entry; with a depth, roll and pitch are derived from a quaternion.
+        logs: tables.
+        draft_notes: receives the note of the columns that are left out.
+    """
+    if "z" not in entries:
+        return dict(entries)
+    vertical_sign = entries["z"].get("sign", 1)
+    is_earth_fixed = "frame" in entries.get("u", {})
+    names = ("x", "y", "z", "psi", "phi", "theta", *(() if is_earth_fixed else ("u", "v", "w")))
+    is_submerged = False
+    for table in logs:
+        channels = {
+            name: entries[name].get("sign", 1)
+            * to_si(entries[name]["unit"], CHANNEL_UNITS[name])
+            * table.columns[name]
+            for name in names
+            if name in entries and name in table.columns
+        }
+        if "theta" in channels:
+            channels["theta"] = vertical_sign * channels["theta"]
+            is_submerged |= DegreesOfFreedom.from_channels(channels).is_six_dof
+    left_out = {"phi", "theta"} | ({"w"} if is_earth_fixed else set())
+    if not is_submerged:
+        left_out |= {"z", "w", "q", "p"}
+        columns = ", ".join(
+            entry["column"] for name, entry in entries.items() if name in {"z", "w", "q", "p"}
+        )
+        text = (
+            f"{columns}: known and not used, a surface vessel is assumed because the depth does not"
+            " follow from the motion; a vessel that heaves needs velocities, for example columns"
+            " u, v, w along its axes"
+        )
+        draft_notes.add_note(CHANNELS_KEY, text)
+    for name in left_out & entries.keys():
+        draft_notes.discard_key((*CHANNELS_KEY, name))
+    return {name: entry for name, entry in entries.items() if name not in left_out}
 
 
 def _project_fixes(

@@ -43,7 +43,6 @@ from residnet.io.drafting.velocities import (
     MeasuredVelocities,
     choose_meaning,
     estimate_drift_free_offset,
-    make_measured_velocities,
     measure_contradiction,
     require_compatible,
 )
@@ -59,6 +58,8 @@ from residnet.io.header_vocabulary import (
 )
 from residnet.preprocessing.channel_values import NEGLIGIBLE_MOTION_SHARE
 
+QUATERNION_HEADING = "heading of the quaternion [rad]"
+"""Column of a heading that is derived from a quaternion."""
 _OVERRULING_CORRELATION = 0.9
 """Smallest correlation for which an estimated factor overrules the header."""
 _MIN_FACTOR_RATIO = 0.6
@@ -100,6 +101,8 @@ class ChannelMapper:
         """
         self._degrees_per_count = float(degrees_per_count)
         self._candidate_frames = tuple(candidate_frames)
+        # whether position and heading have the names of a ROS pose
+        self._is_ros_pose = self._candidate_frames == ROS_POSE_FRAMES
         self._names = dict(names)
         self._logs = list(logs)
         self._draft_notes = draft_notes
@@ -123,7 +126,7 @@ class ChannelMapper:
             for name in [
                 velocity_name for velocity_name in ("u", "v", "r") if velocity_name in self._names
             ]:
-                self._drop_inconsistent_velocity(name)
+                self._drop_constant_velocity(name)
             self._require_compatible_velocities()
         elif "psi" in self._names:
             self._psi_unit = self._infer_unit("psi")
@@ -139,33 +142,18 @@ class ChannelMapper:
                 self._draft_notes.add_guess((*CHANNELS_KEY, force), text)
         return entries
 
-    def _drop_inconsistent_velocity(self, name: str) -> None:
-        """Leave out a velocity that is constant, or uncorrelated and larger than the motion."""
+    def _drop_constant_velocity(self, name: str) -> None:
+        """Leave out a velocity that does not move while position and heading do."""
         motions = [motion for motion in self._motions if motion is not None]
-        if not motions:
-            return
         component_index = {"u": 1, "v": 2, "r": 3}[name]
-        motion_values = np.concatenate([motion[component_index] for motion in motions])
         factor = to_si(self._infer_unit(name, should_note=False), CHANNEL_UNITS[name])
-        column_values = factor * self._concatenate_values(name)
-        # compare u and v with the speed, because one of them may be nearly zero
-        reference_speed = (
-            motion_values
-            if name == "r"
-            else np.hypot(*np.concatenate([m[1:3] for m in motions], axis=1))
-        )
-        problem = ""
-        if float(np.nanstd(column_values)) < NEGLIGIBLE_MOTION_SHARE * float(np.std(motion_values)):
-            problem = "does not move, but position and heading do"
-        elif (
-            float(np.nanmedian(np.abs(column_values))) > float(reference_speed.max())
-            and not fit_to_motion(self._logs, self._motions, name).is_significant
+        spread = factor * float(np.nanstd(self._concatenate_values(name)))
+        if motions and spread < NEGLIGIBLE_MOTION_SHARE * float(
+            np.std(np.concatenate([motion[component_index] for motion in motions]))
         ):
-            problem = "exceeds all velocities from position and heading, and is uncorrelated"
-        if problem:
             column = self._names.pop(name)
-            text = f"'{column}' {problem}; left out: {name} is derived from them"
-            self._draft_notes.add_note(CHANNELS_KEY, text)
+            text = f"'{column}' does not move, but position and heading do; left out: {name} is"
+            self._draft_notes.add_note(CHANNELS_KEY, f"{text} derived from them")
 
     @property
     def _is_named_earth_fixed(self) -> bool:
@@ -174,9 +162,10 @@ class ChannelMapper:
         return find_earth_velocities(columns) == columns
 
     @property
-    def _is_ros_pose(self) -> bool:
-        """Whether position and heading have the names of a ROS pose."""
-        return self._candidate_frames == ROS_POSE_FRAMES
+    def _vertical_sign(self) -> int:
+        """-1 if the vertical axes of the file point up: those of a quaternion in ENU; else 1."""
+        is_quaternion = self._names.get("psi") == QUATERNION_HEADING
+        return -1 if is_quaternion and self._pose_frame.is_from_east else 1
 
     def _concatenate_values(self, name: str) -> np.ndarray:
         parts = [raw.columns[name] for raw in self._logs if name in raw.columns]
@@ -184,16 +173,21 @@ class ChannelMapper:
 
     def choose_frame(self) -> None:
         """Choose unit and frame of the heading that are most consistent with the motion."""
-        score = self._search_heading_frame()
         x, y = parse_name(self._names["x"]), parse_name(self._names["y"])
         is_named_north_east = (
             x.has_all("north") and y.has_all("east") and not (x.text == "x" or y.text == "y")
         )
         is_named_north_east = is_named_north_east or self._degrees_per_count > 0.0
-        if not is_named_north_east and not self._is_ros_pose and self._is_mirrored():
-            self._set_pose_frame(
-                PoseFrame(not self._pose_frame.is_swapped, not self._pose_frame.is_from_east)
+        if is_named_north_east:
+            self._candidate_frames = tuple(
+                dict.fromkeys(PoseFrame(False, f.is_from_east) for f in self._candidate_frames)
             )
+        score = self._search_heading_frame()
+        if not is_named_north_east and not self._is_ros_pose and self._is_mirrored():
+            self._pose_frame = PoseFrame(*(not flag for flag in self._pose_frame))
+            self._motions = [
+                estimate_motion(table, self._psi_unit, self._pose_frame) for table in self._logs
+            ]
             text = "the mirrored motion is as consistent, but more thrust on port turns it to port"
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
         self._name_position_axes(score, is_named_north_east)
@@ -216,16 +210,12 @@ class ChannelMapper:
         # an unwrapped heading in rad may be large, so that its size decides only without motion
         alternative_unit = "rad" if unit_from_size == "deg" else "deg"
         candidate_units = [header_unit] if header_unit else [unit_from_size, alternative_unit]
-        if (
-            not header_unit
-            and np.nanmax(np.abs(self._concatenate_values("psi")), initial=0.0) > 720.0
-        ):
+        largest_value = np.nanmax(np.abs(self._concatenate_values("psi")), initial=0.0)
+        if not header_unit and largest_value > 720.0:
             candidate_units.append("cdeg")
         best_candidate = (-np.inf, "rad", self._candidate_frames[0])
         for unit in candidate_units:
-            for frame in (
-                f for f in self._candidate_frames if not (self._degrees_per_count and f.is_swapped)
-            ):
+            for frame in self._candidate_frames:
                 motions = [estimate_motion(table, unit, frame) for table in self._logs]
                 score = self._score_consistency(motions)
                 # a later candidate must be clearly better: the first ones are the usual ones
@@ -238,11 +228,6 @@ class ChannelMapper:
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"the header has no unit; {reason}")
         return score
 
-    def _set_pose_frame(self, frame: PoseFrame) -> None:
-        """Set the frame of position and heading, and estimate the motion in it."""
-        self._pose_frame = frame
-        self._motions = [estimate_motion(table, self._psi_unit, frame) for table in self._logs]
-
     def _name_position_axes(self, score: float, is_named_north_east: bool) -> None:
         """Assign the position columns to north and east by the frame, and note the guess.
 
@@ -250,15 +235,12 @@ class ChannelMapper:
             score: consistency of position and heading, 1 at most.
             is_named_north_east: whether the names of the columns define their axes.
         """
-        if self._pose_frame.is_swapped and not is_named_north_east:
+        if self._pose_frame.is_swapped:
             self._names["x"], self._names["y"] = self._names["y"], self._names["x"]
             text = "the motion is consistent with the heading only if the column called y is north"
             if self._is_ros_pose and self._pose_frame.is_from_east:
                 text = "x is assumed east and y north, as in a pose of ROS (REP 103)"
             self._draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
-        elif self._pose_frame.is_swapped:
-            # columns named north and east are not exchanged: the heading is from east instead
-            self._set_pose_frame(PoseFrame(False, True))
         elif not is_named_north_east and not self._pose_frame.is_from_east:
             text = f"x is assumed north and y east: consistent with the heading ({score:.2f} of 1)"
             self._draft_notes.add_guess((*CHANNELS_KEY, "x"), text)
@@ -378,12 +360,18 @@ class ChannelMapper:
                 return np.asarray(np.interp(grid, t[is_finite], values[is_finite]))
 
             position = [resample(table.columns[n], table.t, motion.t) for n in (north, east)]
+            surge = motion.surge_velocity
+            sway = motion.sway_velocity
+            heading_on_grid = resample(heading, table.t, motion.t)
+            earth_velocities = rotate(surge, sway, heading_on_grid)
+            components = dict(zip(("north", "east"), earth_velocities, strict=True))
+            components |= {"surge": surge, "sway": sway, "speed": np.hypot(surge, sway)}
             measured.append(
-                make_measured_velocities(
+                MeasuredVelocities(
                     motion.t,
-                    (motion.surge_velocity, motion.sway_velocity),
                     np.stack(position, axis=1),
-                    resample(heading, table.t, motion.t),
+                    heading_on_grid,
+                    components,
                     {name: resample(table.columns[name], table.t, motion.t) for name in names},
                 )
             )
@@ -657,7 +645,13 @@ class ChannelMapper:
         return fit._replace(factor=factors[int(np.argmin(squares))])
 
     def _conventional_sign(self, name: str) -> int:
-        """Return -1 for v and r of tables with a ROS pose (positive to port, REP 103), else 1."""
+        """Return -1 for an axis that points up or to port in the file (REP 103), else 1."""
+        if name == "z" and self._names.get("psi") == QUATERNION_HEADING:
+            text = "completes the six degrees of freedom with the quaternion"
+            text += "; positive up in the file" if self._vertical_sign < 0 else ""
+            self._draft_notes.add_guess((*CHANNELS_KEY, name), text)
+        if name in ("z", "w", "q"):
+            return self._vertical_sign
         if not self._is_ros_pose or name not in ("v", "r"):
             return 1
         text = "assumed positive to port, as for a pose of ROS (REP 103)"
@@ -692,6 +686,8 @@ class ChannelMapper:
                 continue
             t = table.t[is_finite]
             depth, roll, pitch = (factors[key] * table.columns[key][is_finite] for key in factors)
+            depth *= self._vertical_sign
+            pitch *= self._vertical_sign
             depth_rate, roll_rate, pitch_rate = (
                 differentiate_on_grid(motion.t, t, values) for values in (depth, roll, pitch)
             )

@@ -70,8 +70,8 @@ def find_quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
 def find_depth_channels(columns: Sequence[str], known_channels: Collection[str]) -> dict[str, str]:
     """Return the channels w, q, z, theta -> columns of the table of an underwater vessel.
 
-    Such a table has depth, pitch and roll, or motion in the vertical plane only; for other tables
-    the result is empty.
+    Such a table has depth, pitch and roll or a quaternion, or motion in the vertical plane only;
+    for other tables the result is empty.
 
     Args:
         columns: names of the columns.
@@ -83,7 +83,13 @@ def find_depth_channels(columns: Sequence[str], known_channels: Collection[str])
     column_by_channel = {
         name: column_by_channel[name] for name in _DEPTH_CHANNELS if name in column_by_channel
     }
-    has_full_attitude = "phi" in known_channels and {"z", "theta"} <= column_by_channel.keys()
+    if {*QUATERNION} <= {*known_channels}:
+        # the quaternion has the pitch
+        column_by_channel.pop("theta", None)
+    has_full_attitude = "z" in column_by_channel and (
+        {*QUATERNION} <= {*known_channels}
+        or ("phi" in known_channels and "theta" in column_by_channel)
+    )
     if has_full_attitude and "p" not in known_channels:
         column_by_channel |= roll_rate
     return (

@@ -57,9 +57,7 @@ def find_named_table(
         if all(name in table.columns and np.isfinite(table.columns[name]).any() for table in tables)
     ]
     channel_notes = DraftNotes()
-    names, entries = draft_columns(
-        recordings[0].path, fields, tables, channel_notes, match_channels, has_heading=True
-    )
+    names, entries = draft_columns(fields, tables, channel_notes, match_channels, has_heading=True)
     has_attitude = "psi" in names or "qw" in names
     has_position = {"x", "y"} <= {*names} or {"latitude", "longitude"} <= {*names}
     if not (has_attitude and has_position):

@@ -42,12 +42,6 @@ from residnet.io.drafting.table_clock import (
     make_step_clock,
 )
 from residnet.io.drafting.table_preview import TablePreview, parse_unit_cell, preview_named_tables
-from residnet.io.drafting.vertical import (
-    VERTICAL_CHANNELS,
-    draft_vertical_motion,
-    project_on_horizontal,
-    refuse_vertical_y,
-)
 from residnet.io.drafting.vessel_rows import (
     drop_ais_turn_rate,
     match_columns_of_one_vessel,
@@ -108,7 +102,6 @@ def draft_tables(
         return names
 
     column_by_channel, channels = draft_columns(
-        main_preview.path,
         common_numeric,
         logs,
         draft_notes,
@@ -141,7 +134,6 @@ def draft_tables(
 
 
 def draft_columns(
-    path: Path,
     columns: Sequence[str],
     logs: Sequence[RawTable],
     draft_notes: DraftNotes,
@@ -153,7 +145,6 @@ def draft_columns(
     """Draft the channel map of columns from their names, units, values and physics.
 
     Args:
-        path: first file, for errors.
         columns: names of the columns of numbers.
         logs: tables with these columns, some of which may be missing.
         draft_notes: receives guesses and notes.
@@ -182,12 +173,11 @@ def draft_columns(
         # roll is optional for a model, so that it is left out rather than the tables without it
         if any(names.get(name, columns[0]) not in table for table in tables):
             draft_notes.add_note(CHANNELS_KEY, f"empty in some files, left out: {names.pop(name)}")
-    names |= find_depth_channels(simple_columns, names)
     if "psi" not in names:
         names |= choose_quaternion_order(attitudes, tables)
+    names |= find_depth_channels(simple_columns, names)
     if not names:
         return {}, {}
-    refuse_vertical_y(path, simple_columns, tables, names)
     mapped_logs = [
         RawTable(
             log.t,
@@ -201,13 +191,11 @@ def draft_columns(
     ]
     entries = draft_channel_map(
         names,
-        project_on_horizontal(simple_columns, tables, mapped_logs, names),
+        mapped_logs,
         draft_notes,
         texts,
         is_up_positive=is_vertical_axis_up(simple_columns, names, tables),
     )
-    entries |= draft_vertical_motion(simple_columns, tables, mapped_logs, entries, draft_notes)
-    names |= {name: entry["column"] for name, entry in entries.items() if name in VERTICAL_CHANNELS}
     return names, entries
 
 

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from residnet.core.errors import DataError
-from residnet.core.frames import rotate
 
 MAX_CONTRADICTION = 0.1
 """Largest share of the distance by which integrated velocities may leave the positions."""
@@ -90,34 +89,6 @@ class MeaningChoice(NamedTuple):
     def is_ambiguous(self) -> bool:
         """Whether the user must choose."""
         return self.share_ratio > _MAX_SHARE_RATIO
-
-
-def make_measured_velocities(
-    t: np.ndarray,
-    velocities: tuple[np.ndarray, np.ndarray],
-    position: np.ndarray,
-    heading: np.ndarray,
-    columns: Mapping[str, np.ndarray],
-) -> MeasuredVelocities:
-    """Create the velocities of a log.
-
-    Args:
-        t: times [T] in s.
-        velocities: surge and sway [T] from the positions in m/s.
-        position: north and east [T, 2] in m.
-        heading: heading [T] in rad.
-        columns: u, v -> column [T].
-    """
-    surge, sway = velocities
-    north, east = rotate(surge, sway, heading)
-    components = {
-        "surge": surge,
-        "sway": sway,
-        "north": north,
-        "east": east,
-        "speed": np.hypot(surge, sway),
-    }
-    return MeasuredVelocities(t, position, heading, components, columns)
 
 
 def choose_meaning(logs: Sequence[MeasuredVelocities]) -> MeaningChoice:
