@@ -12,10 +12,12 @@ from simulated_motion import BOATS, TrueMotion, simulate_motion
 
 from residnet.core.config import validate_config
 from residnet.core.errors import ConfigError, DataError
+from residnet.io.drafting.named_fields import find_named_table
 from residnet.io.drafting.questions import DraftNotes
 from residnet.io.drafting.reading import DraftResult, read_drafted
 from residnet.io.drafting.tables import draft_tables
 from residnet.io.readers import ReaderConfig
+from residnet.io.readers.recording import Recording, Series
 from residnet.quality import inspect_log
 
 TIMES = np.arange(0.0, 79.0, 0.2)
@@ -250,3 +252,16 @@ def test_earth_fixed_velocities_of_a_matlab_struct(tmp_path: Path) -> None:
         for channel in ("v", "r"):
             errors = log[channel] - np.interp(log.t, TIMES, motion.sample(channel, TIMES))
             assert float(np.nanmax(np.abs(errors))) < 0.1
+
+
+def test_messages_of_an_unknown_type_are_mapped_by_their_fields() -> None:
+    motion = true_motion(1)
+    fields = {name: motion.sample(name, TIMES) for name in ("x", "y", "psi", "u", "v", "r")}
+    series = Series("/boat/state", "usv_msgs/msg/State", fields, stamp=TIMES)
+    target = Series("/boat/setpoint", "usv_msgs/msg/State", fields, stamp=TIMES)
+    recording = Recording(Path("run.mcap"), {"/boat/state": series, "/boat/setpoint": target})
+    assert find_named_table([recording], DraftNotes(), needs_pose=False) is None
+    sources = find_named_table([recording], DraftNotes(), needs_pose=True)
+    assert sources is not None
+    assert sources.settings["position"]["topic"] == "/boat/state"
+    assert {*sources.settings["channels"]} == {"u", "v", "r"}

@@ -3,46 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from residnet.core.names import CHANNEL_UNITS
 from residnet.io.drafting.motion_regression import RawTable, estimate_rudder_gain
 from residnet.io.drafting.motion_sources import extract_pose
 from residnet.io.drafting.questions import CHANNELS_KEY, DraftNotes
 from residnet.io.header_vocabulary import MOTION_CHANNELS, match_input_channel, parse_name
 from residnet.io.readers.messages import KNOWN_COMMANDS
-from residnet.io.readers.quantities import ChannelPlan, FieldMap
+from residnet.io.readers.quantities import ChannelPlan
 from residnet.io.readers.recording import Recording
 
 _MIN_INPUT_ROWS = 20
 """Smallest number of rows of a topic with inputs."""
-
-
-def name_bare_numbers(
-    recording: Recording, standard: Mapping[str, FieldMap]
-) -> Iterator[tuple[str, tuple[str, str]]]:
-    """Yield channel, topic and field of numbers without a unit whose topic names an actuator.
-
-    Args:
-        recording: recording with aligned clocks.
-        standard: channels of standard messages.
-    """
-    for name, entry in standard.items():
-        topic = entry.topic or ""
-        field = entry.field
-        if name in CHANNEL_UNITS or entry.unit not in ("-", "rad") or topic not in recording.series:
-            continue
-        # the last part of a topic's name is the most specific one
-        names = (topic.rsplit("/", 1)[-1], name) if field == "data" else (name,)
-        channels = (
-            match_input_channel(parse_name(candidate.removesuffix("_position")))
-            for candidate in names
-        )
-        if channel := next(filter(None, channels), None):
-            yield channel, (topic, field)
 
 
 def concatenate_field(recordings: Sequence[Recording], topic: str, field: str) -> np.ndarray:

@@ -10,11 +10,11 @@ import numpy as np
 
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
+from residnet.core.names import CHANNEL_UNITS
 from residnet.io.drafting.actuator_fields import (
     concatenate_field,
     find_actuator_fields,
     match_known_command,
-    name_bare_numbers,
 )
 from residnet.io.drafting.motion_regression import (
     POSE_FRAMES,
@@ -72,7 +72,12 @@ def draft_recordings(
         log = None
     plan = extend_with_standard_messages(aligned[0], ChannelPlan())
     pose_sources = [source for source in (plan.position, plan.heading) if source is not None]
-    used_fields = {(entry.topic or "", entry.field) for entry in plan.channels.values()}
+    # numbers without a unit may be those of an actuator, by the name of their topic
+    used_fields = {
+        (entry.topic or "", entry.field)
+        for name, entry in plan.channels.items()
+        if name in CHANNEL_UNITS or entry.unit not in ("-", "rad")
+    }
     used_fields |= {
         (source.topic or "", field) for source in pose_sources for field in source.fields
     }
@@ -96,21 +101,15 @@ def draft_recordings(
     uses_standard_messages = "standard_messages" not in settings
     known_channels = set(log.channels) if log is not None and uses_standard_messages else set()
     channels = dict(settings.pop("channels", {}))
-    renamed_fields = name_bare_numbers(aligned[0], plan.channels) if uses_standard_messages else ()
-    for name, (topic, field) in (
-        *renamed_fields,
-        *find_actuator_fields(aligned, sources.used_fields, plan, draft_notes),
-    ):
+    actuators = find_actuator_fields(aligned, sources.used_fields, plan, draft_notes)
+    for name, (topic, field) in actuators:
         if name in known_channels or name in channels:
             continue
         if (command_of_format := match_known_command(aligned[0], topic, field)) is not None:
-            settings_of_format = command_of_format[1]
-            scale_text = f"{settings_of_format.get('scale', 1.0):g} " * (
-                "scale" in command_of_format[1]
-            )
-            text = f"the format defines {field} in {scale_text}{settings_of_format['unit']}"
+            command_settings = command_of_format[1]
+            text = f"the format defines {field} in {command_settings['unit']}"
             draft_notes.add_note((*CHANNELS_KEY, name), text)
-            channels[name] = {"topic": topic, "field": field, **settings_of_format, "hold": True}
+            channels[name] = {"topic": topic, "field": field, **command_settings, "hold": True}
             continue
         values = concatenate_field(aligned, topic, field)
         scaling = guess_scaling(name, field, values) or infer_unit(name, field, values)
