@@ -19,7 +19,6 @@ from residnet.io.drafting.problems import (
     UnreadableLogsError,
     group_problems,
     name_files_in_errors,
-    rewrite_advice_for_files,
 )
 from residnet.io.drafting.questions import DraftNotes
 from residnet.io.drafting.tables import draft_manoeuvre_setting, draft_tables
@@ -94,13 +93,6 @@ def test_a_problem_of_many_files_is_one_line() -> None:
     assert second == "logs/run3.csv: is empty"
     error = UnreadableLogsError({path: DataError(text) for path, text in messages.items()})
     assert str(error) == first
-
-
-def test_a_file_without_a_channel_map_is_not_told_to_correct_one() -> None:
-    error = rewrite_advice_for_files(DataError("a.csv: no number; remove it from the channel map"))
-    assert str(error) == "a.csv: no number; fill it with values, or leave the file out"
-    other = DataError("a.csv: the clock runs backwards")
-    assert rewrite_advice_for_files(other) is other
 
 
 def write_rows(path: Path, rows: int, columns: int = 4) -> Path:
@@ -207,7 +199,6 @@ def test_advice_on_files_alone_needs_no_config(
     with pytest.raises(ResidnetError, match=advice) as refused:
         residnet.read_logs([tmp_path / "run.mat"])
     assert str(refused.value).startswith(f"{tmp_path / 'run.mat'}: ")
-    assert "set " not in str(refused.value)
 
 
 STEERING = {

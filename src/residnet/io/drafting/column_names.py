@@ -18,6 +18,7 @@ from residnet.io.header_vocabulary import (
     find_earth_velocities,
     find_mismatched_unit,
     is_drift_angle,
+    is_pulse,
     match_input_channel,
     match_state_channel,
     parse_header_unit,
@@ -26,8 +27,6 @@ from residnet.io.header_vocabulary import (
 from residnet.io.readers.quantities import COSINE_SUFFIX, SINE_SUFFIX
 
 _DRIVE_PATTERN = re.compile(r"^(?:cmd_)?(?:n(?=_|$)|thrust)")
-_PULSE_RANGE = (900.0, 2100.0)
-"""Range of the pulses of servos and speed controllers in us."""
 _NAME_END = re.compile(r"\W*[\[(].*|_m$")
 """Unit at the end of a name."""
 _PORT_LETTER = re.compile(r"(?<![^\W_])P(?![^\W_])")
@@ -340,8 +339,8 @@ def rename_pulsed_drives(
 ) -> dict[str, str]:
     """Rename shaft speeds and thrusts whose values are servo pulses or relative to throttle.
 
-    Pulses are integers between 900 and 2,100 us; relative values of a motor or thruster are at most
-    1 and no integers. Columns with a word for revolutions in their names are not renamed.
+    Pulses are integers, see `is_pulse`; relative values of a motor or thruster are at most 1 and no
+    integers. Columns with a word for revolutions in their names are not renamed.
 
     Args:
         names: channel -> column.
@@ -351,18 +350,15 @@ def rename_pulsed_drives(
     for channel, column in names.items():
         values = np.concatenate([table.get(column, np.zeros(0)) for table in tables])
         values = values[np.isfinite(values)]
-        if _DRIVE_PATTERN.match(channel) and values.size and not REVOLUTION_PATTERN.search(column):
+        throttle = _DRIVE_PATTERN.sub("throttle", channel)
+        is_drive = _DRIVE_PATTERN.match(channel) and not REVOLUTION_PATTERN.search(column)
+        if is_drive and values.size and throttle not in names:
             are_integers = bool((values == np.round(values)).all())
-            are_pulses = (
-                are_integers and values.min() >= _PULSE_RANGE[0] and values.max() <= _PULSE_RANGE[1]
-            )
             parsed_name = parse_name(column)
-            is_share = "thrust" in channel or parsed_name.has_all("engine")
-            is_share &= (
-                parsed_name.has_none("revolutions", "propeller", "speed") and not are_integers
-            )
-            throttle = _DRIVE_PATTERN.sub("throttle", channel)
-            if throttle not in names and (are_pulses or (is_share and np.abs(values).max() <= 1.0)):
+            is_motor = "thrust" in channel or parsed_name.has_all("engine")
+            is_motor &= parsed_name.has_none("revolutions", "propeller", "speed")
+            is_relative = is_motor and not are_integers and bool(np.abs(values).max() <= 1.0)
+            if is_relative or (are_integers and is_pulse("throttle", values)):
                 channel = throttle
         renamed[channel] = column
     return renamed

@@ -55,32 +55,6 @@ def name_files_in_errors(paths: Sequence[Path]) -> Iterator[None]:
         raise DataError(f"{paths[0]}: {message}{other_files_text}") from None
 
 
-def rewrite_advice_for_files(error: ResidnetError) -> ResidnetError:
-    """Return an error with advice for users who give only files.
-
-    They have no config, so that advice on its keys or its channel map would not help them.
-    """
-    message = str(error)
-    for advice, advice_for_files in _ADVICE_FOR_FILES:
-        message = re.sub(advice, advice_for_files, message)
-    return error if message == str(error) else DataError(message)
-
-
-_ADVICE_FOR_FILES = (
-    (
-        r"remove (it|them) from the channel map(, or leave the file out)?",
-        r"fill \1 with values, or leave the file out",
-    ),
-    (
-        r"no channel is mapped; set `channels`, `position` and `heading`",
-        "no field has the name of a channel; rename the fields, for example to x, y, psi, u, v, r,"
-        " delta, n",
-    ),
-    (r"set time: \{column: \.\.\.\}", "name the vector of times t"),
-)
-"""Advice for users of a config, as a pattern -> advice for users of files alone."""
-
-
 def strip_file_name(paths: Iterable[Path], message: str) -> str:
     """Return a message without the path of one of its files at the start."""
     for path in paths:

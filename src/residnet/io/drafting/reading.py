@@ -33,7 +33,6 @@ from residnet.io.drafting.problems import (
     UnreadableLogsError,
     name_files_in_errors,
     raise_unreadable,
-    rewrite_advice_for_files,
 )
 from residnet.io.drafting.questions import (
     CHANNELS_KEY,
@@ -105,10 +104,7 @@ def read_drafted(
         # a registered reader that returns channels in SI units needs no channel map
         result.reader = {"kind": log_kind}
     elif log_kind != "canonical":
-        try:
-            result.reader, recordings = draft_recordings(paths, draft_notes)
-        except ResidnetError as error:
-            raise rewrite_advice_for_files(error) from None
+        result.reader, recordings = draft_recordings(paths, draft_notes)
     settings = {key: value for key, value in result.reader.items() if is_gridded or key != "clock"}
     reader = validate_config(settings, ReaderConfig, "draft").build()
     names = assign_log_names(paths)
@@ -121,7 +117,7 @@ def read_drafted(
                 log = reader.read(path) if recording is None else reader.to_log(recording)
                 result.logs[path] = log.replace(name=names[path])
         except ResidnetError as error:
-            result.errors[path] = rewrite_advice_for_files(error)
+            result.errors[path] = error
     report_progress("reading logs", len(paths), len(paths))
     if not result.logs:
         raise_unreadable(result.errors)

@@ -152,7 +152,7 @@ def require_values(path: Path, channel: str, column: str, values: np.ndarray) ->
     if not np.isfinite(values).any():
         raise DataError(
             f"{path}: column '{column}' (channel {channel}) holds no number in any of {values.size}"
-            " rows; remove it from the channel map"
+            " rows; remove it from the channel map, or leave the file out"
         )
 
 

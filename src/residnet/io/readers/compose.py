@@ -342,8 +342,9 @@ def _extract_all_topics(recording: Recording, plan: ChannelPlan) -> list[TopicCh
             raise DataError(f"{recording.path}: {entry['text']}")
     if not topics:
         raise UsageError(
-            f"{recording.path}: no channel is mapped; set `channels`, `position` and `heading`"
-            f" (the recording contains {recording.contents_description})"
+            f"{recording.path}: no channel is mapped; rename the fields, for example to x, y, psi,"
+            " u, v, r, delta, n, or set `channels`, `position` and `heading` (the recording"
+            f" contains {recording.contents_description})"
         )
     return topics
 
@@ -360,7 +361,7 @@ def _read_field(
     if not np.isfinite(values).any():
         raise DataError(
             f"{recording.path}: topic {series.name}: field '{path}' has no number in any of"
-            f" {values.size} rows; remove it from the channel map"
+            f" {values.size} rows; remove it from the channel map, or leave the file out"
         )
     return values if unit is None else to_si(unit) * values
 
@@ -378,7 +379,7 @@ def _make_topic_channels(
     if len(series) < 2:
         raise DataError(
             f"{recording.path}: topic {series.name} has {len(series)} rows, at least 2 are needed;"
-            " remove it from the channel map"
+            " remove it from the channel map, or leave the file out"
         )
     units = {name: (units or {}).get(name) or CHANNEL_UNITS.get(name, "m/s") for name in values}
     log = Log(series.name, series.clock, values, units)

@@ -769,7 +769,7 @@ def _add_yaw_of_quaternion(
         columns = [channel_maps[name].column for name in part_names]
         raise DataError(
             f"{path}: {', '.join(columns)} contain no quaternion, all rows are empty;"
-            " remove them from the channel map"
+            " remove them from the channel map, or leave the file out"
         )
     # the frame of a quaternion is set at qw: in `enu` yaw is counter-clockwise from east
     is_enu = channel_maps["qw"].frame == "enu"

@@ -262,7 +262,8 @@ def _build_tree_recording(
         )
         available = ", ".join(list(leaves)[:12]) or "nothing"
         raise UsageError(
-            f"{path}: has no vector {clock_description}; set time: {{column: ...}} (the file"
+            f"{path}: has no vector {clock_description}; name the vector of times t or set time:"
+            " {column: ...} (the file"
             f" contains {available})"
         )
     fields, remarks = _assign_to_clocks(leaves, clocks, field_filter)
