@@ -311,6 +311,7 @@ def test_read_logs_keeps_logs_without_roll(tmp_path: Path) -> None:
     for number in range(3):
         table = pd.DataFrame({"t": t, "surge [m/s]": 1.0 + 0.1 * np.sin(t), "rudder [deg]": t % 7})
         table["roll [deg]"] = np.nan if number == 1 else 3.0 * np.sin(t)
+        table.insert(0, "spare", np.nan if number == 1 else np.cos(t))
         table.to_csv(tmp_path / f"run_{number}.csv", index=False)
     logs = residnet.read_logs(tmp_path)
     assert [sorted(log.channels) for log in logs] == [["delta", "u"]] * 3

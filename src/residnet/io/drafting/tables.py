@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -89,23 +90,14 @@ def draft_tables(
         name for name in common_columns if name in numeric_columns and name not in clock.columns
     ]
     refuse_minute_columns(main_preview.path, common_numeric)
+    if select:
+        common_numeric = drop_ais_turn_rate(common_numeric, main_preview, draft_notes)
     logs = _build_raw_tables(previews, common_numeric, errors, step)
-
-    def match_columns(
-        columns: Sequence[str], draft_notes: DraftNotes, *, has_heading: bool
-    ) -> dict[str, str]:
-        names = match_columns_of_one_vessel(
-            columns, main_preview.numeric_columns, draft_notes, has_heading=has_heading
-        )
-        if select:
-            drop_ais_turn_rate(names, main_preview, draft_notes)
-        return names
-
     column_by_channel, channels = draft_columns(
         common_numeric,
         logs,
         draft_notes,
-        match_columns,
+        partial(match_columns_of_one_vessel, numeric_columns=main_preview.numeric_columns),
         _collect_texts(main_preview),
         has_heading=has_heading,
     )
@@ -171,7 +163,7 @@ def draft_columns(
     names = add_sin_cos_channels(names, sin_cos_pairs)
     for name in ("phi", "p"):
         # roll is optional for a model, so that it is left out rather than the tables without it
-        if any(names.get(name, columns[0]) not in table for table in tables):
+        if name in names and any(names[name] not in table for table in tables):
             draft_notes.add_note(CHANNELS_KEY, f"empty in some files, left out: {names.pop(name)}")
     if "psi" not in names:
         names |= choose_quaternion_order(attitudes, tables)

@@ -87,29 +87,34 @@ def select_vessel_rows(
 
 
 def drop_ais_turn_rate(
-    column_by_channel: dict[str, str], preview: TablePreview, draft_notes: DraftNotes
-) -> None:
-    """Remove the yaw rate if its values are coded as in AIS: integers from -128 to 127."""
-    column = column_by_channel.get("r", "")
-    if normalize_name(column) not in ("rot", "rate of turn", "rateofturn"):
-        return
-    values = preview.numeric_columns[column]
-    values = values[np.isfinite(values)]
-    is_coded = (values == np.round(values)) & (values >= -128.0) & (values <= 127.0)
-    if is_coded.all():
-        del column_by_channel["r"]
+    columns: Sequence[str], preview: TablePreview, draft_notes: DraftNotes
+) -> list[str]:
+    """Return columns without a yaw rate that is coded as in AIS: integers from -128 to 127."""
+    others = []
+    for column in columns:
+        values = preview.numeric_columns.get(column, np.zeros(0))
+        values = values[np.isfinite(values)]
+        is_coded = (values == np.round(values)) & (values >= -128.0) & (values <= 127.0)
+        if normalize_name(column) not in _AIS_TURN_RATES or not is_coded.all():
+            others.append(column)
+            continue
         draft_notes.add_note(
             CHANNELS_KEY,
             f"'{column}' is coded as in AIS, 4.733 sqrt(deg/min) and -128 for unknown; it is left"
             " out, r follows from the heading",
         )
+    return others
+
+
+_AIS_TURN_RATES = ("rot", "rate of turn", "rateofturn")
+"""Normalised names of the yaw rate in AIS."""
 
 
 def match_columns_of_one_vessel(
     columns: Sequence[str],
-    numeric_columns: Mapping[str, np.ndarray],
     draft_notes: DraftNotes,
     *,
+    numeric_columns: Mapping[str, np.ndarray],
     has_heading: bool,
 ) -> dict[str, str]:
     """Match columns to channels, using one vessel of tables with several.
@@ -120,8 +125,8 @@ def match_columns_of_one_vessel(
 
     Args:
         columns: names of the columns.
-        numeric_columns: column -> values.
         draft_notes: receives guesses and notes.
+        numeric_columns: column -> values.
         has_heading: whether another source may have the heading.
 
     Returns:
