@@ -223,10 +223,11 @@ def test_gaps_wraps_and_outliers_do_not_move_the_errors() -> None:
 
 def test_too_few_values_and_too_long_logs_are_refused() -> None:
     t = np.arange(5.0)
-    with pytest.raises(DataError, match="no sensor has 20 values"):
-        reconstruct([Sensor("heading", t, t)], {}, 0.5)
+    pose = Sensor("position", TIMES, np.zeros((TIMES.size, 2)))
+    with pytest.raises(DataError, match="at least 20 values each"):
+        reconstruct([pose, Sensor("heading", t, t)], {}, 0.5)
     with pytest.raises(DataError, match="increase the step"):
-        reconstruct([Sensor("heading", TIMES, TIMES)], {}, 1e-4)
+        reconstruct([pose, Sensor("heading", TIMES, TIMES)], {}, 1e-4)
 
 
 def test_the_liveliest_stretch_is_chosen() -> None:

@@ -96,7 +96,7 @@ def reconstruct(
     """Reconstruct the motion of a vessel and the errors of its instruments.
 
     Args:
-        sensors: measurements; at least a position, a heading or a velocity.
+        sensors: measurements, among them a position and a heading.
         errors: name of an instrument error -> prior, for the errors named by the sensors and the
             components of a current.
         step: time between nodes in s.
@@ -137,10 +137,10 @@ class _Problem:
     def __init__(self, sensors: Sequence[Sensor], errors: Mapping[str, Prior], step: float) -> None:
         self.sensors = [sensor.select_finite() for sensor in sensors]
         self.sensors = [sensor for sensor in self.sensors if len(sensor.t) >= _MIN_SAMPLES]
-        if not self.sensors:
+        if not {"position", "heading"} <= {sensor.kind for sensor in self.sensors}:
             raise DataError(
-                f"no sensor has {_MIN_SAMPLES} values for a data compatibility analysis; record a"
-                " longer log"
+                f"position and heading need at least {_MIN_SAMPLES} values each for a data"
+                " compatibility analysis; record a longer log"
             )
         reference_sensors = [sensor for sensor in self.sensors if not sensor.clock] or self.sensors
         start = min(float(sensor.t[0]) for sensor in reference_sensors)
@@ -213,19 +213,26 @@ class _Problem:
 
     def _guess_states(self) -> np.ndarray:
         """Return a first guess of the states [K, 9], and set the first noise levels."""
-        by_kind: dict[str, Sensor] = {}
-        for sensor in self.sensors:
-            by_kind.setdefault(sensor.kind, sensor)
+        sensors = {sensor.kind: sensor for sensor in reversed(self.sensors)}
+        position = sensors["position"]
+        heading = sensors["heading"]
         states = np.zeros((self.n_nodes, N_STATES))
-        width = _VELOCITY_WINDOW
-        if "position" in by_kind:
-            position = by_kind["position"]
-            width = max(width, 5.0 * float(np.median(np.diff(position.t))))
-            for state in (X, Y):
-                resampled = np.interp(self.t, position.t, position.values[:, state])
-                states[:, state] = self._smooth(resampled, width)
-        self._guess_heading(states, by_kind, width)
-        self._guess_velocities(states, by_kind, width)
+        width = max(_VELOCITY_WINDOW, 5.0 * float(np.median(np.diff(position.t))))
+        for state in (X, Y):
+            resampled = np.interp(self.t, position.t, position.values[:, state])
+            states[:, state] = self._smooth(resampled, width)
+        resampled = np.interp(self.t, heading.t, unwrap_angle(heading.values[:, 0]))
+        states[:, PSI] = self._smooth(resampled, _HEADING_WINDOW)
+        states[:, R] = self._smooth(states[:, PSI], _HEADING_WINDOW, 1)
+        north, east = (
+            self._smooth(states[:, state], width, 1)
+            - (self.prior_means[self.names.index(name)] if name in self.names else 0.0)
+            for state, name in zip((X, Y), CURRENT_NAMES, strict=True)
+        )
+        cosine = np.cos(states[:, PSI])
+        sine = np.sin(states[:, PSI])
+        states[:, U] = north * cosine + east * sine
+        states[:, V] = east * cosine - north * sine
         for state, rate, seconds in ((U, U_DOT, width), (V, V_DOT, width), (R, R_DOT, 1.0)):
             states[:, rate] = self._smooth(states[:, state], seconds, 1)
         self.jerk_intensity = np.array(
@@ -245,48 +252,6 @@ class _Problem:
         window = max(5, int(seconds / self.step) // 2 * 2 + 1)
         window = max(min(window, (self.n_nodes - 1) // 2 * 2 - 1), 3)
         return np.asarray(savgol_filter(values, window, 2, deriv=derivative, delta=self.step))
-
-    def _guess_heading(
-        self, states: np.ndarray, by_kind: Mapping[str, Sensor], width: float
-    ) -> None:
-        """Set heading and yaw rate from the compass, else from the course or from the gyro."""
-        if "heading" in by_kind:
-            heading = by_kind["heading"]
-            unwrapped = unwrap_angle(heading.values[:, 0] / heading.factor)
-            resampled = np.interp(self.t, heading.t, unwrapped)
-            states[:, PSI] = self._smooth(resampled, _HEADING_WINDOW)
-        elif "position" in by_kind:
-            rates = [self._smooth(states[:, state], width, 1) for state in (X, Y)]
-            states[:, PSI] = self._smooth(np.unwrap(np.arctan2(rates[1], rates[0])), width)
-        if "yaw_rate" not in by_kind or "heading" in by_kind:
-            states[:, R] = self._smooth(states[:, PSI], _HEADING_WINDOW, 1)
-            return
-        rate = by_kind["yaw_rate"]
-        states[:, R] = np.interp(self.t, rate.t, rate.values[:, 0] / rate.factor)
-        if "position" not in by_kind:
-            states[:, PSI] = np.cumsum(states[:, R]) * self.step
-
-    def _guess_velocities(
-        self, states: np.ndarray, by_kind: Mapping[str, Sensor], width: float
-    ) -> None:
-        """Set velocities from positions, else from their sensors, and positions by integration."""
-        cosine = np.cos(states[:, PSI])
-        sine = np.sin(states[:, PSI])
-        if "position" in by_kind:
-            north, east = (
-                self._smooth(states[:, state], width, 1)
-                - (self.prior_means[self.names.index(name)] if name in self.names else 0.0)
-                for state, name in zip((X, Y), CURRENT_NAMES, strict=True)
-            )
-            states[:, U] = north * cosine + east * sine
-            states[:, V] = east * cosine - north * sine
-            return
-        for kind, state in (("speed", U), ("surge", U), ("sway", V)):
-            if kind in by_kind:
-                sensor = by_kind[kind]
-                states[:, state] = np.interp(self.t, sensor.t, sensor.values[:, 0] / sensor.factor)
-        states[:, X] = np.cumsum(states[:, U] * cosine - states[:, V] * sine) * self.step
-        states[:, Y] = np.cumsum(states[:, U] * sine + states[:, V] * cosine) * self.step
 
     # --- linearisation -----------------------------------------------------------------------
 
@@ -633,7 +598,7 @@ class _Problem:
         """
         rng = np.random.default_rng(0)
         names = ["jerk 0", "jerk 1", "jerk 2"]
-        names += [f"sensor {k}" for k, s in enumerate(self.sensors) if not s.is_noise_known]
+        names += [f"sensor {k}" for k in range(len(self.sensors))]
         groups_by_name = {name: [g for g in residuals if g.noise_name == name] for name in names}
         right_hand_sides = []
         by_errors = []
@@ -840,8 +805,8 @@ def _guess_noise(sensor: Sensor) -> Sensor:
     if sensor.noise_std:
         return sensor
     values = sensor.values
-    if sensor.is_angular:
-        values = unwrap_angle(values[:, 0] / sensor.factor)[:, None] * sensor.factor
+    if sensor.kind == "heading":
+        values = unwrap_angle(values[:, 0])[:, None]
     differences = np.abs(np.diff(values, n=3, axis=0))
     noise_std = float(np.median(differences)) / 0.6745 / np.sqrt(20.0)
     smallest = max(1e-6 * (1.0 + float(np.abs(values).max())), sensor.min_noise_std)

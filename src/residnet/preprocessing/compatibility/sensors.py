@@ -19,10 +19,7 @@ COMPLEX_STEP = 1e-20
 """Imaginary step of complex-step derivatives, whose error is of the order of its square."""
 DERIVATIVE_OF = {PSI: R, U: U_DOT, V: V_DOT, R: R_DOT}
 
-SensorKind = Literal[
-    "position", "heading", "yaw_rate", "surge", "sway", "north", "east", "speed", "course", "drift"
-]
-ANGULAR_KINDS = ("heading", "course", "drift")
+SensorKind = Literal["position", "heading", "yaw_rate", "surge", "sway", "north", "east", "speed"]
 CURRENT_NAMES = ("current_north", "current_east")
 """Names of the components of a steady current in m/s, estimated with the instrument errors."""
 
@@ -39,14 +36,12 @@ class Sensor:
 
     Attributes:
         kind: measured quantity. `surge` and `sway` are velocities in body axes, `north` and `east`
-            in earth axes, `course` the direction of the velocity over ground, `drift` the angle
-            from the velocity to the bow, positive to starboard.
+            in earth axes.
         t: times [N] in s on the clock of the sensor.
         values: measured values [N, k] in SI units.
         name: name in reports.
         noise_std: standard deviation of the noise; 0 for a first guess from the values.
         min_noise_std: lower bound of `noise_std`, for example from the resolution.
-        is_noise_known: whether the standard deviation is not estimated.
         is_through_water: whether a velocity is relative to the water instead of the ground.
         clock: error that is added to the times; empty for none.
         bias: error that is added to the quantity; empty for none.
@@ -63,18 +58,12 @@ class Sensor:
     name: str = ""
     noise_std: float = 0.0
     min_noise_std: float = 1e-9
-    is_noise_known: bool = False
     is_through_water: bool = False
     clock: str = ""
     bias: str = ""
     scale: str = ""
     lever_arm: tuple[str, ...] = ()
     factor: float = 1.0
-
-    @property
-    def is_angular(self) -> bool:
-        """Whether differences are taken modulo a full circle."""
-        return self.kind in ANGULAR_KINDS
 
     @property
     def error_names(self) -> list[str]:
@@ -90,12 +79,11 @@ class Sensor:
         )
 
     def subtract(self, predicted: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return predicted minus measured values [N], angles modulo a full circle."""
+        """Return predicted minus measured values [N], headings modulo a full circle."""
         difference: np.ndarray = predicted - values
-        if not self.is_angular:
+        if self.kind != "heading":
             return difference
-        angle = difference / self.factor
-        return np.asarray((angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))) * self.factor)
+        return np.asarray(difference - 2.0 * np.pi * np.round(difference / (2.0 * np.pi)))
 
     @property
     def measured_states(self) -> tuple[int, ...]:
@@ -187,23 +175,9 @@ class Sensor:
         if self.kind == "speed":
             # the small constant makes it differentiable at rest
             return np.asarray(np.sqrt(u * u + v * v + 1e-8))
-        if self.kind == "drift":
-            return -compute_angle(u, v)
         north = u * np.cos(heading) - v * np.sin(heading)
         east = u * np.sin(heading) + v * np.cos(heading)
-        if self.kind == "course":
-            return compute_angle(north, east)
         return np.asarray(north if self.kind == "north" else east)
-
-
-def compute_angle(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return atan2(y, x), with a complex step if an argument has one."""
-    angle = np.arctan2(np.real(y), np.real(x))
-    if not (np.iscomplexobj(x) or np.iscomplexobj(y)):
-        return np.asarray(angle)
-    squared_norm = np.real(x) ** 2 + np.real(y) ** 2 + 1e-12
-    derivative = (np.real(x) * np.imag(y) - np.real(y) * np.imag(x)) / squared_norm
-    return np.asarray(angle + 1j * derivative)
 
 
 def compute_ground_velocity(
