@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from known_logs import wavy
 from planted import FAULTS
@@ -27,7 +25,6 @@ from residnet.quality import (
     Finding,
     InspectionReport,
     build_inspection,
-    find_clock_rate_errors,
     inspect_log,
     inspect_log_set,
     summarize_inspection,
@@ -572,25 +569,6 @@ def test_find_spikes_and_fill_values() -> None:
     values[3], values[7] = -9999.0, np.float32(9.96921e36)
     assert np.flatnonzero(is_fill_value(values)).tolist() == [3, 7]
     assert is_implausible(np.array([3.0, 1e4, np.nan]), "m/s").tolist() == [False, True, False]
-
-
-@pytest.mark.parametrize("epoch", [True, False])
-def test_find_clock_rate_errors_compares_time_with_dates(tmp_path: Path, *, epoch: bool) -> None:
-    for rate in (1.095, 1.0):
-        seconds = pd.Series(1.6e9 + rate * T)
-        texts = pd.to_datetime(seconds, unit="s").dt.strftime("%Y-%m-%d %H:%M:%S.%f")
-        table = pd.DataFrame({"t": T, "date": seconds if epoch else texts, "u": LOG["u"]})
-        table.to_csv(tmp_path / "log.csv", index=False)
-        found = find_clock_rate_errors(LOG, tmp_path / "log.csv")
-        assert [finding.code for finding in found] == ["clock_rate"] * (rate != 1.0)
-        assert all(f.figures["rate"] == pytest.approx(1.095, abs=1e-4) for f in found)
-        # rows of other topics between them are none of the log's
-        assert (
-            find_clock_rate_errors(LOG.replace(meta={"rows_dropped": 900}), tmp_path / "log.csv")
-            == []
-        )
-    (tmp_path / "log.csv").write_bytes(np.random.default_rng(0).bytes(2000))
-    assert find_clock_rate_errors(LOG, tmp_path / "log.csv") == []
 
 
 NOISY = changed(**{n: v + 1e-3 * RANDOM.standard_normal(2000) for n, v in LOG.channels.items()})

@@ -230,7 +230,7 @@ fault("propeller reversed", "propeller_sign", ships=())(
 fault("speed +10 %", "gain", "gain_u", "frames", ships=())(
     lambda s, log, g: scaled(log, ["u", "v"], 1.1)
 )
-fault("clock 9.5 % off", "clock_rate", "gain", ships=())(
+fault("clock 9.5 % off", "gain", ships=())(
     lambda s, log, g: log.replace(t=log.t[0] + (log.t - log.t[0]) * 1.095)
 )
 

@@ -17,9 +17,8 @@ from residnet.core.names import SET_POINT_CHANNELS
 from residnet.preprocessing.align import GridConfig, align_to_grid
 from residnet.preprocessing.masks import MaskRule, apply_masks
 from residnet.preprocessing.motion import original_input_names
-from residnet.quality import actuators, excitation, feedback, frames, inputs, values
+from residnet.quality import actuators, clock, excitation, feedback, frames, inputs, values
 from residnet.quality.between import LogSet
-from residnet.quality.clock import find_clock_rate_errors
 from residnet.quality.effects import FindingEffects
 from residnet.quality.excitation import compute_condition_number
 from residnet.quality.findings import (
@@ -40,10 +39,10 @@ __all__ = [
     "InspectionReport",
     "actuators",
     "build_inspection",
+    "clock",
     "compute_condition_number",
     "excitation",
     "feedback",
-    "find_clock_rate_errors",
     "frames",
     "inputs",
     "inspect_log",

@@ -1,24 +1,13 @@
-"""Checks of the clock of a log: order, rate, jitter, gaps, start, and columns of dates."""
+"""Checks of the clock of a log: order, rate, jitter and gaps."""
 
 from __future__ import annotations
 
-import csv
-import re
 from collections.abc import Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from residnet.core.errors import DataError
-from residnet.core.log import Log
-from residnet.io.readers.text_encoding import open_as_utf8
-from residnet.io.readers.timestamps import parse_numbers, parse_texts
 from residnet.quality.findings import Check, Finding, Level, check, format_share
 from residnet.quality.statistics import SMOOTHING_SAMPLES, LogStatistics
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # largest velocity error due to timestamp jitter, as a share of the velocity's standard deviation
 _MAX_JITTER_SHARE = 0.05
@@ -116,107 +105,3 @@ def check_gaps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
         "t": log.t[longest_index],
     }
     yield make_finding(text, figures, level=level, fix=fix, sample_mask=is_gap)
-
-
-_DATE_COLUMN_PATTERN = re.compile(r"date|time|stamp|utc|gps|clock|epoch", re.IGNORECASE)
-_MAX_DATE_ROWS = 50_000
-"""Rows of a table whose dates are read; chosen by hand, enough to estimate the clock rate."""
-_MAX_HEADER_LENGTH = 1 << 16
-"""Largest length of the header line in characters."""
-# smallest relative error of the clock rate that is reported
-_MIN_RATE_ERROR = 0.005
-_MIN_DATES = 20
-"""Smallest number of dates for an estimate of the clock rate; chosen by hand."""
-
-
-def find_clock_rate_errors(log: Log, path: Path) -> list[Finding]:
-    """Compare the time of a log with the columns of dates in its table.
-
-    Args:
-        log: log as read from the table, row by row. If the reader dropped rows, the rows do not
-            correspond and the result is empty.
-        path: CSV or Parquet file; for other files the result is empty.
-
-    Returns:
-        One finding for each column of dates that runs faster or slower than the log's time.
-    """
-    has_dropped_rows = log.meta.get("rows_dropped", 0) > _MIN_RATE_ERROR * len(log)
-    date_columns = None if has_dropped_rows else _read_date_columns(path)
-    findings = []
-    if date_columns is None:
-        return []
-    for name in date_columns.columns:
-        dates = _to_seconds(date_columns[name])[: len(log)]
-        is_finite = np.isfinite(dates)
-        is_too_short = dates.size < min(len(log), _MAX_DATE_ROWS) or is_finite.sum() < _MIN_DATES
-        if is_too_short or float(np.ptp(dates[is_finite])) <= 0.0:
-            continue
-        t = log.t[: dates.size][is_finite] - log.t[0]
-        dates = dates[is_finite] - dates[is_finite][0]
-        clock_rate = float(np.polyfit(t, dates, 1)[0])
-        correlation = float(np.corrcoef(t, dates)[0, 1])
-        if (
-            correlation > 0.99
-            and abs(clock_rate - 1.0) > _MIN_RATE_ERROR
-            and 0.05 < clock_rate < 20.0
-        ):
-            text = (
-                f"'{name}' advances by {clock_rate:.4g} s per second of the log's time: the time"
-                " column is nominal, or its unit is wrong"
-            )
-            action = f"take the time from '{name}'"
-            findings.append(
-                Finding("will mislead", "clock_rate", text, {"rate": clock_rate}, action)
-            )
-    return findings
-
-
-def _read_date_columns(path: Path) -> pd.DataFrame | None:
-    """Return the columns that may hold dates; None if the file is not a readable table."""
-    import pandas as pd
-
-    try:
-        if path.suffix.lower() == ".parquet":
-            import pyarrow.parquet as pq
-
-            names = [
-                name for name in pq.read_schema(path).names if _DATE_COLUMN_PATTERN.search(name)
-            ]
-            return pd.read_parquet(path, columns=names).head(_MAX_DATE_ROWS) if names else None
-        if path.suffix.lower() not in (".csv", ".txt", ".tsv"):
-            return None
-        with open_as_utf8(path) as file:
-            with file.open(encoding="utf-8-sig", newline="") as text_file:
-                header = text_file.readline(_MAX_HEADER_LENGTH)
-            if not _DATE_COLUMN_PATTERN.search(header):
-                return None
-            return pd.read_csv(
-                file,
-                sep=csv.Sniffer().sniff(header).delimiter,
-                skipinitialspace=True,
-                nrows=_MAX_DATE_ROWS,
-                usecols=lambda name: bool(_DATE_COLUMN_PATTERN.search(str(name))),
-                encoding="utf-8-sig",
-            )
-    except (DataError, OSError, ValueError, LookupError, csv.Error):
-        # the check is optional: without a readable table it reports nothing
-        return None
-
-
-def _to_seconds(column: pd.Series) -> np.ndarray:
-    """Convert a column of dates to seconds [T] with NaN for empty cells; empty if not dates."""
-    import pandas as pd
-
-    try:
-        if pd.api.types.is_numeric_dtype(column):
-            values = column.to_numpy(dtype=float)
-            is_finite = np.isfinite(values)
-            timestamps = parse_numbers(values[is_finite])
-            seconds = np.full(values.size, np.nan)
-            seconds[is_finite] = timestamps.seconds_since(0)
-        else:
-            timestamps = parse_texts(column.astype("string"), has_only_dates=True)
-            seconds = timestamps.seconds_since(0)
-    except DataError:
-        return np.zeros(0)
-    return seconds if timestamps.is_absolute and np.isfinite(seconds).mean() >= 0.9 else np.zeros(0)

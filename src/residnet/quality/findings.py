@@ -233,10 +233,6 @@ class InspectionReport:
         """Whether any finding is worse than a note, so that a fit would be misled."""
         return any(finding.level != "note" for finding in self.findings)
 
-    def with_findings(self, additional_findings: Sequence[Finding]) -> InspectionReport:
-        """Return the report with further findings after its own."""
-        return dataclasses.replace(self, findings=(*self.findings, *additional_findings))
-
     def find_by_code(self, code: str) -> tuple[Finding, ...]:
         """Return the findings of one kind (`Finding.code`)."""
         return tuple(finding for finding in self.findings if finding.code == code)

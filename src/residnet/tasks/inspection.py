@@ -23,7 +23,6 @@ from residnet.quality import (
     InspectionReport,
     build_inspection,
     compute_condition_number,
-    find_clock_rate_errors,
     inspect_log,
     inspect_log_set,
     summarize_inspection,
@@ -108,9 +107,7 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> InspectionResult
             if isinstance(log, ResidnetError):
                 raise DataError(str(log)) if len(files) > 1 else log
             log = log.replace(name=names[path])
-            quality_report = inspect_log(log, inputs, masks).with_findings(
-                find_clock_rate_errors(log, path)
-            )
+            quality_report = inspect_log(log, inputs, masks)
             logs.append(log)
         except DataError as error:
             if len(files) == 1:
