@@ -32,8 +32,7 @@ from residnet.quality import (
 )
 from residnet.quality.actuators import estimate_delay
 from residnet.quality.findings import run_checks
-from residnet.quality.frames import is_course_over_ground
-from residnet.quality.kinematics import estimate_position_causes
+from residnet.quality.kinematics import estimate_position_causes, estimate_yaw_causes
 from residnet.quality.records import InspectionFile
 from residnet.quality.statistics import LogStatistics, estimate_resolution
 
@@ -249,7 +248,7 @@ def test_estimate_position_causes_separates_clocks(boat: str, delays: tuple[floa
         assert any(delays) or causes == {}
         sizes = {name: cause.estimates[0] for name, cause in causes.items()}
         common = sizes.get("lag_xy", 0.0)
-        surge_delay = sizes.get("lag", 0.0) + sizes.get("lag_u", 0.0) - common
+        surge_delay = sizes.get("lag", 0.0) - common
         estimates.append((surge_delay, sizes.get("lag_psi", 0.0) - common))
         assert not any(name.startswith("gain") for name in causes)
     assert np.array(estimates) == pytest.approx(np.tile(delays, (4, 1)), abs=0.03, rel=0.05)
@@ -270,7 +269,7 @@ def test_a_course_is_told_from_a_delayed_heading(boat: str) -> None:
         }
         angles = [course, *(motion.sample("psi", t - delay) for delay in (0.0, 0.5, 1.0, -0.7))]
         logs = [Log(boat, t, {**channels, "psi": angle}) for angle in angles]
-        is_course = [is_course_over_ground(LogStatistics(log)) for log in logs]
+        is_course = ["course" in estimate_yaw_causes(LogStatistics(log)) for log in logs]
         assert is_course == [boat == "catamaran"] + 4 * [False]
         if not is_course[0]:
             continue
@@ -280,20 +279,10 @@ def test_a_course_is_told_from_a_delayed_heading(boat: str) -> None:
         assert not any(code.startswith(("gain", "lag")) for code in found)
 
 
-@pytest.mark.parametrize(
-    ("values", "place"),
-    [
-        (np.where(T < 100.0, LOG["v"], LOG["v"][999]), "from t = 1"),
-        (0.4 * np.sin(0.17 * T), "heading (correlation"),
-    ],
-)
-def test_check_sway_reports_unrelated_sway_and_no_heading_offset(
-    values: np.ndarray, place: str
-) -> None:
-    report = inspect_log(changed(v=values))
-    (finding,) = report.find_by_code("sway_unrelated")
-    assert place in finding.text
-    assert not any("course" in line for line in report.to_lines())
+def test_inspect_log_reports_a_sway_velocity_of_another_motion() -> None:
+    (finding,) = inspect_log(changed(v=0.4 * np.sin(0.17 * T))).find_by_code("gain_v")
+    assert "v does not follow position and heading" in finding.text
+    assert "leave it out" in finding.action
 
 
 def test_check_relative_wind_accepts_a_true_wind() -> None:

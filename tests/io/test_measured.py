@@ -120,7 +120,7 @@ def test_the_doctor_finds_the_known_illnesses(logs: dict[str, list[Log]]) -> Non
         assert (frames.level, frames.figures["coherence"] > 0.97) == ("note", True)
         trailing = [
             finding
-            for code in ("lag", "lag_u", "lag_v", "lag_xy")
+            for code in ("lag", "lag_xy")
             for finding in report.find_by_code(code)
             if finding.text.startswith(("u", "v", "x"))
         ]

@@ -167,7 +167,7 @@ def held(log: Log, names: Sequence[str], at: np.ndarray) -> Log:
 
 # what each line damages, for all that one expression says
 _LAGS = (
-    *("lag", "lag_u", "lag_v", "lag_psi", "lag_xy"),
+    *("lag", "lag_psi", "lag_xy"),
     *("acausal", "gain_v", "gain_u", "heading"),
 )
 _SIGNS = ("frames", "gain", "gain_v", "gain_u", "rudder_sign")

@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from residnet.core.names import POSE_NAMES, VELOCITY_NAMES
-from residnet.core.stretches import find_runs
 from residnet.preprocessing.channel_values import (
     NEGLIGIBLE_MOTION_SHARE,
-    SIGMA_OF_MAD,
     nan_median,
     nan_quantiles,
     nan_std,
@@ -61,21 +59,24 @@ class AveragedRates:
         ground_velocity: derivative of the position, north + 1j east, [T] in m/s.
         body_velocity: velocity over ground from psi, u, v [T] in m/s, by convention.
         yaw_rate: derivative of psi [T] in rad/s.
-        averaged_velocities: averaged u, v, r of the log [T].
-        yaw_rate_noise: larger standard deviation of the noise of `yaw_rate` and averaged r, rad/s.
+        measured_yaw_rate: averaged r of the log [T] in rad/s; NaN without one.
+        yaw_rate_noise: larger standard deviation of the noise of both yaw rates in rad/s.
     """
 
     ground_velocity: np.ndarray
     body_velocity: dict[str, np.ndarray]
     yaw_rate: np.ndarray
-    averaged_velocities: dict[str, np.ndarray]
+    measured_yaw_rate: np.ndarray
     yaw_rate_noise: float
 
 
 def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
     """Compute rates over windows in which the pose changes by several times its noise."""
-    velocity_names = [name for name in log.velocities if np.isfinite(log[name]).any()]
-    yaw_rate_std = log.std("r") if "r" in velocity_names else 0.0
+    u, v, r = (
+        log[name] if name in log and np.isfinite(log[name]).any() else np.full(len(log), np.nan)
+        for name in VELOCITY_NAMES
+    )
+    has_yaw_rate = bool(np.isfinite(r).any())
 
     def choose_half_window(noise: float, typical_rate: float) -> int:
         max_duration = float(log.t[-1] - log.t[0]) / 15.0
@@ -115,11 +116,12 @@ def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
     position_half_window = choose_half_window(
         max(log.noise_std("x"), log.noise_std("y")), log.rms_speed
     )
-    yaw_half_window = choose_half_window(log.noise_std("psi"), yaw_rate_std)
-    u, v = (
-        log[name] if name in velocity_names else np.full(len(log), np.nan) for name in ("u", "v")
+    yaw_half_window = choose_half_window(
+        log.noise_std("psi"), log.std("r") if has_yaw_rate else 0.0
     )
     yaw_rate_noise = np.sqrt(0.5) * log.noise_std("psi") / (yaw_half_window * log.sampling_interval)
+    if has_yaw_rate:
+        yaw_rate_noise = max(yaw_rate_noise, log.noise_std("r") / np.sqrt(2.0 * yaw_half_window))
     return AveragedRates(
         central_difference(log["x"] + 1j * log["y"], position_half_window),
         {
@@ -135,16 +137,8 @@ def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
             "earth axes": trapezoidal_mean(u + 1j * v, position_half_window),
         },
         central_difference(log["psi"], yaw_half_window),
-        {
-            name: trapezoidal_mean(
-                log[name], yaw_half_window if name == "r" else position_half_window
-            )
-            for name in velocity_names
-        },
-        max(
-            yaw_rate_noise,
-            log.noise_std("r") / np.sqrt(2.0 * yaw_half_window) if "r" in velocity_names else 0.0,
-        ),
+        trapezoidal_mean(r, yaw_half_window),
+        yaw_rate_noise,
     )
 
 
@@ -315,110 +309,50 @@ def check_frames(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
 )
 def check_position_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report jumps of the position that the velocities do not explain."""
-    earth_velocity = (log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"])
-    explained_steps = (
-        0.5 * _time_steps_without_gaps(log) * (earth_velocity[1:] + earth_velocity[:-1])
-    )
-    unexplained_steps = np.abs(np.nan_to_num(np.diff(log["x"] + 1j * log["y"]) - explained_steps))
-    explained_distances = np.abs(explained_steps[np.isfinite(explained_steps)])
-    high_distance = (
-        0.5 * nan_quantiles(explained_distances, 0.95)[0] if explained_distances.size else 0.0
-    )
-    limit = max(15.0 * nan_median(unexplained_steps), high_distance)
-    message_template = (
-        f"position jumps {{}} times by more than {limit:.2g} m beyond u, v, at most by {{:.2g}} m"
-    )
-    yield from _report_jumps(
-        log, make_finding, unexplained_steps, limit, message_template, ("x", "y")
-    )
-
-
-def _time_steps_without_gaps(log: LogStatistics) -> np.ndarray:
-    """Return the time steps [T - 1] in s, NaN for gaps."""
-    dt = np.diff(log.t)
-    return np.where(dt > 3.5 * log.sampling_interval, np.nan, dt)
+    velocity = (log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"])
+    text = "position jumps {} times by more than {:.2g} m beyond u, v, at most by {:.2g} m"
+    yield from _report_jumps(log, make_finding, log["x"] + 1j * log["y"], velocity, text)
 
 
 def _report_jumps(
     log: LogStatistics,
     make_finding: Check,
-    excess_steps: np.ndarray,
-    limit: float,
-    message_template: str,
-    channels: tuple[str, ...],
-    factor: float = 1.0,
+    pose: np.ndarray,
+    rate: np.ndarray,
+    text: str,
+    min_jump: float = 0.0,
+    display_factor: float = 1.0,
 ) -> Iterator[Finding]:
-    """Yield a finding if the excess of a pose step [T - 1] exceeds a limit."""
-    is_jump = np.abs(excess_steps) > limit
-    if is_jump.any():
-        worst_index = int(np.argmax(np.abs(excess_steps)))
-        largest_excess = float(abs(excess_steps[worst_index]))
-        time = float(log.t[worst_index + 1])
-        yield make_finding(
-            message_template.format(int(is_jump.sum()), factor * excess_steps[worst_index])
-            + f" at t = {time:.2f} s",
-            {"count": is_jump.sum(), "largest": largest_excess, "t": time},
-            sample_mask=np.append(is_jump, False) | np.append(False, is_jump),
-            channels=channels,
-        )
+    """Yield a finding if steps of a pose [T] exceed the integral of its rate [T].
 
-
-_COURSE_STEP = 2.0
-"""Time in s over which the increments of psi, r and the drift are compared."""
-_MAX_COURSE_DELAY = 3.0
-"""Largest delay in s of a heading that is compared with a course."""
-_N_COURSE_DELAYS = 61
-"""Number of delays that are compared."""
-_MIN_COURSE_MARGIN = 20.0
-"""Smallest difference of the BIC by which psi is the course and not a delayed heading."""
-_MAX_COURSE_SHARE = 0.25
-"""Largest share of the squared increments of psi beyond r that the drift leaves unexplained."""
-
-
-def is_course_over_ground(log: LogStatistics) -> bool:
-    """Return whether psi is the course over ground, the heading plus the drift atan2(v, u).
-
-    The increments of psi are those of the drift and the integral of r if psi is a course, and those
-    of the integral at another time if the heading has another clock. Drift and yaw rate of a vessel
-    are nearly proportional, hence both hypotheses are compared by their BIC.
+    Args:
+        log: statistics of the log.
+        make_finding: the check that reports.
+        pose: measured pose [T]; a position is complex.
+        rate: its rate from the velocities [T].
+        text: text with places for the number of jumps, the limit and the largest jump.
+        min_jump: smallest jump in m or rad.
+        display_factor: factor from m or rad to the unit of the text.
     """
-    if not {"psi", "u", "v", "r"} <= {*log}:
-        return False
-    is_inside = (log.t - log.t[0] > _MAX_COURSE_DELAY) & (log.t[-1] - log.t > _MAX_COURSE_DELAY)
-    samples = np.flatnonzero(is_inside)[:: max(round(_COURSE_STEP / log.sampling_interval), 1)]
-    if np.isfinite(np.diff(log["psi"][samples])).sum() < MIN_SAMPLES:
-        return False
-    rates = interpolate_gaps(log.t, log["r"])
-    turned = np.append(0.0, np.cumsum(0.5 * np.diff(log.t) * (rates[1:] + rates[:-1])))
-    drift = np.unwrap(np.arctan2(log.smoothed("v"), log.smoothed("u")))
-
-    def residual_square(expected: np.ndarray) -> float:
-        increments = np.diff((log["psi"] - expected)[samples])
-        return float(np.nanvar(increments)) if np.isfinite(increments).any() else math.inf
-
-    course_square = residual_square(turned + drift)
-    delays = np.linspace(-_MAX_COURSE_DELAY, _MAX_COURSE_DELAY, _N_COURSE_DELAYS)
-    delay_square = min(
-        residual_square(np.interp(log.t - delay, log.t, turned)) for delay in delays.tolist()
-    )
-    margin = samples.size * math.log(max(delay_square, 1e-300) / max(course_square, 1e-300))
-    return margin > _MIN_COURSE_MARGIN and course_square < _MAX_COURSE_SHARE * residual_square(
-        turned
-    )
-
-
-@check(
-    "grid",
-    "course",
-    fix="take psi from the compass, or subtract the drift atan2(v, u) from it",
-    required_channels=(*_PLANAR_MOTION, "r"),
-    on_subsample=True,
-)
-def check_course(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report a course over ground in place of the heading."""
-    if log.cached(is_course_over_ground):
-        text = "psi is the course over ground: beyond r it turns with the drift angle of u, v"
-        yield make_finding(text, {})
+    dt = np.diff(log.t)
+    dt = np.where(dt > 3.5 * log.sampling_interval, np.nan, dt)
+    explained_steps = 0.5 * dt * (rate[1:] + rate[:-1])
+    excess = np.abs(np.nan_to_num(np.diff(pose) - explained_steps))
+    explained_distances = np.abs(explained_steps[np.isfinite(explained_steps)])
+    if explained_distances.size:
+        min_jump = max(min_jump, 0.5 * nan_quantiles(explained_distances, 0.95)[0])
+    limit = max(15.0 * nan_median(excess), min_jump)
+    is_jump = excess > limit
+    if is_jump.any():
+        worst = int(np.argmax(excess))
+        sizes = display_factor * limit, display_factor * excess[worst]
+        time = float(log.t[worst + 1])
+        yield make_finding(
+            text.format(int(is_jump.sum()), *sizes) + f" at t = {time:.2f} s",
+            {"count": is_jump.sum(), "largest": excess[worst], "t": time},
+            sample_mask=np.append(is_jump, False) | np.append(False, is_jump),
+            channels=("x", "y") if np.iscomplexobj(pose) else ("psi",),
+        )
 
 
 @check("grid", "position_causes", required_channels=_PLANAR_MOTION, on_subsample=True)
@@ -427,63 +361,10 @@ def check_position_causes(log: LogStatistics, make_finding: Check) -> Iterator[F
     frame_agreement = log.cached(compare_frames)
     if frame_agreement is None or not frame_agreement.is_consistent:
         return
-    if log.cached(is_course_over_ground):
+    if "r" in log and "course" in log.cached(estimate_yaw_causes):
         return
     causes = log.cached(estimate_position_causes)
-    if "gain_v" in causes and causes["gain_v"].is_gross and (text := describe_unrelated_sway(log)):
-        yield make_finding(
-            text,
-            code="sway_unrelated",
-            level="will mislead",
-            fix="mask v there, or leave it (or the drift angle) out: x, y and psi give it",
-        )
-        causes = {name: cause for name, cause in causes.items() if not name.endswith("_v")}
     yield from make_cause_findings(causes, POSITION_LIMITS, log, make_finding)
-
-
-_N_SWAY_SECTIONS = 12
-"""Sections of a log in which v is compared with the sway velocity from the position."""
-_MIN_SWAY_CORRELATION = 0.5
-"""Smallest correlation of v with this sway velocity if it has a wrong sign or unit only."""
-_MAX_SWAY_RESIDUAL_SHARE = 0.5
-"""Largest unexplained share of the variance in a section in which v follows the position."""
-
-
-def describe_unrelated_sway(log: LogStatistics) -> str:
-    """Describe where v does not follow position and heading; empty if another cause explains that.
-
-    No gain explains a sensor that is frozen for some time, or a column of another clock. A heading
-    that is the course leaves no sway velocity in the position.
-    """
-    rates = log.cached(compute_averaged_rates)
-    difference = rates.ground_velocity - rates.body_velocity["as declared"]
-    v = rates.averaged_velocities["v"]
-    sway = v + (np.exp(-1j * log["psi"]) * difference).imag
-    rows = np.flatnonzero(np.isfinite(sway) & np.isfinite(v))
-    if rows.size < MIN_SAMPLES or float(np.std(sway[rows])) < float(np.std(v[rows])) / 3.0:
-        return ""
-    sections = np.array_split(rows, _N_SWAY_SECTIONS)
-    is_following = np.array(
-        [
-            float(np.var((sway - v)[section]))
-            < _MAX_SWAY_RESIDUAL_SHARE * float(np.var(sway[section]))
-            for section in sections
-        ]
-    )
-    correlation = float(np.corrcoef(sway[rows], v[rows])[0, 1]) if v[rows].any() else 0.0
-    if not is_following.any() and abs(correlation) > _MIN_SWAY_CORRELATION:
-        return ""
-    place = ""
-    starts, stops = find_runs(~is_following)
-    # times of a subsample of a long log are not those of the log
-    if starts.size == 1 and is_following.any() and not log.near_seam(1).any():
-        start = log.t[sections[starts[0]][0]]
-        stop = log.t[sections[stops[0] - 1][-1]]
-        place = f" from t = {start:.0f} to {stop:.0f} s"
-    return (
-        f"v does not follow position and heading{place} (correlation over the log"
-        f" {correlation:.2f}): a frozen sensor, or another clock?"
-    )
 
 
 _YAW_MOTION = (*POSE_NAMES, "r")
@@ -502,12 +383,10 @@ _MIN_YAW_CORRELATION = 0.5
 def check_yaw_rate(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report a yaw rate that has nothing in common with the derivative of the heading."""
     rates = log.cached(compute_averaged_rates)
-    yaw_rate = rates.averaged_velocities.get("r")
-    if yaw_rate is None:
-        return
+    yaw_rate = rates.measured_yaw_rate
     min_std = max(5.0 * rates.yaw_rate_noise, _MIN_YAW_RATE_STD)
     reference_std = nan_std(rates.yaw_rate)
-    if reference_std <= min_std:
+    if reference_std <= min_std or not np.isfinite(yaw_rate).any():
         return
     if nan_std(yaw_rate) < NEGLIGIBLE_MOTION_SHARE * reference_std:
         yield make_finding(
@@ -537,16 +416,9 @@ def check_yaw_rate(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
 )
 def check_heading_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report jumps of the heading that the yaw rate does not explain."""
-    psi = log["psi"]
-    r = log["r"]
-    excess_steps = np.diff(psi) - 0.5 * _time_steps_without_gaps(log) * (r[1:] + r[:-1])
-    scatter = nan_median(np.abs(excess_steps)) if np.isfinite(excess_steps).any() else 0.0
-    noise = max(log.noise_std("psi") * math.sqrt(2.0), SIGMA_OF_MAD * scatter)
-    limit = max(10.0 * noise, math.radians(2.0))
-    message_template = "psi jumps {} times beyond what r explains, at most by {:+.1f} deg"
-    finite_excess = np.nan_to_num(excess_steps)
+    text = "psi jumps {} times by more than {:.2g} deg beyond r, at most by {:.1f} deg"
     yield from _report_jumps(
-        log, make_finding, finite_excess, limit, message_template, ("psi",), math.degrees(1.0)
+        log, make_finding, log["psi"], log["r"], text, math.radians(2.0), math.degrees(1.0)
     )
 
 
@@ -592,9 +464,7 @@ def check_yaw_drift(log: LogStatistics, make_finding: Check) -> Iterator[Finding
 
 @check("grid", "yaw_causes", required_channels=_YAW_MOTION, on_subsample=True)
 def check_yaw_causes(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report sign, gain and lag of r against psi."""
-    if log.cached(is_course_over_ground):
-        return
+    """Report sign, gain and lag of r against psi, or a course over ground in place of psi."""
     yield from make_cause_findings(log.cached(estimate_yaw_causes), YAW_LIMITS, log, make_finding)
 
 

@@ -22,8 +22,8 @@ from residnet.quality.statistics import LogStatistics
 
 _MIN_LAG = 0.2
 """Smallest lag in s that affects a rollout of a vessel."""
-_MIN_SWAY_RATIO_OF_COURSE = 3.0
-"""Smallest ratio of the sway velocity to that of the positions if the heading is the course."""
+_MIN_UNRELATED_SWAY_RATIO = 3.0
+"""Smallest ratio of v to the sway velocity from the position at which both are unrelated."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,13 @@ def _gain_limit(
 YAW_LIMITS = {
     "gain": _gain_limit("r is too large against psi", 0.06, si_unit="rad/s"),
     "lag": _lag_limit("r trails psi by"),
+    "course": CauseLimit(
+        "psi is the course over ground: beyond r it turns with the drift angle of u, v, by a share"
+        " of",
+        "",
+        0.5,
+        "take psi from the compass, or subtract the drift atan2(v, u) from it",
+    ),
 }
 POSITION_LIMITS = {
     "gain_u": _gain_limit("u is too large against the position", 0.04),
@@ -76,8 +83,6 @@ POSITION_LIMITS = {
         math.radians(3.0),
         "subtract the offset from psi",
     ),
-    "lag_u": _lag_limit("u trails the position by"),
-    "lag_v": _lag_limit("v trails the position by"),
     "lag": _lag_limit("u, v trail the position by"),
     "lag_psi": _lag_limit("psi trails position and velocities by", 2.0 * _MIN_LAG),
     "lag_xy": _lag_limit("x, y trail heading and velocities by"),
@@ -151,9 +156,12 @@ def make_cause_findings(
         unit_text = ""
         is_gross = name.startswith("gain") and cause.is_gross
         ratio = 1.0 + float(cause.estimates[0])
-        if is_gross and name == "gain_v" and abs(ratio) > _MIN_SWAY_RATIO_OF_COURSE:
-            text = f"psi is the course over ground, so that {text}"
-            fix = "take psi from the compass"
+        if is_gross and name == "gain_v" and abs(ratio) > _MIN_UNRELATED_SWAY_RATIO:
+            text = f"v does not follow position and heading: {text}"
+            fix = (
+                "mask v where it is frozen or of another clock, or leave it out; if psi is the"
+                " course over ground, take it from the compass"
+            )
         elif is_gross and ratio < 0.0:
             text = f"the sign is wrong: {text}"
             fix = "turn it in the channel map (sign: -1)"

@@ -19,7 +19,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -37,45 +37,31 @@ from residnet.quality.statistics import (
 )
 
 _LAG_OF_CURVATURE = {
-    name.replace("lag", "curvature"): name
-    for name in ("lag", "lag_u", "lag_v", "lag_psi", "lag_xy")
+    name.replace("lag", "curvature"): name for name in ("lag", "lag_psi", "lag_xy")
 }
 """Terms of second and third order -> lag without which they are not selected."""
 _YAW_CLOCKS = {"lag": ("r",)}
-_POSITION_CLOCKS = {
-    "lag_psi": ("psi",),
-    "lag": ("u", "v"),
-    "lag_xy": ("psi", "u", "v"),
-    "lag_u": ("u",),
-    "lag_v": ("v",),
-}
+_POSITION_CLOCKS = {"lag_psi": ("psi",), "lag": ("u", "v"), "lag_xy": ("psi", "u", "v")}
 """Lag -> channels that are shifted in time."""
+_COURSE_TOLERANCE = 0.5
+"""Largest difference of the share of the drift angle in a course from one."""
+_MIN_COURSE_ADVANTAGE = 100.0
+"""Smallest reduction of the BIC by a course in place of a lag: drift and yaw rate are nearly
+proportional."""
 _MAX_CLOCK_SAMPLES = 8000
 """Largest number of samples of a search of delays, which bounds its computing time."""
 _MAX_CLOCKS = 2
 """Largest number of clocks besides that of the reference."""
-_N_CONTINUED_HYPOTHESES = 2
-"""Number of hypotheses with one clock that are continued by another one."""
-_MAX_SHIFT_CORRECTIONS = 3
-"""Largest number of corrections of the shifts of a hypothesis."""
 _CAUSES_UNLIKE_DELAYS = ("gain_u", "heading", "lever_arm", "current", "bias", "ramp")
 """Causes that a regression does not select in place of a delay."""
 _MIN_CLOCK_ADVANTAGE = 20.0
-"""Smallest difference of the BIC by which the data distinguish two hypotheses."""
+"""Smallest reduction of the BIC by a further clock."""
 _MAX_CONDITION_INDEX = 30.0
 """Largest condition index of the causes beside a delay. Above it they cannot be separated: in a
 zigzag of one period a delay of the heading is a gain of sway with a delay of u and v (Belsley, Kuh
 and Welsch 1980, Regression Diagnostics, sec. 3.2)."""
 _MAX_SHIFT = 3.0
 """Largest delay in s that is tried."""
-_SHIFT_STEPS = (0.3, 1.0)
-"""Smallest and largest step in s between delays that are tried."""
-_SHIFT_STEP_SHARE = 0.3
-"""Step between delays over the time scale of the motion; a period has 20 steps."""
-_MISFIT_BLOCK_SHARE = 2.0 / 3.0
-"""Length of the blocks of samples in which shifts are compared over the step between delays."""
-_MIN_DELAY_SHARE = 0.5
-"""Difference of pose and velocities over the effect of a delay below which this is not searched."""
 _MAX_ROUNDING_SHARE = 1e-3
 """Unexplained share of the squared differences below which no delay is searched."""
 _MAX_RECTANGLE_SHARE = 0.1
@@ -85,10 +71,8 @@ _MIN_COMMON_SHARE = 0.7
 """Smallest number of increments of a hypothesis over the largest one."""
 _MIN_SQUARED_SCALE = 0.01
 """Smallest variance of residuals over that of the noise: smaller ones are rounding."""
-_SCALE_ITERATIONS = 5
-"""Iterations for the scale of a Student distribution."""
-_STUDENT_DOF = 5.0
-"""Degrees of freedom of the Student distribution of the residuals."""
+_MAX_ITERATIONS = 8
+"""Largest number of iterations in the estimate of delays."""
 _MAX_CAUSES = 4
 """Largest number of causes; chosen by hand, because further ones are collinear."""
 # smallest reduction of the sum of squares by a cause in noise variances
@@ -139,8 +123,6 @@ class KinematicCause:
 class _IncrementModel:
     """Increments of a pose, and the effects of possible causes on them.
 
-    The increments are those between successive samples, or over blocks of samples.
-
     Attributes:
         measured_pose: measured pose [T], real or complex; NaN if missing.
         integrated_increments: integrals of the velocities [T - 1], NaN if missing.
@@ -183,34 +165,6 @@ class _IncrementModel:
             return None
         return replace(self, integrated_increments=integrals[best])
 
-    def compute_misfit(self) -> float:
-        """Return the mean squared residual of the increments, with all causes of the model.
-
-        Residuals beyond three standard deviations count as three.
-        """
-        table = [np.diff(self.measured_pose) - self.integrated_increments]
-        table += [
-            column
-            for name, columns in self.columns.items()
-            # the gain of both velocities is the sum of theirs
-            if not (name == "gain" and "gain_v" in self.columns)
-            for column in columns
-        ]
-        increments = np.array(table).T
-        increments = increments[np.isfinite(increments).all(axis=1)]
-        if len(increments) < 2 * len(table):
-            return math.inf
-        if np.iscomplexobj(increments):
-            increments = np.concatenate((increments.real, increments.imag))
-        # normal equations, because this is computed for each delay that is tried
-        gram = increments.T @ increments
-        norms = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-        gram = gram / np.outer(norms, norms)
-        coefficients = np.linalg.lstsq(gram[1:, 1:], gram[1:, 0], rcond=_COLLINEARITY_TOLERANCE)[0]
-        residuals = increments[:, 0] - increments[:, 1:] @ (norms[0] * coefficients / norms[1:])
-        scale = SIGMA_OF_MAD * float(np.median(np.abs(residuals)))
-        return float(np.mean(np.minimum(residuals**2, (3.0 * scale) ** 2)))
-
 
 class _Explanation(NamedTuple):
     """Selected causes of the increments of a pose.
@@ -234,78 +188,68 @@ class _Explanation(NamedTuple):
     n_parameters: int
     condition_index: float = 1.0
 
-    @property
-    def has_gross_gain(self) -> bool:
-        """Whether a velocity has a wrong sign or unit, which is less probable than a delay."""
-        return any(name.startswith("gain") and c.is_gross for name, c in self.causes.items())
+    def estimate(self, name: str) -> float:
+        """Return the first estimate of a cause; 0 if it was not selected."""
+        return float(self.causes[name].estimates[0]) if name in self.causes else 0.0
 
 
 def _compute_bics(explanations: Sequence[_Explanation]) -> np.ndarray:
     """Return the BIC of explanations of the same increments over those that all of them use.
 
-    A wrong sign or unit counts as much as a clear difference, because it is less probable than a
-    delay. An explanation that uses few increments has an infinite BIC.
+    Large residuals count as much as three standard deviations. An explanation that uses few
+    increments has an infinite BIC.
     """
-    bics = np.full(len(explanations), math.inf)
-    n_used = [int(np.isfinite(explanation.squares).sum()) for explanation in explanations]
-    is_compared = np.array(n_used) > _MIN_COMMON_SHARE * max(n_used, default=0)
-    compared = [explanations[k] for k in np.flatnonzero(is_compared).tolist()]
-    if not compared:
-        return bics
-    is_common = np.isfinite([explanation.squares for explanation in compared]).all(axis=0)
-    n_common = max(int(is_common.sum()), 1)
+    squares = np.array([explanation.squares for explanation in explanations])
+    n_used = np.isfinite(squares).sum(axis=1)
+    is_compared = n_used > _MIN_COMMON_SHARE * n_used.max()
+    squares = squares[:, np.isfinite(squares[is_compared]).all(axis=0)]
+    n_common = max(squares.shape[1], 1)
+    mean_squares = np.mean(np.minimum(squares, 9.0 * np.median(squares, axis=1)[:, None]), axis=1)
     # residuals far below the noise, or the differences that are explained, are rounding
-    min_square = max(_MIN_SQUARED_SCALE, _MAX_ROUNDING_SHARE * compared[0].response_square)
-    bics[is_compared] = [
-        n_common * _fit_student_deviance(e.squares[is_common], e.dimension, min_square)
-        + e.n_parameters * math.log(n_common)
-        + _MIN_CLOCK_ADVANTAGE * e.has_gross_gain
-        for e in compared
-    ]
-    return bics
+    dimension = explanations[0].dimension
+    min_square = dimension * max(
+        _MIN_SQUARED_SCALE, _MAX_ROUNDING_SHARE * explanations[0].response_square
+    )
+    deviances = dimension * n_common * np.log(np.maximum(mean_squares, min_square))
+    penalties = [explanation.n_parameters * math.log(n_common) for explanation in explanations]
+    return np.where(is_compared, deviances + penalties, math.inf)
 
 
-def _fit_student_deviance(squares: np.ndarray, dimension: int, min_square: float) -> float:
-    """Return the mean deviance of residuals with a Student distribution of the likeliest scale.
-
-    Args:
-        squares: squared norms [N] of the residuals.
-        dimension: number of components of each residual.
-        min_square: smallest squared scale.
-    """
-    squared_scale = max(float(np.median(squares)) / dimension, min_square)
-    for _ in range(_SCALE_ITERATIONS):
-        weights = (_STUDENT_DOF + dimension) / (_STUDENT_DOF + squares / squared_scale)
-        squared_scale = max(float(np.mean(weights * squares)) / dimension, min_square)
-    tails = np.log1p(squares / (_STUDENT_DOF * squared_scale))
-    return dimension * math.log(squared_scale) + (_STUDENT_DOF + dimension) * float(tails.mean())
-
-
-# smallest standard deviation of the heading for an estimate of the gain of r, in standard
-# deviations
-# of its noise, of which smoothing leaves .4
 _MIN_HEADING_SIGNAL_TO_NOISE = 3.0
+"""Smallest standard deviation of the heading over that of its noise, of which smoothing leaves .4,
+for an estimate of the gain of r."""
 
 
 def estimate_yaw_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     """Estimate the causes of differences between the increments of psi and the integral of r.
 
     Causes: `gain` (r is 1 + value times too large), `lag` (delay of r against psi in s), `bias` (of
-    r in rad/s) and `ramp` (growth of the bias from start to end in rad/s).
+    r in rad/s) and `ramp` (growth of the bias from start to end in rad/s); or only `course` if psi
+    is the course over ground (share of the drift angle atan2(v, u) that psi contains).
     """
+    model = _model_heading(log, _select_channels(log, "r"))
+    # half a step of a simulation is no drift, either
+    if "u" in log and "v" in log and model.integrate_by_rectangles() is None:
+        drift = np.unwrap(np.arctan2(log.smoothed("v"), log.smoothed("u")))
+        columns = {name: model.columns[name] for name in ("bias", "ramp")}
+        columns["course"] = [np.diff(drift)]
+        # drift and yaw rate are nearly proportional, so that a course resembles a delay
+        explanations = [_explain_increments(m) for m in (model, replace(model, columns=columns))]
+        bics = _compute_bics(explanations)
+        share = explanations[1].estimate("course")
+        if bics[1] < bics[0] - _MIN_COURSE_ADVANTAGE and abs(share - 1.0) < _COURSE_TOLERANCE:
+            return {"course": explanations[1].causes["course"]}
     return _compare_clocks(log, _model_heading, ("r",), _YAW_CLOCKS)
 
 
-def _model_heading(log: LogStatistics, channels: Channels, block: int = 1) -> _IncrementModel:
+def _model_heading(log: LogStatistics, channels: Channels) -> _IncrementModel:
     """Return the model of the increments of psi by the integral of r and its errors.
 
     Args:
         log: statistics of the log.
         channels: measured and smoothed channels, of which some may be shifted.
-        block: number of samples of each increment; lags have columns for 1 only.
     """
-    block_ends = _find_block_ends(log, block)
-    t = log.t[block_ends]
+    t = log.t
     dt = np.diff(t)
     smoothed_rate = channels["r smoothed"]
     normalized_time = (0.5 * (t[1:] + t[:-1]) - t.mean()) / max(float(t[-1] - t[0]), 1e-12)
@@ -315,14 +259,13 @@ def _model_heading(log: LogStatistics, channels: Channels, block: int = 1) -> _I
     if log.cached(
         _is_significant, "r"
     ) and heading_std > _MIN_HEADING_SIGNAL_TO_NOISE * log.noise_std("psi"):
-        columns = {"gain": [-_integrate_blocks(log.t, smoothed_rate, block)], **columns}
-        if block == 1:
-            columns["lag"] = [np.diff(smoothed_rate)]
-            columns["curvature"] = _differentiate_twice(smoothed_rate, t)
+        columns = {"gain": [-_integrate(log.t, smoothed_rate)], **columns}
+        columns["lag"] = [np.diff(smoothed_rate)]
+        columns["curvature"] = _differentiate_twice(smoothed_rate, t)
     rate_noise = np.full(dt.size, log.noise_std("r"))
     return _IncrementModel(
-        log["psi"][block_ends],
-        _integrate_blocks(log.t, channels["r"], block),
+        log["psi"],
+        _integrate(log.t, channels["r"]),
         dt,
         log.noise_std("psi"),
         rate_noise,
@@ -335,42 +278,39 @@ def estimate_position_causes(log: LogStatistics) -> dict[str, KinematicCause]:
     """Estimate the causes of differences between increments of x, y and integrals of R(psi) [u, v].
 
     Causes: `gain_u`, `gain_v`, `gain` (u, v or both are 1 + value times too large), `heading`
-    (correction of psi in rad), `lag_u`, `lag_v`, `lag` (delays of u, v or both against the position
-    in s), `lag_psi` (delay of psi in s), `lag_xy` (delay of x, y in s), `lever_arm` (position of
+    (correction of psi in rad), `lag` (delay of u and v against the position in s), `lag_psi` (delay
+    of psi in s), `lag_xy` (delay of x, y in s), `lever_arm` (position of
     the receiver forward and to starboard in m), `current` (north and east in m/s, if u, v are
     relative to the water), `bias` (of u, v in m/s).
     """
     return _compare_clocks(log, _model_positions, ("u", "v", "psi"), _POSITION_CLOCKS)
 
 
-def _model_positions(log: LogStatistics, channels: Channels, block: int = 1) -> _IncrementModel:
+def _model_positions(log: LogStatistics, channels: Channels) -> _IncrementModel:
     """Return the model of the increments of x, y by the integrals of R(psi) [u, v] and errors.
 
     Args:
         log: statistics of the log.
         channels: measured and smoothed channels, of which some may be shifted.
-        block: number of samples of each increment; lags have columns for 1 only.
     """
-    block_ends = _find_block_ends(log, block)
-    dt = np.diff(log.t[block_ends])
+    dt = np.diff(log.t)
     psi = channels["psi"]
     # horizontal vectors are complex numbers: north + 1j east, or forward + 1j starboard
     heading_rotation = np.exp(1j * psi)
     u = channels["u smoothed"]
     v = channels["v smoothed"]
-    surge_increments = _integrate_blocks(log.t, heading_rotation * u, block)
-    sway_increments = 1j * _integrate_blocks(log.t, heading_rotation * v, block)
+    surge_increments = _integrate(log.t, heading_rotation * u)
+    sway_increments = 1j * _integrate(log.t, heading_rotation * v)
     both_increments = surge_increments + sway_increments
-    rotation_increments = np.diff(heading_rotation[block_ends])
-    integrated_rotation = _integrate_blocks(log.t, heading_rotation, block)
+    rotation_increments = np.diff(heading_rotation)
+    integrated_rotation = _integrate(log.t, heading_rotation)
     columns: dict[str, list[np.ndarray]] = {
         "gain_u": [-surge_increments],
         "gain_v": [-sway_increments],
         "gain": [-both_increments],
         "heading": [-1j * both_increments],
     }
-    if block == 1:
-        columns |= _differentiate_by_lags(log.t, channels)
+    columns |= _differentiate_by_lags(log.t, channels)
     columns |= {
         "lever_arm": [rotation_increments, 1j * rotation_increments],
         "current": [dt + 0j, 1j * dt],
@@ -386,13 +326,13 @@ def _model_positions(log: LogStatistics, channels: Channels, block: int = 1) -> 
         for name, cause_columns in columns.items()
         if not any(name in _UNIDENTIFIABLE_CAUSES[channel] for channel in noise_only_channels)
     }
-    speed = np.hypot(np.nan_to_num(channels["u"]), np.nan_to_num(channels["v"]))[block_ends]
+    speed = np.hypot(np.nan_to_num(channels["u"]), np.nan_to_num(channels["v"]))
     heading_noise_velocity = log.noise_std("psi") * 0.5 * (speed[1:] + speed[:-1])
     rate_noise = np.hypot(max(log.noise_std("u"), log.noise_std("v")), heading_noise_velocity)
     velocity = channels["u"] + 1j * channels["v"]
     return _IncrementModel(
-        log["x"][block_ends] + 1j * log["y"][block_ends],
-        _integrate_blocks(log.t, heading_rotation * velocity, block),
+        log["x"] + 1j * log["y"],
+        _integrate(log.t, heading_rotation * velocity),
         dt,
         max(log.noise_std("x"), log.noise_std("y")),
         rate_noise,
@@ -403,29 +343,20 @@ def _model_positions(log: LogStatistics, channels: Channels, block: int = 1) -> 
 
 def _differentiate_by_lags(t: np.ndarray, channels: Channels) -> dict[str, list[np.ndarray]]:
     """Return the effects of lags on the increments of the position, and those of second order."""
-    psi = channels["psi"]
-    u = channels["u smoothed"]
-    v = channels["v smoothed"]
-    heading_rotation = np.exp(1j * psi)
-    mid_rotation = np.exp(0.5j * (psi[1:] + psi[:-1]))
-    lag_u = mid_rotation * np.diff(u)
-    lag_v = 1j * mid_rotation * np.diff(v)
-    earth_velocity = heading_rotation * (u + 1j * v)
+    heading_rotation = np.exp(1j * channels["psi"])
+    mid_rotation = np.exp(0.5j * (channels["psi"][1:] + channels["psi"][:-1]))
+    velocity = channels["u smoothed"] + 1j * channels["v smoothed"]
+    mid_velocity = 0.5 * (velocity[1:] + velocity[:-1])
+    earth_velocity = heading_rotation * velocity
+    lag = mid_rotation * np.diff(velocity)
     lag_psi = 0.5j * np.diff(channels["psi smoothed"]) * (earth_velocity[1:] + earth_velocity[:-1])
-    curvature_u = [mid_rotation * increments for increments in _differentiate_twice(u, t)]
-    curvature_v = [1j * mid_rotation * increments for increments in _differentiate_twice(v, t)]
-    mid_velocity = 0.5 * (u[1:] + u[:-1] + 1j * (v[1:] + v[:-1]))
     return {
-        "lag_u": [lag_u],
-        "lag_v": [lag_v],
-        "lag": [lag_u + lag_v],
+        "lag": [lag],
         "lag_psi": [lag_psi],
-        "lag_xy": [-(lag_u + lag_v + lag_psi)],
-        "curvature_u": curvature_u,
-        "curvature_v": curvature_v,
-        "curvature": [a + b for a, b in zip(curvature_u, curvature_v, strict=True)],
+        "lag_xy": [-(lag + lag_psi)],
+        "curvature": [mid_rotation * steps for steps in _differentiate_twice(velocity, t)],
         "curvature_psi": [
-            mid_velocity * increments for increments in _differentiate_twice(heading_rotation, t)
+            mid_velocity * steps for steps in _differentiate_twice(heading_rotation, t)
         ],
         "curvature_xy": _differentiate_twice(earth_velocity, t),
     }
@@ -435,21 +366,6 @@ def _select_channels(log: LogStatistics, *names: str) -> dict[str, np.ndarray]:
     """Return channels [T] of a log as measured and smoothed."""
     smoothed = {f"{n} smoothed": log.cached(_smooth_leaving_out_centre, n) for n in names}
     return {**{name: log[name] for name in names}, **smoothed}
-
-
-@dataclass(frozen=True)
-class _ClockHypothesis:
-    """An explanation with some clocks shifted.
-
-    Attributes:
-        explanation: causes of the increments that remain.
-        channels: shifted channels.
-        shifts: lag -> number of samples by which its channels are taken later.
-    """
-
-    explanation: _Explanation
-    channels: Channels
-    shifts: dict[str, int] = field(default_factory=dict)
 
 
 def _compare_clocks(
@@ -462,8 +378,8 @@ def _compare_clocks(
 
     A lag in the regression is the first term of a series. Where a delay is longer than the motion
     takes to change, the series diverges, and other causes explain more than this term. Therefore
-    each clock is also tried with its channels shifted by its most likely delay, and the BIC
-    compares these hypotheses with the regression alone.
+    the channels of each clock are also shifted by its delay, which is estimated by the Gauss-Newton
+    method, and the BIC compares these hypotheses with the regression alone.
 
     Args:
         log: statistics of the log.
@@ -482,21 +398,19 @@ def _compare_clocks(
     residual_square = float(np.nan_to_num(regression.squares).mean()) if regression.causes else 0.0
     if is_unlike or residual_square <= _MAX_ROUNDING_SHARE * regression.response_square:
         return regression.causes
-    unshifted = _ClockHypothesis(regression, channels)
     excerpt = log.excerpt_middle(_MAX_CLOCK_SAMPLES)
-    if excerpt is not log:
-        excerpt_channels = _select_channels(excerpt, *names)
-        explanation = _explain_increments(make_model(excerpt, excerpt_channels))
-        unshifted = _ClockHypothesis(explanation, excerpt_channels)
-    shifts = _search_shifts(excerpt, make_model, unshifted, clocks)
+    shifts = _search_shifts(excerpt, make_model, _select_channels(excerpt, *names), clocks)
     if not shifts:
         return regression.causes
-    for clock, n_samples in shifts.items():
-        channels = _shift_channels(log, channels, clocks[clock], n_samples)
-    delays = {clock: _clock_sign(clock) * n * log.sampling_interval for clock, n in shifts.items()}
-    explanation = _explain_increments(make_model(log, channels), [*shifts])
+    explanation = _explain_increments(
+        make_model(log, _shift_clocks(log, channels, clocks, shifts)), [*shifts]
+    )
     return {
-        name: replace(cause, estimates=cause.estimates + delays.get(name, 0.0))
+        name: replace(
+            cause,
+            estimates=cause.estimates
+            + _clock_sign(name) * shifts.get(name, 0) * log.sampling_interval,
+        )
         for name, cause in explanation.causes.items()
     }
 
@@ -504,107 +418,75 @@ def _compare_clocks(
 def _search_shifts(
     log: LogStatistics,
     make_model: Callable[..., _IncrementModel],
-    unshifted: _ClockHypothesis,
+    channels: Channels,
     clocks: Mapping[str, tuple[str, ...]],
 ) -> dict[str, int]:
-    """Return lag -> number of samples for the clocks of the likeliest hypothesis; see above.
+    """Return lag -> number of samples by which its channels are taken later, by forward selection.
 
-    The likeliest of many delays fits noise and errors of the model better than one delay that is
-    known beforehand. The extended BIC counts the hypotheses with as many shifts (Chen and Chen
-    2008, Biometrika 95, 759-771, eq. 1 with gamma = 1).
+    A further clock is selected if it reduces the BIC by more than `_MIN_CLOCK_ADVANTAGE`.
     """
-    model = make_model(log, unshifted.channels)
-    identifiable_clocks = [name for name in clocks if name in model.columns]
-    candidates = [name for name in identifiable_clocks if _may_contain_delay(log, model, name)]
-    hypotheses = [unshifted]
-    continued = hypotheses
+    model = make_model(log, channels)
+    shifts: dict[str, int] = {}
+    best = _explain_increments(model)
+    min_deviation = best.min_deviation
     for _ in range(_MAX_CLOCKS):
-        trials = [
-            trial
-            for hypothesis in continued
-            for name in candidates
-            if name not in hypothesis.shifts
-            and (trial := _shift_clock(log, make_model, hypothesis, name, clocks)) is not None
-        ]
-        bics = _compute_bics([h.explanation for h in (hypotheses[0], *trials)])
-        hypotheses = [*hypotheses, *trials]
-        # two delays of which neither explains anything alone are not searched
-        if bics[0] <= bics[1:].min(initial=math.inf):
+        trials = []
+        for name in clocks:
+            if name in model.columns and name not in shifts:
+                trial = _estimate_shifts(
+                    log, make_model, channels, clocks, {**shifts, name: 0}, min_deviation
+                )
+                trials += [] if trial is None else [trial]
+        if not trials:
             break
-        order = np.argsort(bics[1:]).tolist()
-        continued = [trials[k] for k in order[:_N_CONTINUED_HYPOTHESES]]
-    bics = _compute_bics([hypothesis.explanation for hypothesis in hypotheses])
-    n_alternatives = len(identifiable_clocks) * (2 * _count_shift_steps(log) + 1)
-    bics += [2.0 * math.log(math.comb(n_alternatives, len(h.shifts))) for h in hypotheses]
-    # among hypotheses that the data do not distinguish the simplest one counts
-    likely = np.flatnonzero(bics < bics.min() + _MIN_CLOCK_ADVANTAGE)
-    best = min(
-        (hypotheses[k] for k in likely.tolist()),
-        key=lambda hypothesis: hypothesis.explanation.n_parameters,
-        default=hypotheses[0],
-    )
-    return best.shifts
+        bics = _compute_bics([best, *(explanation for explanation, _ in trials)])
+        likeliest = int(np.argmin(bics[1:]))
+        if bics[0] - bics[1 + likeliest] < _MIN_CLOCK_ADVANTAGE:
+            break
+        best, shifts = trials[likeliest]
+    return shifts
 
 
-def _may_contain_delay(log: LogStatistics, model: _IncrementModel, clock: str) -> bool:
-    """Return whether pose and velocities disagree as much as by the shortest delay of a clock.
-
-    Compares the root mean squares over the blocks in which delays are tried.
-    """
-    stride = log.cached(_shift_stride)
-    block = _choose_misfit_block(stride)
-    difference = np.diff(model.measured_pose) - model.integrated_increments
-    shortest_delay = 0.5 * stride * log.sampling_interval
-    difference_square, effect_square = (
-        np.nanmean(np.abs(_sum_blocks(steps, block)) ** 2)
-        for steps in (difference, shortest_delay * model.columns[clock][0])
-    )
-    return bool(difference_square >= _MIN_DELAY_SHARE**2 * effect_square)
-
-
-def _shift_clock(
+def _estimate_shifts(
     log: LogStatistics,
     make_model: Callable[..., _IncrementModel],
-    hypothesis: _ClockHypothesis,
-    name: str,
+    channels: Channels,
     clocks: Mapping[str, tuple[str, ...]],
-) -> _ClockHypothesis | None:
-    """Return a hypothesis with the most likely delay of one more clock.
+    shifts: dict[str, int],
+    min_deviation: float,
+) -> tuple[_Explanation, dict[str, int]] | None:
+    """Estimate the delays of some clocks by the Gauss-Newton method.
 
-    The result is None without a delay, or if the causes cannot be separated.
+    Returns:
+        The causes that remain and the shifts; None if the method diverges, or if the causes cannot
+        be separated.
     """
-    n_samples = _find_most_likely_shift(log, make_model, hypothesis.channels, clocks[name])
-    if n_samples == 0 and name in hypothesis.explanation.causes:
-        # in noise, the regression shows delays of slow motions that single steps do not show
-        lag = _clock_sign(name) * float(hypothesis.explanation.causes[name].estimates[0])
-        n_samples = round(lag / log.sampling_interval)
-        n_samples *= 2 * abs(n_samples) > log.cached(_shift_stride)
-    if n_samples == 0:
-        return None
-    min_deviation = hypothesis.explanation.min_deviation
-    channels = _shift_channels(log, hypothesis.channels, clocks[name], n_samples)
-    shifts = {**hypothesis.shifts, name: n_samples}
-    explanation = _explain_increments(make_model(log, channels), [*shifts], min_deviation)
-    trial = _ClockHypothesis(explanation, channels, shifts)
-    # Gauss-Newton: the remaining lags are those of all clocks together
-    for _ in range(_MAX_SHIFT_CORRECTIONS):
-        corrections = {
-            clock: round(_clock_sign(clock) * float(cause.estimates[0]) / log.sampling_interval)
-            for clock, cause in trial.explanation.causes.items()
-            if clock in trial.shifts
+    for _ in range(_MAX_ITERATIONS):
+        shifted = _shift_clocks(log, channels, clocks, shifts)
+        explanation = _explain_increments(make_model(log, shifted), [*shifts], min_deviation)
+        estimate = explanation, shifts
+        shifts = {
+            clock: n_samples
+            + round(_clock_sign(clock) * explanation.estimate(clock) / log.sampling_interval)
+            for clock, n_samples in shifts.items()
         }
-        if not any(corrections.values()):
+        if max(map(abs, shifts.values())) * log.sampling_interval > _MAX_SHIFT:
+            return None
+        if shifts == estimate[1]:
             break
-        channels = dict(trial.channels)
-        for clock, correction in corrections.items():
-            channels = _shift_channels(log, channels, clocks[clock], correction)
-        shifts = {clock: n + corrections.get(clock, 0) for clock, n in trial.shifts.items()}
-        explanation = _explain_increments(make_model(log, channels), [*shifts], min_deviation)
-        bics = _compute_bics([trial.explanation, explanation])
-        if bics[1] >= bics[0]:
-            break
-        trial = _ClockHypothesis(explanation, channels, shifts)
-    return trial if trial.explanation.condition_index <= _MAX_CONDITION_INDEX else None
+    return estimate if estimate[0].condition_index <= _MAX_CONDITION_INDEX else None
+
+
+def _shift_clocks(
+    log: LogStatistics,
+    channels: Channels,
+    clocks: Mapping[str, tuple[str, ...]],
+    shifts: Mapping[str, int],
+) -> Channels:
+    """Return the channels with those of each clock taken a number of samples later."""
+    for clock, n_samples in shifts.items():
+        channels = _shift_channels(log, channels, clocks[clock], n_samples)
+    return channels
 
 
 def _clock_sign(name: str) -> float:
@@ -627,67 +509,11 @@ def _shift_channels(
     return shifted
 
 
-def _shift_stride(log: LogStatistics) -> int:
-    """Return the number of samples between delays that are tried, fewer for faster motions."""
-    time_scales = []
-    for name in ("u", "v", "r"):
-        if name in log:
-            smoothed = log.cached(_smooth_leaving_out_centre, name)
-            rate_std = nan_std(np.diff(smoothed)) / log.sampling_interval
-            time_scales.append(nan_std(smoothed) / max(rate_std, 1e-300))
-    step = _SHIFT_STEP_SHARE * min(time_scales, default=0.0)
-    return max(round(float(np.clip(step, *_SHIFT_STEPS)) / log.sampling_interval), 1)
-
-
-def _choose_misfit_block(stride: int) -> int:
-    """Return the number of samples of the blocks in which delays are compared."""
-    return max(round(_MISFIT_BLOCK_SHARE * stride), 1)
-
-
-def _count_shift_steps(log: LogStatistics) -> int:
-    """Return the number of delays that are tried to either side."""
-    return max(int(_MAX_SHIFT / (log.cached(_shift_stride) * log.sampling_interval)), 1)
-
-
-def _find_most_likely_shift(
-    log: LogStatistics,
-    make_model: Callable[..., _IncrementModel],
-    channels: Channels,
-    names: Sequence[str],
-) -> int:
-    """Return the shift in samples under which all causes but lags explain the increments best."""
-    stride = log.cached(_shift_stride)
-    n_steps = _count_shift_steps(log)
-    block = _choose_misfit_block(stride)
-
-    def compute_misfit(n_samples: int) -> float:
-        shifted = _shift_channels(log, channels, names, n_samples)
-        return make_model(log, shifted, block).compute_misfit()
-
-    # every other delay, then the neighbours of the best one
-    misfits = {k: compute_misfit(stride * k) for k in range(-n_steps, n_steps + 1, 2)}
-    best = min(misfits, key=misfits.__getitem__)
-    misfits |= {k: compute_misfit(stride * k) for k in (best - 1, best + 1) if abs(k) <= n_steps}
-    best = min(misfits, key=misfits.__getitem__)
-    # delays of less than half a step are left to the lags of the regression
-    if best == 0 or abs(best) == n_steps:
-        return 0
-    before, lowest, after = (
-        misfits[k] if k in misfits else compute_misfit(stride * k)
-        for k in (best - 1, best, best + 1)
-    )
-    curvature = before - 2.0 * lowest + after
-    if not math.isfinite(curvature):
-        return 0
-    # vertex of the parabola through the three lowest points
-    return round(stride * (best - 0.5 * (after - before) / max(curvature, 1e-300)))
-
-
 # channel -> causes that are not identifiable if it holds noise only, because of the shared noise
 _UNIDENTIFIABLE_CAUSES = {
-    "u": ("gain_u", "lag_u", "gain", "lag", "lag_xy", "heading"),
-    "v": ("gain_v", "lag_v"),
-    "psi": ("lag_psi", "lever_arm", "lag_v"),
+    "u": ("gain_u", "gain", "lag", "lag_xy", "heading"),
+    "v": ("gain_v",),
+    "psi": ("lag_psi", "lever_arm"),
 }
 
 
@@ -701,21 +527,9 @@ def _differentiate_twice(values: np.ndarray, t: np.ndarray) -> list[np.ndarray]:
     return steps
 
 
-def _find_block_ends(log: LogStatistics, block: int) -> slice:
-    """Return the samples at the ends of blocks of a number of samples."""
-    return slice(None, (len(log) - 1) // block * block + 1, block)
-
-
-def _integrate_blocks(t: np.ndarray, rates: np.ndarray, block: int) -> np.ndarray:
-    """Return the trapezoidal integrals of a rate [T] over blocks of samples at times t [T] in s."""
-    return _sum_blocks(0.5 * np.diff(t) * (rates[1:] + rates[:-1]), block)
-
-
-def _sum_blocks(steps: np.ndarray, block: int) -> np.ndarray:
-    """Return the sums over blocks of successive steps [T - 1]; remaining steps are left out."""
-    steps = steps[: steps.size // block * block]
-    # sums of strided samples, because a sum over a short last axis takes ten times as long
-    return np.asarray(sum((steps[k::block] for k in range(1, block)), steps[::block]))
+def _integrate(t: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Return the trapezoidal integrals [T - 1] of a rate [T] over the steps between times [T]."""
+    return np.asarray(0.5 * np.diff(t) * (rates[1:] + rates[:-1]))
 
 
 def _is_significant(log: LogStatistics, name: str) -> bool:
@@ -769,8 +583,9 @@ def _explain_increments(
         n_missing = np.concatenate((initial_zeros, np.cumsum(is_missing, axis=0)))[measured_indices]
         return np.where(np.diff(n_missing, axis=0) > 0, np.nan, np.diff(cumulative_sums, axis=0))
 
+    squares = np.full(max(measured_indices.size - 1, 0), np.nan)
     if measured_indices.size < MIN_SAMPLES:
-        return _Explanation({}, np.zeros(0), 1, 0.0, 0.0, 0)
+        return _Explanation({}, squares, 1, 0.0, 0.0, 0)
     unexplained_increments = np.diff(measured_pose[measured_indices])
     unexplained_increments = unexplained_increments - sum_between_poses(model.integrated_increments)
     durations = sum_between_poses(dt)
@@ -788,7 +603,7 @@ def _explain_increments(
     )
     retained_indices = np.flatnonzero(is_usable & (durations <= 3.0 * nan_median(durations)))
     if retained_indices.size < MIN_SAMPLES:
-        return _Explanation({}, np.zeros(0), 1, 0.0, 0.0, 0)
+        return _Explanation({}, squares, 1, 0.0, 0.0, 0)
     total_variance = sum_between_poses(variance)[retained_indices]
     shared_variance = variance[np.minimum(measured_indices[retained_indices], variance.size - 1)]
     shared_variance = np.where(
@@ -838,7 +653,6 @@ def _explain_increments(
         names,
         required,
     )
-    squares = np.full(measured_indices.size - 1, np.nan)
     residuals = y - cause_columns @ coefficients
     squares_by_component = (residuals**2).reshape(retained_indices.size, -1)
     squares[retained_indices] = squares_by_component.sum(axis=1)
@@ -869,13 +683,13 @@ def _compute_condition_index(columns: np.ndarray) -> float:
 def _orthogonal_matching_pursuit(
     response: np.ndarray, regressors: np.ndarray, names: np.ndarray, required: Sequence[str]
 ) -> tuple[dict[str, KinematicCause], np.ndarray]:
-    """Select groups of columns by orthogonal matching pursuit, then remove redundant groups.
+    """Select groups of columns by orthogonal matching pursuit.
 
     Args:
         response: whitened response [N].
         regressors: whitened columns [N, k].
         names: cause of each column [k].
-        required: causes that are selected first and not removed.
+        required: causes that are selected first.
 
     Returns:
         Cause -> estimate, in the order of selection, and the coefficients [k] of all columns.
@@ -922,8 +736,7 @@ def _orthogonal_matching_pursuit(
             and _LAG_OF_CURVATURE.get(name, name) in (name, *selected_causes)
         }
         # among equivalent causes (a lag of one channel, or of all others) the first counts;
-        # rounding
-        # makes their gains equal
+        # rounding makes their gains equal
         net_gain_by_cause = {
             cause_name: round(
                 (residual_energy - energy_of_cause - min_gain_by_cause[cause_name])
@@ -937,16 +750,6 @@ def _orthogonal_matching_pursuit(
             break
         selected_causes = [*selected_causes, best_cause]
         residual_energy = residual_energy_by_cause[best_cause]
-    # backward elimination of causes that later ones made redundant; a lag stays with its curvature
-    permanent = {*required, *(_LAG_OF_CURVATURE.get(name) for name in selected_causes)}
-    for name in [name for name in selected_causes[:-1] if name not in permanent]:
-        reduced_causes = [cause for cause in selected_causes if cause != name]
-        selected_causes = (
-            reduced_causes
-            if compute_residual_energy(reduced_causes) - compute_residual_energy(selected_causes)
-            < min_gain_by_cause[name]
-            else selected_causes
-        )
     if not selected_causes:
         return {}, coefficients
     is_selected = np.isin(names, selected_causes)
