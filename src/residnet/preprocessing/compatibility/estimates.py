@@ -32,7 +32,7 @@ class ErrorEstimate:
     Attributes:
         value: estimate in SI units.
         statistical_error: larger one of the standard errors from the curvature and from a jackknife
-            over sections of the log.
+            over sections of the log; clocks also have the error of the grid of nodes.
         change: change of the value if the jerk intensities are ten times larger.
         growth: factor on the standard error if the jerk intensities are a hundred times larger.
         prior_std: standard deviation of the prior.
@@ -54,11 +54,7 @@ class ErrorEstimate:
 
     @property
     def standard_error(self) -> float:
-        """Standard error; it contains the change of the value under less smoothness.
-
-        Without that change the intervals of clocks of small boats are too short: smoothing delays a
-        yaw rate that changes within few steps.
-        """
+        """Standard error; it contains the change of the value under less smoothness."""
         growth = 1.0 if self.is_independent_of_smoothness else self.growth
         return float(np.hypot(growth * self.statistical_error, self.change))
 

@@ -72,6 +72,10 @@ _PROBED_SMOOTHNESS = 10.0
 """Factor on the jerk intensities for the test whether smoothness changes the errors."""
 _N_REESTIMATIONS = 3
 """Number of Gauss-Newton steps with this factor."""
+_CLOCK_STEP_SHARE = 0.01
+"""Standard deviation that the grid adds to a clock, as a share of the step between nodes: actuators
+change accelerations between nodes, and this shifts the interpolated velocities.
+"""
 _MAX_NODES = 20_000
 """Largest number of nodes."""
 _CACHE_BYTES = 50_000_000
@@ -666,6 +670,10 @@ class _Problem:
         """Return estimates with standard errors, growth and evidence."""
         solver = self._factorize(residuals, errors)
         standard_errors = self._compute_standard_errors(residuals, errors)
+        clocks = {sensor.clock for sensor in self.sensors}
+        for k, name in enumerate(self.names):
+            if name in clocks:
+                standard_errors[k] = np.hypot(standard_errors[k], _CLOCK_STEP_SHARE * self.step)
         deviance = self._compute_deviance(residuals, errors, solver)
         intensity = self.jerk_intensity.copy()
         growth = np.ones(errors.size)
