@@ -122,6 +122,33 @@ def test_velocities_of_another_run_stop_the_draft(tmp_path: Path) -> None:
         read_drafted([path], DraftNotes())
 
 
+def test_a_late_heading_changes_no_unit_of_sway(tmp_path: Path) -> None:
+    motion = true_motion(1)
+    table = {name: motion.sample(name, TIMES) for name in ("x", "y", "u", "v", "r")}
+    columns = {"x [m]": table["x"], "y [m]": table["y"], "surge": table["u"], "sway": table["v"]}
+    columns |= {"psi [rad]": motion.sample("psi", TIMES - 0.7), "r [rad/s]": table["r"]}
+    pd.DataFrame({"t [s]": TIMES, **columns}).to_csv(path := tmp_path / "run.csv", index=False)
+    result = read_drafted([path], DraftNotes())
+    assert result.reader["channels"]["v"] == {"column": "sway", "unit": "m/s"}
+    log = next(iter(result.logs.values()))
+    codes = {f.code for f in inspect_log(log).findings if f.level == "will mislead"}
+    assert "lag_psi" in codes
+    assert "sway_unrelated" not in codes
+
+
+@pytest.mark.parametrize("is_dead", [True, False])
+def test_a_gyro_of_noise_is_left_out_and_a_late_one_is_not(
+    tmp_path: Path, *, is_dead: bool
+) -> None:
+    motion = true_motion(1)
+    table = {f"{name} [m]": motion.sample(name, TIMES) for name in ("x", "y")}
+    noise = 0.006 + 0.02 * np.std(motion.r) * np.random.default_rng(1).normal(size=TIMES.size)
+    table["yaw_rate"] = noise + (0.0 if is_dead else motion.sample("r", TIMES - 4.0))
+    table["psi [deg]"] = np.degrees(motion.sample("psi", TIMES)) % 360.0
+    pd.DataFrame({"t [s]": TIMES, **table}).to_csv(path := tmp_path / "run.csv", index=False)
+    assert ("r" in read_drafted([path], DraftNotes()).reader["channels"]) != is_dead
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_receiver_at_the_bow_changes_no_unit_or_sign_of_sway(tmp_path: Path, sign: float) -> None:
     paths = []

@@ -22,7 +22,13 @@ from residnet.io.drafting.problems import (
 )
 from residnet.io.drafting.questions import DraftNotes
 from residnet.io.drafting.tables import draft_manoeuvre_setting, draft_tables
-from residnet.io.header_vocabulary import match_input_channel, match_state_channel, parse_name
+from residnet.io.header_vocabulary import (
+    find_earth_velocities,
+    match_input_channel,
+    match_state_channel,
+    parse_header_unit,
+    parse_name,
+)
 from residnet.io.readers.clock_repair import repair_clock
 from residnet.io.readers.excel_tables import read_excel_sheet
 from residnet.io.readers.manoeuvre_kinds import infer_manoeuvre, match_manoeuvre_name
@@ -234,6 +240,17 @@ def test_nozzles_and_currents_of_motors_are_no_rudders() -> None:
     for word in ("Düsenwinkel", "azimut", "acimut", "asimut", "tobera", "насадка", "ノズル"):
         assert match_input_channel(parse_name(word)) == "azimuth", word
     assert match_input_channel(parse_name("steering motor current")) is None
+    names = {"outboard_angle_deg": "azimuth", "outboard_rpm": "n", "engine throttle": "throttle"}
+    assert {name: match_input_channel(parse_name(name)) for name in names} == names
+
+
+def test_lateral_is_no_latitude_in_a_velocity() -> None:
+    names = {"vel_lat": "v", "vel_fwd": "u", "lat": "latitude", "gps_lat_deg": "latitude"}
+    names["ATTITUDE.yawspeed"] = "r"
+    assert {name: match_state_channel(parse_name(name)) for name in names} == names
+    assert find_earth_velocities(["vn_cms", "ve_cms"]) == ("vn_cms", "ve_cms")
+    assert parse_header_unit("vn_cms", "m/s") == "cm/s"
+    assert parse_header_unit("gz_mrad", "rad/s") == "mrad/s"
 
 
 @pytest.mark.parametrize(

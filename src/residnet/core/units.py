@@ -41,7 +41,7 @@ _FACTORS_OF_DIMENSION: dict[str, dict[str, float]] = {
     },
     "rad/s": {
         "rad/s": 1.0, "rad/min": 1.0 / 60.0, "deg/s": math.pi / 180.0, "deg/min": math.pi / 10800.0,
-        "mdeg/s": math.pi / 180000.0,
+        "mdeg/s": math.pi / 180000.0, "mrad/s": 0.001,
     },
     "rad/s^2": {"rad/s^2": 1.0, "deg/s^2": math.pi / 180.0},
     "N": {"N": 1.0, "kN": 1000.0},

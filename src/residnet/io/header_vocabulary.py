@@ -412,7 +412,7 @@ def _match_rules(rules: tuple[_ChannelRule, ...], parsed_name: ParsedName) -> st
 
 _TWIST_PATTERN = (
     r"\b(?:(?:twist|velocity) linear|linear velocity|v|vel|velo|velocity|speed|lin|linear)"
-    r" ?{}(?: (?:m s|mps|ms|mm s|cm s|kn|kts))?$"
+    r" ?{}(?: (?:m s|mps|ms|mm s|cm s|cms|kn|kts))?$"
 )
 _RATE_UNITS = "(?:dps|degps|degs|radps|rads|rps|deg s|rad s)"
 """Units of angular velocities at the end of a name."""
@@ -435,7 +435,8 @@ _POSITION_SOURCES = (
 )
 """Names of instruments and frames before an axis of a position."""
 _STATE_RULES = (
-    _ChannelRule("latitude", "latitude"),
+    # with a speed these words mean lateral and longitudinal
+    _ChannelRule("latitude", "latitude", "sway speed"),
     _ChannelRule("longitude", "longitude", "surge speed"),
     # the sibling of a velocity along x and y is no sway, and u of one side is a control signal
     _ChannelRule(None, "", "angular", _TWIST_PATTERN.format("z")),
@@ -466,7 +467,7 @@ _STATE_RULES = (
             (axis, r"^p [xy](?: m)?$"),
         )
     ),
-    _ChannelRule("v", "sway", _EARTH_AXIS_CONCEPTS),
+    _ChannelRule("v", "sway|latitude", _EARTH_AXIS_CONCEPTS),
     _ChannelRule("u", "surge|longitude", _EARTH_AXIS_CONCEPTS),
     _ChannelRule("v", "speed port|starboard", _EARTH_AXIS_CONCEPTS),
     _ChannelRule("speed", "speed", _EARTH_AXIS_CONCEPTS),
@@ -569,7 +570,7 @@ def match_axis_velocity(parsed_name: ParsedName) -> str | None:
 
 _EARTH_AXIS_VELOCITY = re.compile(
     r"(?:^|.* )(?:v|vel|velo|velocity|speed|geschwindigkeit) ?"
-    r"(?:(?P<north>n|north|nord)|(?P<east>e|east|ost))(?: (?:m s|mps|ms|mm s|cm s|kn|kts))?"
+    r"(?:(?P<north>n|north|nord)|(?P<east>e|east|ost))(?: (?:m s|mps|ms|mm s|cm s|cms|kn|kts))?"
 )
 """Normalised name of a velocity along north or east."""
 
@@ -595,6 +596,8 @@ _INPUT_RULES = (
     _ChannelRule("{cmd_}delta_s{side}", "planes"),
     _ChannelRule("{cmd_}delta_rate{side}", "rudder rate"),
     _ChannelRule("{cmd_}delta{side}", "rudder"),
+    # an outboard motor steers as an azimuth thruster does
+    _ChannelRule("{cmd_}azimuth{side}", "engine angle", "throttle revolutions"),
     _ChannelRule("throttle{side}", "propeller throttle|pitch", "revolutions"),
     _ChannelRule("throttle{side}", "engine throttle", "revolutions angle"),
     _ChannelRule("{cmd_}n{side}", "revolutions|propeller", "thrust"),

@@ -196,8 +196,8 @@ _MAX_SPEED_RATIO = 5.0
 def compare_frames(log: LogStatistics) -> FrameAgreement | None:
     """Compare position and velocities; None with fewer than 50 samples in motion.
 
-    If a lever arm of the receiver explains a difference better than a reversed v, the declared
-    convention is compared at the vessel's centre.
+    If a lever arm of the receiver explains a difference better than another convention, the
+    declared one is compared at the vessel's centre.
     """
     averaged_rates = log.cached(compute_averaged_rates)
     is_finite = np.isfinite(averaged_rates.ground_velocity)
@@ -229,7 +229,7 @@ def compare_frames(log: LogStatistics) -> FrameAgreement | None:
     centre_velocity = ground_velocity - lever_arm * arm
     norms = float(np.linalg.norm(centre_velocity)) * float(np.linalg.norm(declared_velocity))
     overlap_of_centre = complex(np.vdot(declared_velocity, centre_velocity)) / max(norms, 1e-300)
-    if abs(overlap_of_centre) > abs(overlaps["v reversed"]) > abs(overlaps["as declared"]):
+    if abs(overlap_of_centre) > max(map(abs, overlaps.values())):
         overlaps["as declared"] = overlap_of_centre
     return FrameAgreement(
         overlaps, float(np.linalg.norm(declared_velocity) / np.linalg.norm(ground_velocity))

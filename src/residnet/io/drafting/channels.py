@@ -68,6 +68,8 @@ _MAX_FACTOR_RATIO = 1.6
 """Largest such ratio."""
 _MIN_BODY_CONSISTENCY = 0.85
 """Smallest consistency with position and heading of u and v that are certainly in body axes."""
+_MAX_NOISE_SHARE = 0.2
+"""Largest standard deviation of the noise of a dead gyro, as share of that of the yaw rate."""
 _MAX_WIND_SPREAD_RATIO = 0.8
 """Largest ratio of true-wind standard deviations for a reference other than that of the name.
 
@@ -148,7 +150,11 @@ class ChannelMapper:
         component_index = {"u": 1, "v": 2, "r": 3}[name]
         factor = to_si(self._infer_unit(name, should_note=False), CHANNEL_UNITS[name])
         spread = factor * float(np.nanstd(self._concatenate_values(name)))
-        if motions and spread < NEGLIGIBLE_MOTION_SHARE * float(
+        # a yaw rate without a correlation may have another clock, but no smaller amplitude
+        fit = fit_to_motion(self._logs, self._motions, name)
+        is_noise = name == "r" and not fit.is_significant
+        max_share = _MAX_NOISE_SHARE if is_noise else NEGLIGIBLE_MOTION_SHARE
+        if motions and spread < max_share * float(
             np.std(np.concatenate([motion[component_index] for motion in motions]))
         ):
             column = self._names.pop(name)
@@ -543,6 +549,7 @@ class ChannelMapper:
             name in ("phi", "theta")
             and scaling.reason
             and "psi" in self._names
+            and self._psi_unit != "cdeg"
             and np.nanmax(np.abs(values * to_si(self._psi_unit, "rad")), initial=0.0) < np.pi
         ):
             # small angles in deg have the size of angles in rad
@@ -626,8 +633,11 @@ class ChannelMapper:
         unit = parse_header_unit(self._names["v"], "m/s") or surge_fit.matching_unit("m/s")
         if unit is None or _MIN_FACTOR_RATIO < fit.factor / to_si(unit) < _MAX_FACTOR_RATIO:
             return fit
-        factors = (to_si(unit), -to_si(unit), fit.factor)
-        squares = np.zeros(3)
+        factors = [to_si(unit), -to_si(unit)]
+        # a weak correlation, as with a late heading, is no evidence for another unit than that of u
+        if fit.correlation >= _OVERRULING_CORRELATION:
+            factors.append(fit.factor)
+        squares = np.zeros(len(factors))
         for table, motion in zip(self._logs, self._motions, strict=True):
             if motion is None or "v" not in table.columns:
                 continue

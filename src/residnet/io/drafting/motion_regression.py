@@ -78,7 +78,7 @@ class ScaleFit(NamedTuple):
         Args:
             expected: SI unit of the dimension.
         """
-        excluded_units = ("rad/min", "m/min", "cm/s")
+        excluded_units = ("rad/min", "m/min")
         candidate_units = [
             n for n in unit_names() if si_unit(n) == expected and n not in excluded_units
         ]
