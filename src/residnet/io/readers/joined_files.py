@@ -31,6 +31,8 @@ from residnet.preprocessing.compatibility.clock import ClockEstimate, estimate_c
 from residnet.preprocessing.motion import MotionConfig, complete_motion
 from residnet.preprocessing.statistics import OverlappingBlocks
 
+_MIN_CROPPED_SHARE = 0.5
+"""Smallest overlap to which a joined log is cropped, as share of the log with the motion."""
 _MIN_OVERLAP = 0.5
 """Smallest overlap of two logs while a clock offset is searched, as share of the shorter one."""
 _COARSE_STEP = 0.5
@@ -196,11 +198,14 @@ class JoinedConfig(ConfiguredReader):
             *other_log.meta.get("findings", ()),
             offset_remark,
         ]
-        return log.replace(
+        joined_log = log.replace(
             channels={**log.channels, **{name: resampled[name] for name in new_channels}},
             units={**log.units, **{name: other_log.units[name] for name in new_channels}},
             meta={**log.meta, "findings": findings},
         )
+        # one recorder usually starts before the other one; a short part ends no log
+        is_cropped = in_overlap.mean() > _MIN_CROPPED_SHARE
+        return joined_log.select_rows(in_overlap) if is_cropped else joined_log
 
     def _convert_times(
         self,
