@@ -297,3 +297,21 @@ def test_odometry_of_ros_under_water(tmp_path: Path) -> None:
     pd.DataFrame(columns).to_csv(folder / "odom.csv", index=False)
     (read,) = residnet.read_logs(folder)
     assert not {"z", "theta", "w", "q"} & {*read.channels}
+
+
+def test_table_with_one_variable_on_each_line(tmp_path: Path) -> None:
+    rows = [
+        (f"{1784000000 + t:.3f}", name, value)
+        for t in (0.0, 0.5, 1.0)
+        for name, value in (("boat/nav/x", t), ("boat/nav/y", 2.0 * t), ("pilot/rudder", "P"))
+    ]
+    path = tmp_path / "session.csv"
+    pd.DataFrame(rows, columns=["ts", "topic", "value"]).to_csv(path, index=False)
+    recording = AutoConfig().load(path, ALL_FIELDS)
+    assert {name: sorted(series.fields) for name, series in recording.series.items()} == {
+        "boat/nav": ["x", "y"]
+    }
+    np.testing.assert_allclose(recording["boat/nav"]["y"], [0.0, 1.0, 2.0])
+    # a table with three columns of numbers is none
+    path.write_text("t,key,value\n0,1,2\n1,2,3\n")
+    assert detect_recording_format(path) is None

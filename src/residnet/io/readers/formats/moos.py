@@ -18,6 +18,16 @@ from residnet.io.readers.recording import ALL_FIELDS, FieldFilter, Recording, Se
 _VALUE_LINE = re.compile(
     rb"^\s*(?P<time>[-+\d.eE]+)\s+(?P<name>\S+)\s+(?P<source>\S+)\s+(?P<value>\S+)"
 )
+_LONG_TABLE_LINE = re.compile(
+    rb"""^"?(?P<time>[-+\d.eE]+)"?[,;\t]"?(?:(?P<source>[^,;\t"]+)[/.])?(?P<name>[^,;\t"/.]+)"?"""
+    rb"""[,;\t]"?(?P<value>[-+\d.eE]+)"""
+)
+_LONG_TABLE_START = re.compile(
+    rb"""^\W*(?:t|ts|time|timestamp|unix_time|time_s)\W+(?:topic|name|variable|signal|field|key|channel)"""
+    rb"""\W+(?:value|payload|data)\W*?\n"?\d+(?:\.\d*)?"?[,;\t]"?[a-z/_]""",
+    re.IGNORECASE,
+)
+"""Header of a table with one variable on each line, its first time and first name."""
 _MESSAGE_TYPE = "moos/Variables"
 _START_LINE = re.compile(rb"^%%\s*LOGSTART\s+(?P<start>\d+(?:\.\d+)?)")
 
@@ -37,7 +47,7 @@ def _are_same_posts(first: np.ndarray, second: np.ndarray) -> bool:
 
 @final
 class MoosConfig(RecordingConfig):
-    """Reader of alog files from pLogger of MOOS-IvP.
+    """Reader of alog files from pLogger of MOOS-IvP, and of csv files with time, name and value.
 
     A series has the variables that one source (`uNav`) publishes together, and the name of the
     source. A variable with other times is a series with the name of the variable, or
@@ -48,7 +58,8 @@ class MoosConfig(RecordingConfig):
     kind: Literal["moos"] = "moos"
     endings: ClassVar = (".alog",)
     formats: ClassVar = {
-        "MOOS alog": lambda path, head: path.suffix.lower() == ".alog" or b"%% LOGSTART" in head
+        "MOOS alog": lambda path, head: path.suffix.lower() == ".alog" or b"%% LOGSTART" in head,
+        "long csv": lambda path, head: bool(_LONG_TABLE_START.match(head)),
     }
 
     def load(self, path: Path, field_filter: FieldFilter = ALL_FIELDS) -> Recording:
@@ -66,7 +77,8 @@ class MoosConfig(RecordingConfig):
                     advance(min(bytes_read, size))
                 if start_match := _START_LINE.match(line):
                     epoch = round(float(start_match["start"]) * 1e9)
-                match = None if line.startswith(b"%") else _VALUE_LINE.match(line)
+                match = _LONG_TABLE_LINE.match(line) or _VALUE_LINE.match(line)
+                match = None if line.startswith(b"%") else match
                 if match is None:
                     continue
                 try:
@@ -75,7 +87,7 @@ class MoosConfig(RecordingConfig):
                 except ValueError:
                     continue
                 source_and_name = (
-                    match["source"].decode(errors="replace"),
+                    (match["source"] or b"values").decode(errors="replace"),
                     match["name"].decode("latin-1"),
                 )
                 times[source_and_name].append(time)
