@@ -285,6 +285,15 @@ def test_inspect_log_reports_a_sway_velocity_of_another_motion() -> None:
     assert "leave it out" in finding.action
 
 
+def test_a_reset_of_the_pose_has_no_delays_and_scales_as_causes() -> None:
+    is_after = T >= 90.0
+    pose = (LOG["x"] + 1j * LOG["y"] - LOG["x"][900] - 1j * LOG["y"][900]) * np.exp(1.7j)
+    pose = np.where(is_after, pose, LOG["x"] + 1j * LOG["y"])
+    log = changed(x=pose.real, y=pose.imag, psi=PSI + 1.7 * is_after)
+    codes = {f.code for f in inspect_log(log).findings if f.level == "will mislead"}
+    assert codes == {"heading_jump", "position_jump"}
+
+
 def test_check_relative_wind_accepts_a_true_wind() -> None:
     gusts = 0.3 * np.sin(0.17 * T) + 0.2 * np.sin(0.71 * T)
     assert not inspect_log(changed(wind_dir=1.0 + gusts)).find_by_code("relative_wind")

@@ -355,6 +355,10 @@ def _report_jumps(
         )
 
 
+_MIN_HEADING_RESET = math.radians(20.0)
+"""Smallest jump of the heading in rad that distorts the causes in the position."""
+
+
 @check("grid", "position_causes", required_channels=_PLANAR_MOTION, on_subsample=True)
 def check_position_causes(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report the causes of differences between position and velocities in correct frames."""
@@ -363,6 +367,13 @@ def check_position_causes(log: LogStatistics, make_finding: Check) -> Iterator[F
         return
     if "r" in log and "course" in log.cached(estimate_yaw_causes):
         return
+    if "r" in log:
+        dt = np.diff(log.t)
+        dt = np.where(dt > 3.5 * log.sampling_interval, np.nan, dt)
+        excess = np.diff(log["psi"]) - 0.5 * dt * (log["r"][1:] + log["r"][:-1])
+        # a reset of the pose, which has a check of its own, looks like delays and scales
+        if np.nanmax(np.abs(excess), initial=0.0) > _MIN_HEADING_RESET:
+            return
     causes = log.cached(estimate_position_causes)
     yield from make_cause_findings(causes, POSITION_LIMITS, log, make_finding)
 
