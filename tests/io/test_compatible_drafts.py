@@ -148,6 +148,18 @@ def test_a_gyro_of_noise_is_left_out_and_a_late_one_is_not(
     assert ("r" in read_drafted([path], DraftNotes()).reader["channels"]) != is_dead
 
 
+@pytest.mark.parametrize("names", [("north", "east"), ("x", "y")])
+def test_a_heading_positive_to_port(tmp_path: Path, names: tuple[str, str]) -> None:
+    motion = true_motion(1)
+    table = {f"{n} [m]": motion.sample(c, TIMES) for n, c in zip(names, "xy", strict=True)}
+    table |= {f"{name} [rad/s]": -motion.sample(name, TIMES) for name in "r"}
+    table["yaw [deg]"] = -np.degrees(motion.sample("psi", TIMES)) % 360.0
+    pd.DataFrame({"t [s]": TIMES, **table}).to_csv(path := tmp_path / "run.csv", index=False)
+    channels = read_drafted([path], DraftNotes()).reader["channels"]
+    assert channels["psi"] == {"column": "yaw [deg]", "unit": "deg", "sign": -1}
+    assert channels["r"]["sign"] == -1
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_receiver_at_the_bow_changes_no_unit_or_sign_of_sway(tmp_path: Path, sign: float) -> None:
     paths = []

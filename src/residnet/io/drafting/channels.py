@@ -66,6 +66,8 @@ _MIN_FACTOR_RATIO = 0.6
 """Smallest ratio of an estimated factor to that of a unit at which both agree."""
 _MAX_FACTOR_RATIO = 1.6
 """Largest such ratio."""
+_MIN_FRAME_SCORE = 0.5
+"""Smallest consistency of position, heading and velocities in a frame that is not questioned."""
 _MIN_BODY_CONSISTENCY = 0.85
 """Smallest consistency with position and heading of u and v that are certainly in body axes."""
 _MAX_NOISE_SHARE = 0.2
@@ -189,6 +191,26 @@ class ChannelMapper:
                 dict.fromkeys(PoseFrame(False, f.is_from_east) for f in self._candidate_frames)
             )
         score = self._search_heading_frame()
+        if score < _MIN_FRAME_SCORE:
+            # a heading positive to port, next to north and east, fits none of the frames
+            logs, motions = self._logs, self._motions
+            unit, frame = self._psi_unit, self._pose_frame
+            self._logs = [
+                RawTable(t, {n: -values if n == "psi" else values for n, values in columns.items()})
+                for t, columns in ((table.t, table.columns) for table in logs)
+            ]
+            reversed_score = self._search_heading_frame()
+            if reversed_score > _MIN_BODY_CONSISTENCY:
+                score = reversed_score
+                self._sign_flipped.add("psi")
+                text = "the motion is consistent with the heading only if it is positive to port"
+                self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
+            else:
+                self._logs, self._motions = logs, motions
+                self._psi_unit, self._pose_frame = unit, frame
+        if parse_header_unit(self._names["psi"], "rad") is None:
+            reason = f"position and heading are most consistent in {self._psi_unit}"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"the header has no unit; {reason}")
         if not is_named_north_east and not self._is_ros_pose and self._is_mirrored():
             self._pose_frame = PoseFrame(*(not flag for flag in self._pose_frame))
             self._motions = [
@@ -202,7 +224,7 @@ class ChannelMapper:
             if self._is_ros_pose:
                 text = "the heading is assumed from east, as in a pose of ROS (REP 103)"
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
-        if score < 0.5:
+        if score < _MIN_FRAME_SCORE:
             text = f"position, heading and velocities are inconsistent ({score:.2f} of 1)"
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"{text}: check units and axes")
         # swapped columns have been exchanged by name
@@ -229,9 +251,6 @@ class ChannelMapper:
                     best_candidate = (score, unit, frame)
                     self._motions = motions
         score, self._psi_unit, self._pose_frame = best_candidate
-        if header_unit is None:
-            reason = f"position and heading are most consistent in {self._psi_unit}"
-            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"the header has no unit; {reason}")
         return score
 
     def _name_position_axes(self, score: float, is_named_north_east: bool) -> None:
@@ -573,6 +592,7 @@ class ChannelMapper:
             if MAGNETIC_PATTERN.search(column):
                 entry |= self._correct_magnetic_heading(column)
             entry["unit"] = self._psi_unit
+            entry |= {"sign": -1} if "psi" in self._sign_flipped else {}
             return entry | ({"frame": "enu"} if self._pose_frame.is_from_east else {})
         if self._is_earth_fixed and name in ("u", "v"):
             entry["frame"] = "ned"
