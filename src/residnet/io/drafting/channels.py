@@ -193,11 +193,10 @@ class ChannelMapper:
         score = self._search_heading_frame()
         if score < _MIN_FRAME_SCORE:
             # a heading positive to port, next to north and east, fits none of the frames
-            logs, motions = self._logs, self._motions
-            unit, frame = self._psi_unit, self._pose_frame
+            as_logged = (self._logs, self._motions, self._psi_unit, self._pose_frame)
             self._logs = [
                 RawTable(t, {n: -values if n == "psi" else values for n, values in columns.items()})
-                for t, columns in ((table.t, table.columns) for table in logs)
+                for t, columns in ((table.t, table.columns) for table in self._logs)
             ]
             reversed_score = self._search_heading_frame()
             if reversed_score > _MIN_BODY_CONSISTENCY:
@@ -206,8 +205,7 @@ class ChannelMapper:
                 text = "the motion is consistent with the heading only if it is positive to port"
                 self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
             else:
-                self._logs, self._motions = logs, motions
-                self._psi_unit, self._pose_frame = unit, frame
+                self._logs, self._motions, self._psi_unit, self._pose_frame = as_logged
         if parse_header_unit(self._names["psi"], "rad") is None:
             reason = f"position and heading are most consistent in {self._psi_unit}"
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"the header has no unit; {reason}")
