@@ -463,6 +463,17 @@ def test_check_gaps_accepts_a_few_lost_rows_of_a_fast_recorder(n_lost: int, fix:
     assert fix in one(inspect_log(log), "gaps").action
 
 
+def test_a_speed_that_is_slower_than_its_log_is_no_repeated_row() -> None:
+    random = np.random.default_rng(2)
+    speed = np.repeat(1.0 + 0.1 * random.normal(size=500), [1, 1, 1, 1, 2] * 100)
+    command = np.cumsum(random.integers(0, 2, speed.size)) / 300.0
+    channels = {"u": speed, "cmd_port": command, "cmd_stbd": command}
+    log = Log("run", 0.1 * np.arange(speed.size), channels)
+    assert not inspect_log(log, ("cmd_port", "cmd_stbd")).find_by_code("repeated_rows")
+    log = log.replace(channels={**channels, "v": -speed})
+    assert inspect_log(log, ("cmd_port", "cmd_stbd")).find_by_code("repeated_rows")
+
+
 def test_check_repeated_rows_accepts_chance_repeats() -> None:
     u = RANDOM.standard_normal(2000).round(4)
     u[501] = u[500]
