@@ -159,10 +159,6 @@ def _pair_speed_with_drift_angle(
         text = f"'{drift_angle}' is not read: no column is the speed next to this drift angle"
         draft_notes.add_note(CHANNELS_KEY, text)
         return {}
-    for column in velocities.values():
-        if column != speed:
-            text = f"'{column}' is left out: u and v follow from '{speed}' and '{drift_angle}'"
-            draft_notes.add_note(CHANNELS_KEY, text)
     return {"speed": speed, "drift_angle": drift_angle}
 
 

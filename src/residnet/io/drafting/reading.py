@@ -133,19 +133,17 @@ def _detect_common_kind(paths: Sequence[Path]) -> str:
     Raises:
         UsageError: if they have several formats.
     """
-    kind_by_path = {path: detect_log_kind(path) for path in paths}
-    if len(set(kind_by_path.values())) > 1:
-        names_by_kind: dict[str, list[str]] = {}
-        for path, kind in sorted(kind_by_path.items(), key=lambda item: item[1]):
-            names_by_kind.setdefault(kind, []).append(path.name)
-        kinds_text = "; ".join(
-            f"{kind}: {', '.join(file_names)[:120]}" for kind, file_names in names_by_kind.items()
-        )
+    kinds = {path: detect_log_kind(path) for path in paths}
+    if len({*kinds.values()}) > 1:
+        names = {
+            kind: ", ".join(path.name for path in paths if kinds[path] == kind)
+            for kind in sorted({*kinds.values()})
+        }
+        text = "; ".join(f"{kind}: {file_names[:120]}" for kind, file_names in names.items())
         raise UsageError(
-            f"the logs have several formats, one was expected ({kinds_text}); give logs of one"
-            " format"
+            f"the logs have several formats, one was expected ({text}); give logs of one format"
         )
-    return kind_by_path[paths[0]]
+    return kinds[paths[0]]
 
 
 def _note_manoeuvres(result: DraftResult) -> None:
