@@ -82,60 +82,40 @@ def draft_recordings(
         (source.topic or "", field) for source in pose_sources for field in source.fields
     }
     steps = [
-        median_series_step(aligned[0].series[s.topic])
-        for s in pose_sources
-        if s.topic in aligned[0].series
+        median_series_step(aligned[0].series[source.topic])
+        for source in pose_sources
+        if source.topic in aligned[0].series
     ]
-    sample_step = max(min(steps), 0.02) if steps else 1.0
     if not steps and log is not None:
-        sample_step = float(np.median(np.diff(log.t)))
-    sources = _choose_motion_sources(
-        aligned,
-        log,
-        MotionSources({}, used_fields, sample_step),
-        draft_notes,
-    )
+        steps = [float(np.median(np.diff(log.t)))]
+    has_pose = log is not None and {"x", "y", "psi"} <= log.channels.keys()
+    needs_pose = log is None or not has_pose or not _is_consistent(log)
+    sources = find_named_table(aligned, draft_notes, needs_pose=needs_pose)
+    known_channels: set[str] = set()
+    if sources is None:
+        sources = MotionSources({}, used_fields, max(min(steps, default=1.0), 0.02))
+        known_channels = set() if log is None else {*log.channels}
     settings |= sources.settings
     settings["clock"] = {"kind": "uniform", "step": f"{float(f'{sources.step:.2g}'):g} s"}
     draft_notes.add_note((*READER_KEY, "clock"), "rate of the heading or of the position")
-    uses_standard_messages = "standard_messages" not in settings
-    known_channels = set(log.channels) if log is not None and uses_standard_messages else set()
     channels = dict(settings.pop("channels", {}))
-    actuators = find_actuator_fields(aligned, sources.used_fields, plan, draft_notes)
-    for name, (topic, field) in actuators:
+    for name, (topic, field) in find_actuator_fields(
+        aligned, sources.used_fields, plan, draft_notes
+    ):
         if name in known_channels or name in channels:
             continue
-        if (command_of_format := match_known_command(aligned[0], topic, field)) is not None:
-            command_settings = command_of_format[1]
-            text = f"the format defines {field} in {command_settings['unit']}"
-            draft_notes.add_note((*CHANNELS_KEY, name), text)
-            channels[name] = {"topic": topic, "field": field, **command_settings, "hold": True}
-            continue
-        values = concatenate_field(aligned, topic, field)
-        scaling = guess_scaling(name, field, values) or infer_unit(name, field, values)
-        reason = f"taken by its name; {scaling.reason}" if scaling.reason else "taken by its name"
-        draft_notes.add_guess((*CHANNELS_KEY, name), reason)
-        channels[name] = {"topic": topic, "field": field, **scaling.settings, "hold": True}
+        key = (*CHANNELS_KEY, name)
+        _, entry = match_known_command(aligned[0], topic, field) or ("", {})
+        if entry:
+            draft_notes.add_note(key, f"the format defines {field} in {entry['unit']}")
+        else:
+            values = concatenate_field(aligned, topic, field)
+            scaling = guess_scaling(name, field, values) or infer_unit(name, field, values)
+            entry = scaling.settings
+            reasons = filter(None, ("taken by its name", scaling.reason))
+            draft_notes.add_guess(key, "; ".join(reasons))
+        channels[name] = {"topic": topic, "field": field, **entry, "hold": True}
     return settings | ({"channels": channels} if channels else {}), recordings
-
-
-def _choose_motion_sources(
-    recordings: Sequence[Recording],
-    log: Log | None,
-    standard_sources: MotionSources,
-    draft_notes: DraftNotes,
-) -> MotionSources:
-    """Return the sources of position and heading: named fields, or the standard messages.
-
-    Args:
-        recordings: recordings with aligned clocks.
-        log: log of the first recording from its standard messages; None if they are not sufficient.
-        standard_sources: fields of the standard messages.
-        draft_notes: receives guesses and notes.
-    """
-    has_pose = log is not None and {"x", "y", "psi"} <= log.channels.keys()
-    needs_pose = log is None or not has_pose or not _is_consistent(log)
-    return find_named_table(recordings, draft_notes, needs_pose=needs_pose) or standard_sources
 
 
 def _is_consistent(log: Log) -> bool:
