@@ -239,7 +239,7 @@ def _append_units(table: pd.DataFrame) -> dict[str, str]:
     cell_units = table.attrs.get("units", ())
     names = [str(name).strip() for name in table.columns]
     unit_rows = [
-        [parse_unit_cell(cell) for cell in row] for row in table.attrs.get("unit_rows", [])
+        [_parse_unit_cell(cell) for cell in row] for row in table.attrs.get("unit_rows", [])
     ]
     units = max(unit_rows, key=lambda row: sum(map(bool, row)), default=[])
     units = units if 2 * sum(map(bool, units)) >= len([name for name in names if name]) else []
@@ -249,7 +249,7 @@ def _append_units(table: pd.DataFrame) -> dict[str, str]:
         # notation of physics: a quantity divided by its unit, `u / m/s`
         match = _NAME_OVER_UNIT.fullmatch(name)
         bare_name, unit = (
-            (match["name"], parse_unit_cell(match["unit"])) if match else (name, unit_below)
+            (match["name"], _parse_unit_cell(match["unit"])) if match else (name, unit_below)
         )
         original_names[
             f"{bare_name} [{unit}]" if unit and not _OPENING_BRACKET.search(name) else name
@@ -257,7 +257,7 @@ def _append_units(table: pd.DataFrame) -> dict[str, str]:
     return original_names
 
 
-def parse_unit_cell(cell: str) -> str:
+def _parse_unit_cell(cell: str) -> str:
     """Return the unit in a cell below a column name, or an empty string."""
     unit = cell.strip(" []()")
     return unit if is_unit(unit) else ""
@@ -286,10 +286,9 @@ def _preview_excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]
     Further sheets of the same recording are joined.
     """
     names = list_sheet_names(path)
-    if list_joined_sheets(path):
-        tables = {name: read_excel_sheet(path, name, rows) for name in names}
-        return join_excel_sheets(path, tables), {"kind": "excel"}
     tables = {name: read_excel_sheet(path, name, rows) for name in names}
+    if list_joined_sheets(path):
+        return join_excel_sheets(path, tables), {"kind": "excel"}
     numeric_sheets = [
         n for n, table in tables.items() if len(table.select_dtypes("number").columns) > 1
     ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -42,7 +41,7 @@ from residnet.io.drafting.table_clock import (
     detect_or_ask_clock,
     make_step_clock,
 )
-from residnet.io.drafting.table_preview import TablePreview, parse_unit_cell, preview_named_tables
+from residnet.io.drafting.table_preview import TablePreview, preview_named_tables
 from residnet.io.drafting.vessel_rows import (
     drop_ais_turn_rate,
     match_columns_of_one_vessel,
@@ -284,8 +283,6 @@ def _suggest_table_fix(
             " pandas.concat({file.stem: pandas.read_csv(file, index_col=0).iloc[:, 0] for file in"
             " files}, axis=1).sort_index().to_csv('log.csv')"
         )
-    if all(parse_unit_cell(re.sub(r"\.\d+$", "", name)) for name in numeric_columns):
-        return "these are units: write each column's name in a cell above its unit, or before it"
     return (
         "rename them in the line of names, for example to x [m], y [m], psi [deg], u [m/s],"
         " r [deg/s], rudder [deg], rpm"
