@@ -149,13 +149,14 @@ def _convert_entries(
             settings[section] |= {key: field for key, (_, field) in zip(keys, fields, strict=True)}
     attitude = {name: entries.pop(name) for name in ("psi", *QUATERNION) if name in entries}
     fields = [sources[entry["column"]] for entry in attitude.values()]
-    frame = {"frame": attitude.get("psi", attitude.get("qw", {})).get("frame", "ned")}
     if "psi" in attitude:
-        heading = {"kind": "angle", "field": fields[0][1], "unit": attitude["psi"]["unit"]}
+        heading = {"kind": "angle", "topic": fields[0][0], "field": fields[0][1]}
+        heading["unit"] = attitude["psi"]["unit"]
     else:
-        heading = {"kind": "quaternion", "field": [field for _, field in fields]}
-        heading["roll"] = len(attitude) == len(QUATERNION)
-    settings["heading"] = {"topic": fields[0][0], **heading, **frame}
+        heading = {"kind": "quaternion", "topic": fields[0][0]}
+        heading |= {"field": [field for _, field in fields], "roll": len(fields) == len(QUATERNION)}
+    frame = attitude.get("psi", attitude.get("qw", {})).get("frame", "ned")
+    settings["heading"] = {**heading, "frame": frame}
     settings["channels"] = {}
     for name, entry in entries.items():
         topic, field = sources[entry.pop("column")]
