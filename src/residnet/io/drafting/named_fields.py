@@ -149,12 +149,12 @@ def _convert_entries(
             settings[section] |= {key: field for key, (_, field) in zip(keys, fields, strict=True)}
     attitude = {name: entries.pop(name) for name in ("psi", *QUATERNION) if name in entries}
     fields = [sources[entry["column"]] for entry in attitude.values()]
+    heading: dict[str, Any] = {"kind": "angle", "topic": fields[0][0], "field": fields[0][1]}
     if "psi" in attitude:
-        heading = {"kind": "angle", "topic": fields[0][0], "field": fields[0][1]}
         heading["unit"] = attitude["psi"]["unit"]
     else:
-        heading = {"kind": "quaternion", "topic": fields[0][0]}
-        heading |= {"field": [field for _, field in fields], "roll": len(fields) == len(QUATERNION)}
+        heading |= {"kind": "quaternion", "field": [field for _, field in fields]}
+        heading["roll"] = len(fields) == len(QUATERNION)
     frame = attitude.get("psi", attitude.get("qw", {})).get("frame", "ned")
     settings["heading"] = {**heading, "frame": frame}
     settings["channels"] = {}
