@@ -14,7 +14,6 @@ from residnet.core.errors import ConfigError, DataError, ResidnetError, UsageErr
 from residnet.core.log import Log
 from residnet.core.units import to_si
 from residnet.io.drafting.column_names import match_channels
-from residnet.io.drafting.force_columns import find_wrench_columns
 from residnet.io.drafting.problems import (
     UnreadableLogsError,
     group_problems,
@@ -251,26 +250,6 @@ def test_lateral_is_no_latitude_in_a_velocity() -> None:
     assert find_earth_velocities(["vn_cms", "ve_cms"]) == ("vn_cms", "ve_cms")
     assert parse_header_unit("vn_cms", "m/s") == "cm/s"
     assert parse_header_unit("gz_mrad", "rad/s") == "mrad/s"
-
-
-@pytest.mark.parametrize(
-    ("columns", "expected"),
-    [
-        (
-            ["force.x", "force.y", "force.z", "torque.x", "torque.z"],
-            {"force.x": "tau_x", "force.y": "tau_y", "torque.z": "tau_n"},
-        ),
-        (
-            ["wrench_force_x", "wrench_moment_z"],
-            {"wrench_force_x": "tau_x", "wrench_moment_z": "tau_n"},
-        ),
-        # one part alone may be a load cell, and a thruster acts on a part of the vessel
-        (["force_x", "speed"], {}),
-        (["thruster force x", "thruster force y"], {}),
-    ],
-)
-def test_columns_of_a_wrench(columns: list[str], expected: dict[str, str]) -> None:
-    assert find_wrench_columns(columns) == expected
 
 
 def test_folders_of_one_file_each_are_no_manoeuvres(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from residnet.core.names import CHANNEL_UNITS, get_si_unit
-from residnet.io.drafting.force_columns import find_wrench_columns, match_force_column
+from residnet.io.drafting.force_columns import match_force_column
 from residnet.io.drafting.motion_columns import MAGNETIC_PATTERN, MOTION_AND_WIND_CHANNELS
 from residnet.io.drafting.questions import CHANNELS_KEY, DraftNotes
 from residnet.io.header_vocabulary import (
@@ -175,7 +175,6 @@ def _assign_columns(
     duplicates: dict[str, list[str]] = {}
     speeds: list[str] = []
     side_velocities = _match_shaft_speeds(parsed_names)
-    wrench = find_wrench_columns(columns)
 
     def sort_key(column: str) -> tuple[bool, bool, int]:
         is_magnetic = (
@@ -191,7 +190,7 @@ def _assign_columns(
     # precedence: true before magnetic headings, then canonical names (`u` before `vx`), then names
     # with fewer concepts (`heading` before `heading of the second compass`)
     for column in sorted(columns, key=sort_key):
-        force = match_force_column(column) or wrench.get(column)
+        force = match_force_column(column)
         name = side_velocities.get(column) or _match_name(column, parsed_names[column])
         if not force and name is None:
             continue

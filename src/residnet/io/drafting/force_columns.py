@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import si_unit
@@ -17,34 +16,6 @@ _FORCE_AXES = {
     "N m": dict.fromkeys(("r", "n", "z", "yaw", "psi"), "tau_n"),
 }
 """SI unit of a force or moment -> last word of a name -> channel."""
-_WRENCH_PATTERN = re.compile(
-    r"(?P<stem>(?:.*[\W_])?)(?P<quantity>force|torque|moment)s?[\W_]*(?P<axis>[xyz])"
-    r"(?:[\W_]*\[.*\])?",
-    re.IGNORECASE,
-)
-_WRENCH_AXES = {("force", "x"): "tau_x", ("force", "y"): "tau_y", ("moment", "z"): "tau_n"}
-_MIN_WRENCH_PARTS = 2
-"""Fewest parts by which a force and a moment are those of the vessel, not of one load cell."""
-
-
-def find_wrench_columns(columns: Sequence[str]) -> dict[str, str]:
-    """Return column -> channel of the forces and the moment on a vessel, such as `force.x`.
-
-    Columns of one stem are a wrench. Forces of thrusters, rudders and wind are no total forces.
-    """
-    groups: dict[str, dict[str, str]] = {}
-    for column in columns:
-        match = _WRENCH_PATTERN.fullmatch(column.strip())
-        if match is None or not parse_name(column).has_none(*_PARTIAL_FORCES):
-            continue
-        quantity = "force" if match["quantity"].lower() == "force" else "moment"
-        channel = _WRENCH_AXES.get((quantity, match["axis"].lower()))
-        if channel is not None:
-            groups.setdefault(match["stem"].lower(), {}).setdefault(channel, column)
-    complete = [group for group in groups.values() if len(group) >= _MIN_WRENCH_PARTS]
-    return {column: channel for channel, column in complete[0].items()} if complete else {}
-
-
 _PARTIAL_FORCES = (
     "wind",
     "thrust",
