@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.errors import ResidnetError
 from residnet.io.drafting.motion_regression import RawTable, estimate_rudder_gain
-from residnet.io.drafting.motion_sources import extract_pose
 from residnet.io.drafting.questions import CHANNELS_KEY, DraftNotes
 from residnet.io.header_vocabulary import MOTION_CHANNELS, match_input_channel, parse_name
+from residnet.io.readers.compose import extract_heading
 from residnet.io.readers.messages import KNOWN_COMMANDS
 from residnet.io.readers.quantities import ChannelPlan
 from residnet.io.readers.recording import Recording
@@ -114,7 +115,7 @@ def _find_followed_field(
 ) -> tuple[str, str]:
     """Return which of the commands of one rudder by several topics the vessel follows.
 
-    It is the one with the most significant effect on the yaw rate; without a pose the first one.
+    It is the one with the most significant effect on the yaw rate; without a heading the first one.
 
     Args:
         channel: channel of the rudder.
@@ -123,17 +124,18 @@ def _find_followed_field(
         plan: sources of position and heading by standard messages.
         draft_notes: receives the guess.
     """
-    pose = None
-    if plan.position is not None and plan.heading is not None:
-        pose = extract_pose(recording, plan.position, plan.heading)
-    if pose is None:
+    if plan.heading is None:
         return fields[0]
-    yaw_rate = np.gradient(pose.columns["psi"], pose.t)
+    try:
+        log = extract_heading(recording, plan.heading).log
+    except ResidnetError:
+        return fields[0]
+    yaw_rate = np.gradient(log["psi"], log.t)
     significances = {}
     for topic, field in fields:
         series = recording.series[topic]
-        rows = np.maximum(np.searchsorted(series.clock, pose.t, side="right") - 1, 0)
-        table = RawTable(pose.t, {channel: series[field][rows]})
+        rows = np.maximum(np.searchsorted(series.clock, log.t, side="right") - 1, 0)
+        table = RawTable(log.t, {channel: series[field][rows]})
         gain, standard_error = estimate_rudder_gain([table], channel, {0: yaw_rate})
         significances[topic, field] = abs(gain) / standard_error
     followed = max(fields, key=lambda source: significances[source])

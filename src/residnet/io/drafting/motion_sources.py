@@ -7,11 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.errors import ResidnetError
-from residnet.io.drafting.motion_regression import RawTable
-from residnet.io.readers.compose import extract_heading, extract_position
-from residnet.io.readers.quantities import HeadingConfig, PositionConfig
-from residnet.io.readers.recording import Recording, Series
+from residnet.io.readers.recording import Series
 
 MIN_MOTION_ROWS = 50
 """Smallest number of rows of a topic with motion."""
@@ -33,35 +29,5 @@ class MotionSources:
 
 
 def median_series_step(series: Series) -> float:
+    """Return the median step of a series in s; infinite for a single row."""
     return float(np.median(np.diff(series.clock))) if len(series) > 1 else float("inf")
-
-
-def extract_pose(
-    recording: Recording, position: PositionConfig, heading: HeadingConfig
-) -> RawTable | None:
-    """Return north, east and heading at the times of the positions, or None.
-
-    None means that a source cannot be read, the clocks do not overlap, or the heading is constant.
-    """
-    try:
-        position_log = extract_position(recording, position).log
-        heading_log = extract_heading(recording, heading).log
-    except ResidnetError:
-        return None
-    is_finite = np.isfinite(heading_log["psi"])
-    # with a constant heading, velocities in body axes and in earth axes are equally consistent
-    if is_finite.sum() < MIN_MOTION_ROWS or float(np.ptp(heading_log["psi"][is_finite])) < 0.3:
-        return None
-    if heading_log.t[-1] < position_log.t[0] or heading_log.t[0] > position_log.t[-1]:
-        return None
-    heading_at_positions = np.interp(
-        position_log.t,
-        heading_log.t[is_finite],
-        heading_log["psi"][is_finite],
-        left=np.nan,
-        right=np.nan,
-    )
-    return RawTable(
-        position_log.t,
-        {"x": position_log["x"], "y": position_log["y"], "psi": heading_at_positions},
-    )
