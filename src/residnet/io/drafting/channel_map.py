@@ -13,9 +13,11 @@ from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import to_si
 from residnet.io.drafting.channels import QUATERNION_HEADING, ChannelMapper
 from residnet.io.drafting.drift_angle import derive_drift_velocities, restore_drift_angle
+from residnet.io.drafting.motion_columns import is_vertical_axis_up
 from residnet.io.drafting.motion_regression import POSE_FRAMES, ROS_POSE_FRAMES, PoseFrame, RawTable
 from residnet.io.drafting.questions import CHANNELS_KEY, DraftNotes
 from residnet.io.drafting.vertical import project_on_horizontal
+from residnet.io.header_vocabulary import match_state_channel, parse_name
 from residnet.io.readers.quantities import (
     COSINE_SUFFIX,
     QUATERNION,
@@ -68,8 +70,6 @@ def draft_channel_map(
     logs: Sequence[RawTable],
     draft_notes: DraftNotes,
     texts: Iterable[str] = (),
-    *,
-    is_up_positive: bool = False,
 ) -> dict[str, dict[str, Any]]:
     """Draft a channel map.
 
@@ -78,13 +78,15 @@ def draft_channel_map(
         logs: tables with the columns under the names of their channels.
         draft_notes: receives guesses and notes.
         texts: names of all columns, and cells, which may contain the name of a frame.
-        is_up_positive: whether the vertical axis of the frame points up, see `is_vertical_axis_up`.
 
     Returns:
         Channel -> entry.
     """
     quaternion_columns = {name: column for name, column in names.items() if name in QUATERNION}
-    candidate_frames = ROS_POSE_FRAMES if is_up_positive else _choose_candidate_frames(names, texts)
+    candidate_frames = _choose_candidate_frames(names, texts)
+    depths = np.concatenate([raw.columns.get("z", np.zeros(0)) for raw in logs])
+    if quaternion_columns and is_vertical_axis_up(depths):
+        candidate_frames = ROS_POSE_FRAMES
     channel_columns = {name: column for name, column in names.items() if name not in QUATERNION}
     # replace sines and cosines, and quaternions, by their angles while frames are determined
     angle_columns = {}
@@ -201,18 +203,21 @@ def _drop_surface_heave(
         if "theta" in channels:
             channels["theta"] = vertical_sign * channels["theta"]
             is_submerged |= DegreesOfFreedom.from_channels(channels).is_six_dof
-    left_out = {"phi", "theta"} | ({"w"} if is_earth_fixed else set())
-    if not is_submerged:
-        left_out |= {"z", "w", "q", "p"}
-        columns = ", ".join(
-            entry["column"] for name, entry in entries.items() if name in {"z", "w", "q", "p"}
-        )
+    heave_columns = {
+        name: entry["column"]
+        for name, entry in entries.items()
+        # a roll rate is a channel of surface vessels too
+        if name in ("z", "w", "q", "p")
+        and match_state_channel(parse_name(entry["column"])) != name
+        and not is_submerged
+    }
+    if heave_columns:
         text = (
-            f"{columns}: known and not used, a surface vessel is assumed because the depth does not"
-            " follow from the motion; a vessel that heaves needs velocities, for example columns"
-            " u, v, w along its axes"
+            f"{', '.join(heave_columns.values())}: known and not used, a surface vessel is assumed"
+            " because the depth does not follow from the motion"
         )
         draft_notes.add_note(CHANNELS_KEY, text)
+    left_out = {"phi", "theta", *heave_columns, *(["w"] if is_earth_fixed else [])}
     for name in left_out & entries.keys():
         draft_notes.discard_key((*CHANNELS_KEY, name))
     return {name: entry for name, entry in entries.items() if name not in left_out}
@@ -242,15 +247,12 @@ def _project_fixes(
         return dict(names), list(logs), 0.0
     fix_tables = [raw for raw in logs if fix_channels <= set(raw.columns)]
     fix_values = {
-        fix_name: np.concatenate([raw.columns[fix_name] for raw in fix_tables] or [np.zeros(0)])
-        for fix_name in fix_channels
+        name: np.concatenate([np.zeros(0), *(raw.columns[name] for raw in fix_tables)])
+        for name in fix_channels
     }
-    finite_values = {name: values[np.isfinite(values)] for name, values in fix_values.items()}
-    max_latitude = float(np.abs(finite_values["latitude"]).max(initial=0.0))
+    max_latitude = float(np.nanmax(np.abs(fix_values["latitude"]), initial=0.0))
     # autopilots log latitude and longitude as integers in 1e-7 deg
-    are_integers = all(
-        bool((values == np.round(values)).all()) for values in finite_values.values()
-    )
+    are_integers = not any((np.nan_to_num(part) % 1.0).any() for part in fix_values.values())
     degrees_per_count = 1e-7 if 1e6 < max_latitude <= 90e7 and are_integers else 1.0
     if not fix_tables or max_latitude * degrees_per_count > 90.0:
         columns = ", ".join(names[name] for name in _FIX_OF_AXIS.values())

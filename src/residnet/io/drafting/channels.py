@@ -6,12 +6,14 @@ the heading. Columns are regressed on these quantities to determine their factor
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
 
+from residnet.core.errors import DataError
 from residnet.core.frames import rotate
 from residnet.core.names import BOW_WIND_CHANNELS, CHANNEL_UNITS, port_starboard_pairs
 from residnet.core.units import to_si
@@ -37,6 +39,7 @@ from residnet.io.drafting.velocities import (
     BODY_AXES,
     EARTH_AXES,
     EXCHANGED_EARTH_AXES,
+    MAX_CONTRADICTION,
     HeadingOffset,
     Meaning,
     MeaningChoice,
@@ -44,7 +47,6 @@ from residnet.io.drafting.velocities import (
     choose_meaning,
     estimate_drift_free_offset,
     measure_contradiction,
-    require_compatible,
 )
 from residnet.io.header_vocabulary import (
     Scaling,
@@ -131,12 +133,15 @@ class ChannelMapper:
                 velocity_name for velocity_name in ("u", "v", "r") if velocity_name in self._names
             ]:
                 self._drop_constant_velocity(name)
-            self._require_compatible_velocities()
         elif "psi" in self._names:
             self._psi_unit = self._infer_unit("psi")
             self._is_earth_fixed = self._is_named_earth_fixed
         self._choose_wind_reference()
         entries = {name: self._make_entry(name) for name in self._names}
+        if {"x", "y", "psi"} <= entries.keys():
+            self._require_compatible_velocities(entries)
+        if "psi" in entries and MAGNETIC_PATTERN.search(self._names["psi"]):
+            entries["psi"] |= self._correct_magnetic_heading(self._names["psi"])
         for force, velocity in (("tau_y", "v"), ("tau_n", "r")):
             # forces have the same axes as the velocities of the file
             is_reversed = entries.get(velocity, {}).get("sign") == -1
@@ -319,9 +324,9 @@ class ChannelMapper:
                     self._draft_notes.add_guess((*CHANNELS_KEY, name), text)
             return
         if "speed" in meaning.components:
-            name = ("u", "v")[meaning.components.index("speed")]
-            column = self._names.pop(name)
-            text = f"'{column}' is left out, {name} is derived from positions: {choice.text}"
+            text = (
+                f"'{self._names.pop('v')}' is left out, v is derived from positions: {choice.text}"
+            )
             self._draft_notes.add_note(CHANNELS_KEY, text)
             return
         if meaning == EXCHANGED_EARTH_AXES:
@@ -409,28 +414,42 @@ class ChannelMapper:
         u, v = rotate(north, east, -heading)
         return RawTable(table.t, {**table.columns, "u": u, "v": v})
 
-    def _require_compatible_velocities(self) -> None:
-        """Stop where integrated velocities contradict the positions."""
-        if not {"u", "v"} <= self._names.keys():
+    def _require_compatible_velocities(self, entries: Mapping[str, Mapping[str, Any]]) -> None:
+        """Estimate the offset of the heading; stop where velocities contradict the positions.
+
+        Args:
+            entries: channel -> entry, with units and signs of u and v.
+
+        Raises:
+            DataError: if integrated velocities leave the positions by a tenth of the distance.
+        """
+        names = ("u", "v")
+        if not {*names} <= entries.keys():
             self._heading_offset = estimate_drift_free_offset(
                 self.measure_velocities((), self._logs)
             )
             return
-        tables = []
-        for table in self._logs:
-            columns = dict(table.columns)
-            for name, fit in ((n, self._fit_velocity(n)) for n in ("u", "v")):
-                unit = parse_header_unit(self._names[name], "m/s") or fit.matching_unit("m/s")
-                factor = to_si(unit) if unit else 1.0
-                sign = -1.0 if fit.is_significant and fit.factor < 0.0 else 1.0
-                if name in columns:
-                    columns[name] = sign * factor * columns[name]
-            tables.append(RawTable(table.t, columns))
-        logs = self.measure_velocities(("u", "v"), tables)
+        factors = {
+            name: entries[name].get("sign", 1) * to_si(entries[name]["unit"]) for name in names
+        }
+        logs = [
+            dataclasses.replace(
+                log, columns={name: factors[name] * part for name, part in log.columns.items()}
+            )
+            for log in self.measure_velocities(names, self._logs)
+        ]
         contradiction = measure_contradiction(logs)
-        if contradiction is not None:
-            require_compatible(contradiction, [self._names[name] for name in ("u", "v")])
-            self._heading_offset = contradiction.heading_offset
+        if contradiction is None:
+            return
+        self._heading_offset = contradiction.heading_offset
+        if contradiction.share > MAX_CONTRADICTION:
+            raise DataError(
+                f"the velocities {' and '.join(self._names[name] for name in names)}, integrated,"
+                f" differ from the positions by {100.0 * contradiction.share:.0f} % of the distance"
+                f" travelled (at most {100.0 * MAX_CONTRADICTION:.0f} % is possible); no heading"
+                " offset, scale, current or frame explains it: these channels are not one motion;"
+                " check units and clocks, or delete these columns in the files"
+            )
 
     def _score_consistency(self, motions: Sequence[Motion | None]) -> float:
         """Return the consistency of position, heading and velocities, at most 1."""
@@ -587,8 +606,6 @@ class ChannelMapper:
                 | ({"scale": self._degrees_per_count} if self._degrees_per_count < 1.0 else {})
             )
         if name == "psi":
-            if MAGNETIC_PATTERN.search(column):
-                entry |= self._correct_magnetic_heading(column)
             entry["unit"] = self._psi_unit
             entry |= {"sign": -1} if "psi" in self._sign_flipped else {}
             return entry | ({"frame": "enu"} if self._pose_frame.is_from_east else {})

@@ -106,27 +106,13 @@ _MIN_SUBMERGED_DEPTH = 0.1
 """Smallest depth in m of its median, so that a vessel at the surface does not count as diving."""
 
 
-def is_vertical_axis_up(
-    columns: Sequence[str],
-    known_channels: Collection[str],
-    tables: Sequence[Mapping[str, np.ndarray]],
-) -> bool:
-    """Return whether an underwater vessel's vertical position is negative, and so points up.
-
-    Args:
-        columns: names of the columns of numbers.
-        known_channels: channels that are mapped already; only a quaternion depends on the axis.
-        tables: column -> values of each table.
-    """
-    if "qw" not in known_channels:
-        return False
-    column = next((name for name in columns if match_depth_channel(parse_name(name)) == "z"), None)
-    values = np.concatenate([table.get(column or "", np.zeros(0)) for table in tables])
-    values = values[np.isfinite(values)]
+def is_vertical_axis_up(depths: np.ndarray) -> bool:
+    """Return whether the vertical axis of depths [T] points up: those of a diver are negative."""
+    depths = depths[np.isfinite(depths)]
     return bool(
-        values.size
-        and float((values < 0.0).mean()) > _MIN_SUBMERGED_SHARE
-        and float(np.median(values)) < -_MIN_SUBMERGED_DEPTH
+        depths.size
+        and float((depths < 0.0).mean()) > _MIN_SUBMERGED_SHARE
+        and float(np.median(depths)) < -_MIN_SUBMERGED_DEPTH
     )
 
 

@@ -190,42 +190,33 @@ def fit_to_motion(
         channel: `u`, `v` or `r`.
     """
     component_index = {"u": 1, "v": 2, "r": 3}[channel]
-    covariance_sum = correlation_sum = column_sum = motion_sum = 0.0
-    for table, log_motion in zip(logs, motions, strict=True):
+    products = [np.zeros((2, 2))]
+    for table, motion in zip(logs, motions, strict=True):
         values = table.columns.get(channel)
-        if log_motion is None or values is None:
+        if motion is None or values is None:
             continue
         is_finite = np.isfinite(values) & np.isfinite(table.t)
         if is_finite.sum() < 30:
             continue
-        column_values = np.interp(log_motion.t, table.t[is_finite], values[is_finite])
-        motion_values = log_motion[component_index]
+        column = np.interp(motion.t, table.t[is_finite], values[is_finite])
+        pair = np.stack((column, motion[component_index]))
         # exclude jumps of positions and headings
-        is_plausible = (
-            np.abs(motion_values) <= 5.0 * float(np.quantile(np.abs(motion_values), 0.95)) + 1e-12
-        )
+        size = np.abs(pair[1])
+        pair = pair[:, size <= 5.0 * float(np.quantile(size, 0.95)) + 1e-12]
         # v and r are centred, so that a bias has no effect; u is not, because a steady speed
         # determines its factor
-        column_mean = 0.0 if channel == "u" else float(column_values[is_plausible].mean())
-        motion_mean = 0.0 if channel == "u" else float(motion_values[is_plausible].mean())
-        column_centred = column_values[is_plausible] - column_mean
-        motion_centred = motion_values[is_plausible] - motion_mean
-        covariance_sum += float(column_centred @ motion_centred)
-        # the sign of r may differ between logs, if a gyro was turned over
-        correlation_sum += (
-            abs(float(column_centred @ motion_centred))
-            if channel == "r"
-            else float(column_centred @ motion_centred)
-        )
-        column_sum += float(column_centred @ column_centred)
-        motion_sum += float(motion_centred @ motion_centred)
-    if min(column_sum, motion_sum) <= 0.0:
+        if channel != "u":
+            pair = pair - pair.mean(axis=1, keepdims=True)
+        products.append(pair @ pair.T)
+    (column_energy, covariance), (_, motion_energy) = np.sum(products, axis=0)
+    if min(column_energy, motion_energy) <= 0.0:
         return ScaleFit(0.0, 0.0)
+    # the sign of r may differ between logs, if a gyro was turned over
+    covariances = [product[0, 1] for product in products]
+    explained = np.abs(covariances).sum() if channel == "r" else abs(covariance)
     # both quantities are noisy: geometric mean of the factors of both regressions
-    correlation = correlation_sum / np.sqrt(column_sum * motion_sum)
-    return ScaleFit(
-        float(np.sign(covariance_sum) * np.sqrt(motion_sum / column_sum)), abs(float(correlation))
-    )
+    factor = float(np.sign(covariance) * np.sqrt(motion_energy / column_energy))
+    return ScaleFit(factor, float(explained / np.sqrt(column_energy * motion_energy)))
 
 
 def fit_rate_to_angle(
@@ -278,44 +269,27 @@ def estimate_rudder_gain(
     """
     rows = []
     rate_changes = []
-    for log_index, table in enumerate(logs):
-        values = table.columns.get(channel)
-        rate_values = rates.get(log_index)
-        if values is None or rate_values is None:
+    for number, table in enumerate(logs):
+        if channel not in table.columns or number not in rates:
             continue
-        restoring_angle = (
-            np.zeros(table.t.size) if angle_column is None else table.columns[angle_column]
-        )
-        is_finite = (
-            np.isfinite(values)
-            & np.isfinite(rate_values)
-            & np.isfinite(table.t)
-            & np.isfinite(restoring_angle)
-        )
-        if is_finite.sum() < 50:
+        tilt = np.zeros(table.t.size) if angle_column is None else table.columns[angle_column]
+        samples = np.stack((table.t, table.columns[channel], rates[number], tilt))
+        samples = samples[:, np.isfinite(samples).all(axis=0)]
+        if samples.shape[1] < 50:
             continue
-        t = remove_pauses(table.t[is_finite])
-        rudder_angles = values[is_finite]
-        rates_finite = rate_values[is_finite]
+        t = remove_pauses(samples[0])
+        _, rudder_angle, rate, tilt = samples
         horizon = max(2.0, 3.0 * float(np.median(np.diff(t))))
         start_times = np.arange(t[0], t[-1] - horizon, horizon / 4)
         if start_times.size < 10:
             continue
-        initial_rate = np.interp(start_times, t, rates_finite)
-        final_rate = np.interp(start_times + horizon, t, rates_finite)
-        mean_rudder_angle = np.mean(
-            [
-                np.interp(start_times + share * horizon, t, rudder_angles)
-                for share in (0.0, 0.25, 0.5, 0.75)
-            ],
-            0,
-        )
-        tilt_angle = np.interp(start_times, t, restoring_angle[is_finite])
-        rows.append(
-            np.stack(
-                (mean_rudder_angle, initial_rate, np.ones(start_times.size), tilt_angle), axis=1
-            )
-        )
+        initial_rate = np.interp(start_times, t, rate)
+        final_rate = np.interp(start_times + horizon, t, rate)
+        times_of_mean = start_times + horizon * np.array([[0.0], [0.25], [0.5], [0.75]])
+        mean_rudder_angle = np.interp(times_of_mean, t, rudder_angle).mean(axis=0)
+        initial_tilt = np.interp(start_times, t, tilt)
+        ones = np.ones(start_times.size)
+        rows.append(np.stack((mean_rudder_angle, initial_rate, ones, initial_tilt), axis=1))
         rate_changes.append(final_rate - initial_rate)
     if not rows:
         return 0.0, 1.0

@@ -25,7 +25,6 @@ from residnet.io.drafting.motion_columns import (
     find_depth_channels,
     find_quaternions,
     find_sin_cos_pairs,
-    is_vertical_axis_up,
 )
 from residnet.io.drafting.motion_regression import RawTable
 from residnet.io.drafting.questions import (
@@ -185,7 +184,6 @@ def draft_columns(
         mapped_logs,
         draft_notes,
         texts,
-        is_up_positive=is_vertical_axis_up(simple_columns, names, tables),
     )
     return names, entries
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-
-from residnet.core.errors import DataError
 
 MAX_CONTRADICTION = 0.1
 """Largest share of the distance by which integrated velocities may leave the positions."""
@@ -45,9 +42,7 @@ BODY_AXES = Meaning(("surge", "sway"), "velocities in body axes")
 EARTH_AXES = Meaning(("north", "east"), "velocities in earth axes, north and east")
 EXCHANGED_EARTH_AXES = Meaning(("east", "north"), "velocities in earth axes, east and north")
 SPEED_AS_V = Meaning(("surge", "speed"), "v is the speed")
-SPEED_AS_U = Meaning(("speed", "sway"), "u is the speed")
 _PAIR_MEANINGS = (BODY_AXES, EARTH_AXES, EXCHANGED_EARTH_AXES, SPEED_AS_V)
-_SINGLE_MEANINGS = {"u": (BODY_AXES,), "v": (BODY_AXES, SPEED_AS_V)}
 
 
 @dataclass(frozen=True)
@@ -101,14 +96,14 @@ def choose_meaning(logs: Sequence[MeasuredVelocities]) -> MeaningChoice:
         logs: logs with the same columns, at least one.
     """
     names = [name for name in ("u", "v") if name in logs[0].columns]
-    meanings = _PAIR_MEANINGS if len(names) == 2 else _SINGLE_MEANINGS[names[0]]
+    meanings = _PAIR_MEANINGS if len(names) == 2 else (BODY_AXES, SPEED_AS_V)
     shares = {
         meaning: compute_unexplained_share(logs, names, meaning.components) for meaning in meanings
     }
     ranking = sorted(shares, key=lambda meaning: shares[meaning])
     best = ranking[0]
     if (
-        len(meanings) < 2
+        "v" not in names
         or best == BODY_AXES
         or shares[BODY_AXES] < _CONSISTENT_SHARE
         or shares[best] > min(_MAX_UNEXPLAINED_SHARE, _MAX_SHARE_RATIO * shares[BODY_AXES])
@@ -216,36 +211,33 @@ def measure_contradiction(logs: Sequence[MeasuredVelocities]) -> Contradiction |
     Returns:
         The difference; None without windows in motion.
     """
-    displacements: list[complex] = []
-    integrals: list[complex] = []
-    rotations: list[complex] = []
-    durations: list[float] = []
-    log_numbers: list[int] = []
+    windows = [np.zeros((5, 0), dtype=np.complex128)]
     for number, log in enumerate(logs):
         velocity = (log.columns["u"] + 1j * log.columns["v"]) * np.exp(1j * log.heading)
         track = log.position[:, 0] + 1j * log.position[:, 1]
-        bounds = np.linspace(0, log.t.size - 1, _N_WINDOWS + 1).astype(int)
-        dt = np.diff(log.t)
         axis = np.exp(1j * log.heading)
-        increments = 0.5 * dt * (velocity[1:] + velocity[:-1])
-        jumps = np.flatnonzero(_is_jump(np.diff(track), increments))
-        for first, last in itertools.pairwise(bounds.tolist()):
-            integral = increments[first:last].sum()
-            displacement = track[last] - track[first]
-            has_jump = bool(((jumps >= first) & (jumps < last)).any())
-            if np.isfinite(integral + displacement) and last > first and not has_jump:
-                displacements.append(displacement)
-                integrals.append(integral)
-                rotations.append(axis[last] - axis[first])
-                durations.append(log.t[last] - log.t[first])
-                log_numbers.append(number)
-    distance = float(np.abs(displacements).sum()) if displacements else 0.0
-    if len(displacements) < _N_WINDOWS or distance <= 0.0:
+        increments = 0.5 * np.diff(log.t) * (velocity[1:] + velocity[:-1])
+        is_jump = _is_jump(np.diff(track), increments)
+        bounds = np.unique(np.linspace(0, log.t.size - 1, _N_WINDOWS + 1).astype(int))
+        window = np.stack(
+            (
+                np.diff(track[bounds]),
+                np.add.reduceat(increments, bounds[:-1]),
+                np.diff(axis[bounds]),
+                np.diff(log.t[bounds]),
+                np.full(bounds.size - 1, number),
+            )
+        )
+        is_usable = np.isfinite(window).all(axis=0)
+        is_usable &= ~np.logical_or.reduceat(is_jump, bounds[:-1])
+        windows.append(window[:, is_usable])
+    response, integrals, rotations, durations, numbers = np.concatenate(windows, axis=1)
+    distance = float(np.abs(response).sum())
+    if response.size < _N_WINDOWS or distance <= 0.0:
         return None
-    response = np.array(displacements)
     columns = np.zeros((response.size, 2 + len(logs)), dtype=np.complex128)
     columns[:, 0] = integrals
-    columns[np.arange(response.size), 1 + np.array(log_numbers)] = durations
+    columns[np.arange(response.size), 1 + numbers.real.astype(int)] = durations
     columns[:, -1] = rotations
     solution = np.linalg.lstsq(columns, response, rcond=1e-10)[0]
     residual = response - columns @ solution
@@ -295,23 +287,3 @@ def estimate_drift_free_offset(logs: Sequence[MeasuredVelocities]) -> HeadingOff
     standard_error = float(np.std(angles) / np.sqrt(max(angles.size - 1, 1)))
     source = "if the mean drift angle is zero"
     return HeadingOffset(-float(np.angle(total)), standard_error, source)
-
-
-def require_compatible(contradiction: Contradiction, columns: Sequence[str]) -> None:
-    """Stop if integrated velocities leave the positions.
-
-    Args:
-        contradiction: contradiction of the logs.
-        columns: names of the columns of the velocities.
-
-    Raises:
-        DataError: if the share exceeds a tenth of the distance.
-    """
-    if contradiction.share > MAX_CONTRADICTION:
-        raise DataError(
-            f"the velocities {' and '.join(columns)}, integrated, differ from the positions by"
-            f" {100.0 * contradiction.share:.0f} % of the distance travelled (at most"
-            f" {100.0 * MAX_CONTRADICTION:.0f} % is possible); no heading offset, scale, current or"
-            " frame explains it: these channels are not one motion; check units and clocks, or"
-            " delete these columns in the files"
-        )
