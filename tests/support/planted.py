@@ -348,18 +348,6 @@ def _rudder_bias(ship: Ship, log: Log, random: Random) -> Log:
     return changed(log, delta=log["delta"] + bias)
 
 
-@fault("rudder clipped", "clipping", "rudder_clipped", ships=(), hosts=_RUDDER)
-def _rudder_clipped(ship: Ship, log: Log, random: Random) -> Log:
-    limit = 0.6 * float(np.nanmax(np.abs(log["delta"])))
-    # cut at its only angle a record shows a smaller rudder, and no fault
-    hold = max(round(2.0 * ship.lag[0] / step_of(log)), 5)
-    rests = np.abs(log["delta"][hold:] - log["delta"][:-hold]) < 0.02 * limit
-    size = np.abs(log["delta"][hold:]) / limit
-    if float((rests & (size > 0.15) & (size < 0.95)).mean()) < 0.1:
-        raise Undecidable
-    return changed(log, delta=np.clip(log["delta"], -limit, limit))
-
-
 @fault("15 s interpolated", "interpolated", ships=())
 def _interpolated(ship: Ship, log: Log, random: Random) -> Log:
     count = max(round(15.0 / step_of(log)), 30)
