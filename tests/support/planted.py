@@ -369,16 +369,6 @@ fault("course swapped", *_COURSE, ships=())(
 )
 
 
-@fault("positions scaled", "positions_scaled", ships=())
-def _positions_scaled(ship: Ship, log: Log, random: Random) -> Log:
-    latitude = np.radians(34.8) + log["x"] / 6.371e6
-    longitude = np.radians(135.5) + log["y"] / (6.371e6 * np.cos(np.radians(34.8)))
-    log = changed(log, latitude=latitude, longitude=longitude)
-    log = log.replace(units={**log.units, "latitude": "rad", "longitude": "rad"})
-    # velocities scaled alike: only the fixes can tell
-    return scaled(log, ["x", "y", "u", "v"], random.uniform(1.05, 1.3) ** sign(random))
-
-
 @fault("rows repeat the fix", "repeated_fix", "repeated_rows", "held", "frozen", ships=())
 def _repeated_fix(ship: Ship, log: Log, random: Random) -> Log:
     old = random.random(len(log)) < random.uniform(0.15, 0.4)

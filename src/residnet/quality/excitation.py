@@ -109,20 +109,6 @@ def check_samples_at_rest(log: LogStatistics, make_finding: Check) -> Iterator[F
         )
 
 
-@check("excitation", "slow", "note", "there is little to learn there", required_channels=("u", "v"))
-def check_slow_motion(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report parts of a log slower than a tenth of the 95 % quantile of the speed."""
-    speed = np.hypot(log["u"], log["v"])
-    slow_speed = 0.1 * nan_quantiles(speed, 0.95)[0]
-    slow_share = float(np.mean(speed[np.isfinite(speed)] <= slow_speed))
-    if slow_share > 0.05:
-        text = (
-            f"the vessel is almost at rest (slower than {format_quantity(slow_speed, 'm/s')}, a"
-            f" tenth of its speed) for {format_share(slow_share)} of the time"
-        )
-        yield make_finding(text, {"share": slow_share})
-
-
 @check("excitation", "condition", "note", on_subsample=True)
 def report_condition_number(subsample: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report collinear velocities and inputs of a log."""

@@ -1,7 +1,6 @@
 """Checks of input channels and of auxiliary channels.
 
-Inputs: jumps, limits, offset, astern propellers, unit, stuck actuators. Auxiliary channels:
-relative wind, which contains the motion, and positions against latitude and longitude.
+Inputs: limits, unit, stuck actuators. Auxiliary channels: relative wind, which contains the motion.
 """
 
 from __future__ import annotations
@@ -20,12 +19,10 @@ from residnet.quality.findings import (
     Finding,
     Level,
     check,
-    describe_unit_confusion,
     format_quantity,
     format_share,
 )
 from residnet.quality.statistics import (
-    STEERING_CHANNELS,
     LogStatistics,
     abs_quantile,
     count_reversals,
@@ -33,114 +30,14 @@ from residnet.quality.statistics import (
     interpolate_gaps,
 )
 
-_LATITUDE_NAMES = ("latitude", "lat", "gps_lat", "gnss_lat", "latitude_deg", "lat_deg")
-_LONGITUDE_NAMES = (
-    "longitude",
-    "lon",
-    "lng",
-    "long",
-    "gps_lon",
-    "gnss_lon",
-    "longitude_deg",
-    "lon_deg",
-)
-# the mean radii of curvature of the ellipsoid are within .4 % of this value in m
-_EARTH_RADIUS = 6_371_000.0
-
-
-@check(
-    "inputs",
-    "positions_scaled",
-    fix="compute x, y from latitude and longitude, or correct their unit",
-    required_channels=("x", "y"),
-)
-def check_positions_against_coordinates(
-    log: LogStatistics, make_finding: Check
-) -> Iterator[Finding]:
-    """Report a scale error or a rotation of x, y against latitude and longitude."""
-    names_by_lowercase = {name.lower(): name for name in log}
-    latitude_name = next(
-        (names_by_lowercase[name] for name in _LATITUDE_NAMES if name in names_by_lowercase), ""
-    )
-    longitude_name = next(
-        (names_by_lowercase[name] for name in _LONGITUDE_NAMES if name in names_by_lowercase), ""
-    )
-    if not latitude_name or not longitude_name:
-        return
-    latitude_rad, longitude_rad = (
-        log[name] if log.units[name] == "rad" else np.radians(log[name])
-        for name in (latitude_name, longitude_name)
-    )
-    coordinate_positions = _EARTH_RADIUS * (
-        latitude_rad
-        - np.nanmean(latitude_rad)
-        + 1j * np.cos(latitude_rad) * (longitude_rad - np.nanmean(longitude_rad))
-    )
-    logged_positions = log["x"] + 1j * log["y"]
-    is_finite = np.isfinite(coordinate_positions) & np.isfinite(logged_positions)
-    if is_finite.sum() < MIN_SAMPLES:
-        return
-    coordinate_positions = coordinate_positions[is_finite] - coordinate_positions[is_finite].mean()
-    logged_positions = logged_positions[is_finite] - logged_positions[is_finite].mean()
-    if float(np.abs(coordinate_positions).max()) < 1.0:
-        return
-    complex_gain = complex(np.vdot(coordinate_positions, logged_positions)) / float(
-        np.vdot(coordinate_positions, coordinate_positions).real
-    )
-    position_norm = float(np.linalg.norm(logged_positions))
-    residual_norm = float(np.linalg.norm(logged_positions - complex_gain * coordinate_positions))
-    residual_share = residual_norm / max(position_norm, 1e-12)
-    scale = abs(complex_gain)
-    rotation = float(np.angle(complex_gain))
-    if residual_share >= 0.2:
-        text = (
-            f"x, y do not follow {latitude_name}, {longitude_name}: the residual is"
-            f" {100.0 * residual_share:.0f} %"
-        )
-    elif abs(scale - 1.0) >= 0.02 or abs(rotation) >= math.radians(3.0):
-        text = (
-            f"x, y are {scale:.3f} times as large as by {latitude_name}, {longitude_name}, rotated"
-            f" by {math.degrees(rotation):+.1f} deg{describe_unit_confusion(scale, 'm')}"
-        )
-    else:
-        return
-    yield make_finding(text, {"scale": scale, "turn": rotation, "rest": residual_share})
-
 
 def _finite_inputs(log: LogStatistics) -> list[str]:
     return [name for name in log.inputs if np.isfinite(log[name]).sum() > 1]
 
 
-@check(
-    "inputs",
-    "input_jump",
-    "note",
-    "derivatives are biased around it, mask them (kind: input_jump)",
-)
-def check_input_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report inputs that change by a quarter of their range within one sample."""
-    for name in _finite_inputs(log):
-        changes = np.abs(np.nan_to_num(np.diff(log[name])))
-        input_range = float(np.nanmax(log[name]) - np.nanmin(log[name]))
-        largest_index = int(np.argmax(changes))
-        largest = float(changes[largest_index])
-        time = float(log.t[largest_index + 1])
-        # an angle other than a rudder angle may wrap
-        if 0.0 < 0.25 * input_range < largest and (
-            log.units[name] != "rad" or name in STEERING_CHANNELS
-        ):
-            text = (
-                f"{name} changes by {format_quantity(largest, log.units[name])} within one sample"
-                f" ({format_share(largest / input_range)} of its range) at t = {time:.2f} s"
-            )
-            yield make_finding(
-                text, {"largest": largest, "t": time, "share_of_range": largest / input_range}
-            )
-
-
 @check("inputs", "at_limits", "note", "a model cannot learn the behaviour beyond these limits")
 def check_input_limits(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report inputs that are often at their limits, and asymmetric limits of a rudder."""
+    """Report inputs that are often at their limits."""
     for name in _finite_inputs(log):
         finite_values = log[name][np.isfinite(log[name])]
         unit = log.units[name]
@@ -159,43 +56,6 @@ def check_input_limits(log: LogStatistics, make_finding: Check) -> Iterator[Find
             f" ({format_share(limit_shares[1])})"
         )
         yield make_finding(text, {"low": lower, "high": upper, "share": sum(limit_shares)})
-        midpoint = 0.5 * (lower + upper)
-        # only nearly symmetric limits are the two end stops of one actuator
-        is_nearly_symmetric = lower < 0.0 < upper and 1e-3 * upper < abs(midpoint) < 0.02 * (
-            upper - lower
-        )
-        if is_nearly_symmetric and name in STEERING_CHANNELS and unit == "rad":
-            text = (
-                f"{name} ranges from {format_quantity(lower, unit)} to"
-                f" {format_quantity(upper, unit)}: an offset of {format_quantity(midpoint, unit)}"
-            )
-            fix = "subtract it, or include a constant among the regressors"
-            yield make_finding(
-                text,
-                {"offset": midpoint, "low": lower, "high": upper},
-                code="input_offset",
-                fix=fix,
-            )
-
-
-@check(
-    "inputs",
-    "reversed",
-    "note",
-    "a propeller astern has other characteristics: add separate terms, or exclude these parts",
-)
-def check_astern_propellers(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report propellers that run astern."""
-    for name in _finite_inputs(log):
-        astern_share = float((log[name] < 0.0).mean())
-        is_propeller = log.units[name] == "1/s" or name.split("_")[0] in ("n", "rpm", "rev")
-        if is_propeller and 0.0 < astern_share < 1.0:
-            lowest_text = format_quantity(float(np.nanmin(log[name])), log.units[name])
-            text = (
-                f"{name} is negative (astern) in {format_share(astern_share)} of the samples, down"
-                f" to {lowest_text}"
-            )
-            yield make_finding(text, {"share": astern_share})
 
 
 @check("inputs", "unit", fix="correct the unit in the channel map", is_record_fault=True)
@@ -342,21 +202,12 @@ def check_relative_wind(log: LogStatistics, make_finding: Check) -> Iterator[Fin
     ]
     for name in direction_names:
         slope, error = _estimate_slope_against_heading(log, name)
-        matching_names = (
-            other_name
-            for other_name in direction_names
-            if other_name != name and _is_same_direction(log, name, other_name)
-        )
-        matching_name = next(matching_names, None)
         has_heading_slope = (
             error > 0.0 and slope < -5.0 * error and abs(slope + 1.0) < max(3.0 * error, 0.2)
         )
-        if not (
-            has_heading_slope or matching_name or "relative" in name or name.startswith("rel_")
-        ):
+        if not (has_heading_slope or "relative" in name or name.startswith("rel_")):
             continue
         text = f"{name} turns by {slope:+.2f} +- {2.0 * error:.2f} per unit change of heading"
-        text += f", and with psi added it equals {matching_name}" if matching_name else ""
         is_input = name in log.inputs
         level: Level = "will mislead" if is_input else "note"
         fix = "it must not drive a free run" if is_input else "do not use it as an input"
@@ -364,17 +215,6 @@ def check_relative_wind(log: LogStatistics, make_finding: Check) -> Iterator[Fin
         yield make_finding(
             text, {"slope": slope, "error": error}, level=level, fix=f"{fix}: use the true wind"
         )
-
-
-def _is_same_direction(log: LogStatistics, relative_name: str, true_name: str) -> bool:
-    """Return whether a relative direction plus the heading equals a true direction."""
-    coherence_with_heading, coherence_without_heading = (
-        abs(np.nanmean(np.exp(1j * (log[relative_name] + heading - log[true_name]))))
-        for heading in (log["psi"], 0.0)
-    )
-    return bool(
-        coherence_with_heading > 0.9 and coherence_without_heading < coherence_with_heading - 0.02
-    )
 
 
 def _estimate_slope_against_heading(log: LogStatistics, name: str) -> tuple[float, float]:
