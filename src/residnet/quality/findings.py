@@ -87,6 +87,9 @@ class Finding:
         )
 
 
+_CheckFunction = Callable[[Any, "Check"], Iterable[Finding]]
+
+
 @dataclass(frozen=True)
 class Check:
     """Registered check of a log.
@@ -99,23 +102,23 @@ class Check:
         code: default code of its findings.
         level: default level of its findings.
         fix: default of `Finding.action` of its findings.
+        function: called with a log (or several) and the check; yields findings.
         required_channels: channels without which the check is skipped.
         is_record_fault: see `Finding`.
         invalidates_samples: see `Finding`.
         on_subsample: whether a long log is replaced by `LogStatistics.subsample`, because the check
             is statistical and does not report single samples.
-        function: called with a log (or several) and the check; yields findings.
     """
 
     stage: str
     code: str
     level: Level
     fix: str
-    required_channels: tuple[str, ...]
-    is_record_fault: bool
-    invalidates_samples: bool
-    on_subsample: bool
-    function: Callable[[Any, Check], Iterable[Finding]]
+    function: _CheckFunction
+    required_channels: tuple[str, ...] = ()
+    is_record_fault: bool = False
+    invalidates_samples: bool = False
+    on_subsample: bool = False
 
     def __call__(
         self,
@@ -158,36 +161,14 @@ class Check:
 CHECKS: list[Check] = []
 """All checks in the order of execution."""
 
-_CheckFunction = Callable[[Any, Check], Iterable[Finding]]
-
 
 def check(
-    stage: str,
-    code: str,
-    level: Level = "will mislead",
-    fix: str = "",
-    *,
-    required_channels: tuple[str, ...] = (),
-    is_record_fault: bool = False,
-    invalidates_samples: bool = False,
-    on_subsample: bool = False,
+    stage: str, code: str, level: Level = "will mislead", fix: str = "", **options: Any
 ) -> Callable[[_CheckFunction], _CheckFunction]:
     """Register a function as a check; the arguments are the attributes of `Check`."""
 
     def register(function: _CheckFunction) -> _CheckFunction:
-        CHECKS.append(
-            Check(
-                stage,
-                code,
-                level,
-                fix,
-                required_channels,
-                is_record_fault,
-                invalidates_samples,
-                on_subsample,
-                function,
-            )
-        )
+        CHECKS.append(Check(stage, code, level, fix, function, **options))
         return function
 
     return register
