@@ -13,7 +13,6 @@ import numpy as np
 
 from residnet.core.names import BOW_WIND_CHANNELS
 from residnet.core.stretches import find_runs
-from residnet.preprocessing.statistics import MIN_SAMPLES
 from residnet.quality.findings import (
     Check,
     Finding,
@@ -25,9 +24,7 @@ from residnet.quality.findings import (
 from residnet.quality.statistics import (
     LogStatistics,
     abs_quantile,
-    count_reversals,
     fit_least_squares,
-    interpolate_gaps,
 )
 
 
@@ -141,56 +138,6 @@ def check_stuck_actuators(log: LogStatistics, make_finding: Check) -> Iterator[F
             )
             yield make_finding(
                 text, {"seconds": longest_duration, "t": start_time}, sample_mask=is_stuck
-            )
-
-
-# a heading that swings this far to both sides was steered
-_MIN_HEADING_SWING = math.radians(10.0)
-
-
-@check(
-    "inputs",
-    "stuck",
-    fix="the recorded input is stuck, or another one is missing from the log",
-    required_channels=("psi",),
-    is_record_fault=True,
-)
-def check_constant_inputs_while_turning(
-    log: LogStatistics, make_finding: Check
-) -> Iterator[Finding]:
-    """Report a heading that oscillates although all inputs are constant."""
-    driving_inputs = [name for name in log.inputs if not name.startswith(("wind", "current"))]
-    if not driving_inputs or np.isfinite(log["psi"]).sum() < MIN_SAMPLES:
-        return
-    psi = interpolate_gaps(log.t, log["psi"])
-    is_constant = np.ones(len(log) - 1, dtype=bool)
-    for name in driving_inputs:
-        is_constant &= np.abs(np.nan_to_num(np.diff(log[name]))) <= 1e-9 * abs_quantile(
-            log[name], 1.0
-        )
-    starts, stops = find_runs(is_constant)
-    # an oscillating heading travels farther than from its first to its last value
-    heading_travel = np.append(0.0, np.cumsum(np.abs(np.diff(psi))))
-    has_swing = (
-        heading_travel[stops] - heading_travel[starts] - np.abs(psi[stops] - psi[starts])
-        >= _MIN_HEADING_SWING
-    )
-    for start, stop in zip(starts[has_swing], stops[has_swing], strict=True):
-        heading_segment = psi[start : stop + 1]
-        n_reversals = count_reversals(heading_segment, _MIN_HEADING_SWING)
-        if n_reversals >= 2:
-            is_idle = np.zeros(len(log), dtype=bool)
-            is_idle[start : stop + 1] = True
-            duration = float(log.t[stop] - log.t[start])
-            start_time = float(log.t[start])
-            text = (
-                f"no input changes for {duration:.1f} s from t = {start_time:.2f} s, yet the"
-                f" heading reverses {n_reversals} times"
-            )
-            yield make_finding(
-                text,
-                {"seconds": duration, "turns": n_reversals, "t": start_time},
-                sample_mask=is_idle,
             )
 
 
