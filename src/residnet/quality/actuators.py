@@ -51,8 +51,6 @@ _MIN_TURN_RATIO = 8e-4
 """Smallest plausible yaw angle per propeller revolution at full rudder in rad; vessels have .003 to
 .03.
 """
-_MAX_TURN_RATIO = 0.3
-"""Largest plausible yaw angle per propeller revolution at full rudder in rad."""
 _MAX_REVOLUTIONS = 250.0
 """Largest plausible propeller revolutions in 1/s."""
 _FULL_RUDDER = 0.35
@@ -71,29 +69,22 @@ _MIN_STEERING_SHARE = 0.2
 def check_propeller_unit(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report revolutions whose unit cannot be 1/s."""
     names = log.cached(find_propellers)
-    # the fastest propeller counts, because one of several may be almost stopped
-    max_revolutions = max((abs_quantile(log[name]) for name in names), default=0.0)
+    steering_share = _steering_share(log, names) if "r" in log and names else 0.0
+    turn_ratio = np.inf
+    if steering_share > _MIN_STEERING_SHARE:
+        # the fastest propeller counts, because one of several may be almost stopped
+        max_revolutions = max(abs_quantile(log[name]) for name in names)
+        turn_ratio = abs_quantile(log["r"]) / min(steering_share, 1.0) / max(max_revolutions, 1e-12)
     for name in names:
         revolutions = abs_quantile(log[name])
-        factor = 0.0
-        text = f"{name} reaches {revolutions:.3g} 1/s, out of proportion to the yaw rate"
-        steering_share = _steering_share(log, names) if "r" in log else 0.0
-        if revolutions > _MAX_REVOLUTIONS:
-            text = f"{name} reaches {revolutions:.4g} 1/s, more than any propeller"
-            factor = 60.0
-        elif steering_share > _MIN_STEERING_SHARE:
-            turn_ratio = (
-                abs_quantile(log["r"]) / min(steering_share, 1.0) / max(max_revolutions, 1e-12)
+        is_out_of_proportion = revolutions > 20.0 and turn_ratio < _MIN_TURN_RATIO
+        if revolutions > _MAX_REVOLUTIONS or is_out_of_proportion:
+            text = (
+                f"{name} reaches {revolutions:.4g} 1/s, more than any propeller or out of"
+                " proportion to the yaw rate: rpm taken as 1/s?"
             )
-            if revolutions > 20.0 and turn_ratio < _MIN_TURN_RATIO:
-                factor = 60.0
-            elif max_revolutions < 1.0 and turn_ratio > _MAX_TURN_RATIO:
-                factor = 1.0 / 60.0
-        if factor:
-            text += ": rpm taken as 1/s?" if factor > 1.0 else ": 1/s taken as rpm?"
-            yield make_finding(
-                text, {"largest": revolutions}, repair=make_correction((name,), factor=factor)
-            )
+            repair = make_correction((name,), factor=60.0)
+            yield make_finding(text, {"largest": revolutions}, repair=repair)
 
 
 def _steering_share(log: LogStatistics, names: Sequence[str]) -> float:
@@ -411,44 +402,40 @@ def check_rudder_sign(log: LogStatistics, make_finding: Check) -> Iterator[Findi
     if not names or is_finite.sum() < 2 * MIN_SAMPLES:
         return
     name = " less ".join(names)
+    exchange_fix = "exchange the columns of both sides, or check the sign of r and psi"
+    reversal_fix = _REVERSE_SIGN_AND_CHECK_FIX if len(names) == 1 else exchange_fix
     is_finite &= np.isfinite(steering)
     r = log.smoothed("r")[is_finite]
     steering_values = steering[is_finite]
-    if is_finite.sum() >= 2 * MIN_SAMPLES and float(np.abs(r).mean()) >= 6.0 * log.noise_std("r"):
-        is_one_sided = all(
-            abs(signal.sum()) > 0.95 * np.abs(signal).sum() for signal in (r, steering_values)
-        )
+    is_one_sided = all(
+        abs(signal.sum()) > 0.95 * np.abs(signal).sum() for signal in (r, steering_values)
+    )
+    if is_one_sided and float(np.abs(r).mean()) >= 6.0 * log.noise_std("r"):
         # in a turning circle the yaw rate falls with the speed, so only its sign is evaluated
-        if is_one_sided and float(r.sum()) * float(steering_values.sum()) < 0.0:
-            text = f"{name} is always on one side and the vessel turns to the other side"
-            yield make_finding(text, fix=_REVERSE_SIGN_AND_CHECK_FIX)
-        elif is_one_sided:
-            text = f"{name} is always on one side and the vessel turns to this side"
-            yield make_finding(text, level="note", fix="")
-        if is_one_sided:
+        is_reversed = float(r.sum()) * float(steering_values.sum()) < 0.0
+        side = "to the other side" if is_reversed else "to this side"
+        text = f"{name} is always on one side and the vessel turns {side}"
+        figures = {}
+    else:
+        model = log.cached(_fit_yaw_model)
+        if model is None:
             return
-    model = log.cached(_fit_yaw_model)
-    if model is None:
-        return
-    delay = model.best_delay()
-    fit = model.fit(delay)
-    without_steering = fit_least_squares(model.terms, model.changes).sum_of_squares
-    if without_steering < _MIN_STEERING_IMPROVEMENT * fit.sum_of_squares:
-        return
-    effect = float(fit.coefficients[-1] * np.nanmean(_rudder_flow(log, names)))
-    figures = {"effect": effect, "t": fit.t_statistic, "lag": delay}
-    if fit.t_statistic < -_MIN_T_STATISTIC:
+        delay = model.best_delay()
+        fit = model.fit(delay)
+        without_steering = fit_least_squares(model.terms, model.changes).sum_of_squares
+        is_identifiable = without_steering > _MIN_STEERING_IMPROVEMENT * fit.sum_of_squares
+        if not is_identifiable or abs(fit.t_statistic) < _MIN_T_STATISTIC:
+            return
+        is_reversed = fit.t_statistic < 0.0
+        effect = model.fit().coefficients[-1] * np.nanmean(_rudder_flow(log, names))
+        figures = {"effect": float(effect), "t": fit.t_statistic, "lag": delay}
         text = (
-            f"positive {name} turns the vessel to port (yaw acceleration {effect:.3g} per unit,"
-            f" {-fit.t_statistic:.0f} standard errors)"
+            f"positive {name} turns the vessel to {'port' if is_reversed else 'starboard'}"
+            f" ({abs(fit.t_statistic):.0f} standard errors)"
         )
-        exchange_fix = "exchange the columns of both sides, or check the sign of r and psi"
-        fix = _REVERSE_SIGN_AND_CHECK_FIX if len(names) == 1 else exchange_fix
-        yield make_finding(text, figures, fix=fix)
-    elif fit.t_statistic > _MIN_T_STATISTIC:
-        text = (
-            f"positive {name} turns the vessel to starboard ({fit.t_statistic:.0f} standard errors)"
-        )
+    if is_reversed:
+        yield make_finding(text, figures, fix=reversal_fix)
+    else:
         yield make_finding(text, figures, level="note", fix="")
 
 

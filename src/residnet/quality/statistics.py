@@ -26,7 +26,7 @@ from residnet.preprocessing.channel_values import (
     sample_rows,
 )
 from residnet.preprocessing.derivatives import fit_local_polynomials
-from residnet.preprocessing.statistics import MIN_SAMPLES, OverlappingBlocks
+from residnet.preprocessing.statistics import OverlappingBlocks
 
 MOTION_CHANNELS = frozenset((*SIX_DOF_LAYOUT.state_names, *ACCELERATION_NAMES))
 """Channels of states and accelerations; all other channels count as inputs."""
@@ -263,22 +263,10 @@ def smooth_by_parabola(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def moving_average(values: np.ndarray, n_samples: int) -> np.ndarray:
     """Return the centred moving average [T] of the finite values; NaN in windows without any."""
+    import pandas as pd
+
     window_length = min(n_samples, values.size)
-    is_finite = np.isfinite(values)
-    padding = window_length // 2, (window_length - 1) // 2
-    cumulative_sums = (
-        np.cumsum(cumulative_sum)
-        for cumulative_sum in (is_finite, np.where(is_finite, values, 0.0))
-    )
-    padded_sums = (
-        np.pad(np.append(0.0, cumulative_sum), padding, mode="edge")
-        for cumulative_sum in cumulative_sums
-    )
-    n_known, window_sums = (
-        cumulative_sum[window_length:] - cumulative_sum[:-window_length]
-        for cumulative_sum in padded_sums
-    )
-    return np.where(n_known > 0.5, window_sums / np.maximum(n_known, 1.0), np.nan)
+    return pd.Series(values).rolling(window_length, min_periods=1, center=True).mean().to_numpy()
 
 
 MIN_TURN_SHARE = 0.05
@@ -333,73 +321,6 @@ def count_reversals(heading: np.ndarray, min_swing: float) -> int:
         minimum = min(minimum, heading_value)
         maximum = max(maximum, heading_value)
     return n_reversals
-
-
-_N_EXCERPT_VALUES = 1000
-"""Number of values that are tested before all values of a channel."""
-_MAX_SIGNIFICANT_DIGITS = 5
-"""Most significant digits of printed values that count as few; noise is usually above the sixth."""
-
-
-def printed_resolution(values: np.ndarray) -> np.ndarray | None:
-    """Return the resolution of each value of a channel that has few significant digits.
-
-    The resolution of such a channel grows with its magnitude: with four digits, 9.999 is followed
-    by 10.00 and 99.99 by 100.0.
-
-    Args:
-        values: values [T] in the unit of the print.
-
-    Returns:
-        Resolution [T]; None if the values have more digits, or the same resolution everywhere.
-    """
-    finite = values[np.isfinite(values) & (values != 0.0)]
-    if finite.size < 2:
-        return None
-
-    def resolution_of(numbers: np.ndarray, n_digits: int) -> np.ndarray:
-        magnitude = np.floor(np.log10(np.maximum(np.abs(numbers), 1e-300)) + 1e-12)
-        resolution: np.ndarray = 10.0 ** (magnitude + 1 - n_digits)
-        return resolution
-
-    def count_digits(numbers: np.ndarray, n_digits: int) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Return resolution, values in units of it, and whether these are integers."""
-        resolution = resolution_of(numbers, n_digits)
-        counts = numbers / resolution
-        return resolution, counts, bool((np.abs(counts - np.round(counts)) < 1e-6).all())
-
-    # some values of a long channel refute most numbers of digits
-    excerpt = finite[:: -(-finite.size // _N_EXCERPT_VALUES)]
-    for n_digits in range(1, _MAX_SIGNIFICANT_DIGITS + 1):
-        if not count_digits(excerpt, n_digits)[2]:
-            continue
-        resolution, counts, are_integers = count_digits(finite, n_digits)
-        if are_integers:
-            # with a fixed number of decimals the last digit of all values below the largest
-            # magnitude is zero; few values may end in zero by chance
-            is_finer = resolution < 0.2 * resolution.max()
-            last_digits = np.round(counts[is_finer]) % 10.0
-            if not is_finer.any() or float((last_digits != 0.0).mean()) < 0.5:
-                return None
-            return resolution_of(np.where(values == 0.0, np.abs(finite).min(), values), n_digits)
-    return None
-
-
-def estimate_resolution(values: np.ndarray) -> float:
-    """Return the quantisation step of a channel; 0 if its values have no common step."""
-    # second differences: the first ones of a position at speed have many steps
-    rounding_error = 1e-12 * float(np.nanmax(np.abs(values), initial=0.0))
-    nonzero_changes = np.abs(np.diff(values, 2))
-    nonzero_changes = nonzero_changes[nonzero_changes > rounding_error]
-    if nonzero_changes.size < MIN_SAMPLES:
-        return 0.0
-    min_step = nan_quantiles(nonzero_changes, 0.01)[0]
-    changes_in_steps = nonzero_changes / min_step
-    return (
-        min_step
-        if float((np.abs(changes_in_steps - np.round(changes_in_steps)) < 0.02).mean()) > 0.95
-        else 0.0
-    )
 
 
 class LeastSquaresFit(NamedTuple):

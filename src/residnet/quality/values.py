@@ -38,8 +38,6 @@ from residnet.quality.statistics import (
     MOTION_CHANNELS,
     STEERING_CHANNELS,
     LogStatistics,
-    estimate_resolution,
-    printed_resolution,
 )
 
 
@@ -228,41 +226,55 @@ def check_repeated_rows(log: LogStatistics, make_finding: Check) -> Iterator[Fin
         )
 
 
-@check("values", "fill_values", fix="leave these cells empty", is_record_fault=True)
-def check_fill_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report fill values, which represent a missing measurement."""
-    for name in log:
-        fill_indices = np.flatnonzero(is_fill_value(log[name]))
-        if fill_indices.size:
-            fill_value = float(log[name][fill_indices[0]])
-            text = (
-                f"{fill_indices.size} samples of {name} hold the fill value {fill_value:g}, first"
-                f" at t = {log.t[fill_indices[0]]:.2f} s: nothing was measured there"
-            )
-            yield make_finding(
-                text, {"count": fill_indices.size, "value": fill_value}, channels=(name,)
-            )
-
-
-@check("values", "absurd", "fatal", "correct or empty them")
-def check_implausible_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report values outside the range of any vessel."""
+@check("values", "spikes", is_record_fault=True, invalidates_samples=True)
+def check_wrong_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report samples that are no measurement: fill values, implausible values and spikes."""
+    spikes = find_spikes(log.log)
+    no_spikes = np.zeros(len(log), dtype=bool)
     for name in log:
         values = log[name]
-        implausible_indices = np.flatnonzero(is_implausible(values, log.units[name]))
-        implausible_indices = (
-            implausible_indices[~is_fill_value(values)[implausible_indices]]
-            if implausible_indices.size
-            else implausible_indices
+        is_reported = no_spikes
+        kinds: tuple[tuple[str, Level, np.ndarray, str, str], ...] = (
+            (
+                "fill_values",
+                "will mislead",
+                is_fill_value(values),
+                "hold a fill value: nothing was measured there",
+                "leave these cells empty",
+            ),
+            (
+                "absurd",
+                "fatal",
+                is_implausible(values, log.units[name]),
+                "are beyond what any vessel reaches",
+                "correct or empty them",
+            ),
+            (
+                "spikes",
+                "will mislead",
+                spikes.get(name, no_spikes),
+                "are single samples far outside the other values",
+                "correct or empty these cells; a fit bridges them and leaves them out",
+            ),
         )
-        if implausible_indices.size:
-            text = (
-                f"{name} is"
-                f" {format_quantity(float(values[implausible_indices[0]]), log.units[name])} at t ="
-                f" {log.t[implausible_indices[0]]:.2f} s, which no vessel reaches"
-                f" ({implausible_indices.size} such samples)"
+        for code, level, is_wrong, text, fix in kinds:
+            is_new = is_wrong & ~is_reported
+            is_reported = is_reported | is_wrong
+            if not is_new.any():
+                continue
+            deviations = np.abs(values - np.nanmedian(values))
+            worst_index = int(np.argmax(np.where(is_new, deviations, -1.0)))
+            worst_text = format_quantity(float(values[worst_index]), log.units[name])
+            yield make_finding(
+                f"{int(is_new.sum())} samples of {name} {text}, the worst {worst_text} at t ="
+                f" {log.t[worst_index]:.2f} s",
+                {"count": is_new.sum(), "value": values[worst_index], "t": log.t[worst_index]},
+                code=code,
+                level=level,
+                fix=fix,
+                sample_mask=is_new,
+                channels=(name,),
             )
-            yield make_finding(text, {"count": implausible_indices.size})
 
 
 # shortest run of equal values that counts as frozen, in steps
@@ -276,18 +288,10 @@ _MAX_STEADY_HEADING_DURATION = 3.0
 @check("values", "frozen", is_record_fault=True, invalidates_samples=True)
 def check_frozen_sensors(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report sensors that hold their last value although the vessel moves."""
-    position_frozen = np.zeros(len(log), dtype=bool)
-    has_position = {"x", "y"} <= set(log.measured_motion)
-    for names in (
-        *((("x", "y"),) if has_position else ()),
-        *((name,) for name in log.measured_motion),
-    ):
+    position = tuple(name for name in ("x", "y") if name in log.measured_motion)
+    others = [(name,) for name in log.measured_motion if name not in position]
+    for names in (position, *others) if position else others:
         is_frozen = _find_frozen_samples(log, names)
-        if len(names) == 2:
-            position_frozen = is_frozen
-        elif has_position and names[0] in ("x", "y"):
-            # stretches in which x and y freeze together were reported above
-            is_frozen &= ~(np.convolve(position_frozen, np.ones(3))[1:-1] > 0.5)
         starts, stops = find_runs(is_frozen)
         if not starts.size:
             continue
@@ -337,9 +341,7 @@ def _find_frozen_samples(log: LogStatistics, names: tuple[str, ...]) -> np.ndarr
     """
     is_frozen_sample = np.zeros(len(log), dtype=bool)
     is_multi_channel = len(names) > 1
-    is_repeated = np.logical_and.reduce(
-        [(log[name][1:] == log[name][:-1]) & ~_is_coarsely_printed(log[name]) for name in names]
-    )
+    is_repeated = np.logical_and.reduce([log[name][1:] == log[name][:-1] for name in names])
     if not is_repeated.any():
         return is_frozen_sample
     starts, stops = find_runs(is_repeated)
@@ -392,179 +394,6 @@ def _moves_after_run(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
     typical_change = np.nanmax(following_changes[:, 1:], axis=1)
     is_large_step = following_changes[:, 0] > np.maximum(3.0 * typical_change, 3.0 * min_change)
     return np.asarray((stops < changes.size - 3) & is_large_step)
-
-
-_MIN_REPEATED_SHARE = 0.1
-"""Smallest share of repeated rows that is reported."""
-_MAX_REPEAT = 5
-"""Number of repeats in succession from which the check of frozen sensors applies instead."""
-
-
-@check(
-    "values",
-    "repeated_fix",
-    fix="leave these cells empty, or log at the receiver's rate",
-    required_channels=("x", "y"),
-    is_record_fault=True,
-)
-def check_repeated_positions(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report single rows that repeat the position although the vessel moves."""
-    increments = np.diff(log.log.stack(("x", "y")), axis=0)
-    is_repeated = (increments == 0.0).all(axis=1)
-    starts, stops = find_runs(is_repeated)
-    is_short = stops - starts < _MAX_REPEAT
-    short_repeats = mask_from_ranges(is_repeated.size, starts[is_short], stops[is_short])
-    repeated_share = float(short_repeats.mean())
-    # the check needs steps that are much longer than the resolution of the position
-    step_lengths = np.hypot(*increments[~is_repeated].T)
-    step_lengths = step_lengths[np.isfinite(step_lengths)]
-    north_changes = np.abs(increments[:, 0])
-    min_change = float(north_changes[north_changes > 0.0].min(initial=np.inf))
-    if (
-        repeated_share < _MIN_REPEATED_SHARE
-        or step_lengths.size < 20
-        or float(np.median(step_lengths)) <= 4.0 * min_change
-    ):
-        return
-    if median_update_interval(log.log.stack(("x", "y"))) > 1.0:
-        # a slow receiver is reported as `held`, and a fit excludes the repeats
-        return
-    names = ["x", "y"]
-    for name in ("psi", "u", "v", "r"):
-        if name in log and float((np.diff(log[name])[short_repeats] == 0.0).mean()) > 0.8:
-            names.append(name)
-    text = (
-        f"{int(short_repeats.sum())} rows ({format_share(repeated_share)}) repeat the last"
-        f" {', '.join(names)}: the fix is older than the row"
-    )
-    affected = np.append(False, short_repeats)
-    yield make_finding(
-        text,
-        {"count": short_repeats.sum(), "share": repeated_share},
-        sample_mask=affected,
-        channels=tuple(names),
-    )
-
-
-_MIN_STRAIGHT_SAMPLES = 8
-"""Smallest number of samples of a straight stretch."""
-_MIN_STRAIGHT_DURATION = 1.0
-"""Shortest duration of a straight stretch in s."""
-# largest straight share; above it, straight lines are the normal behaviour of the channel
-_MAX_STRAIGHT_SHARE = 0.4
-
-
-@check(
-    "values",
-    "interpolated",
-    fix="leave the cells between two measurements empty",
-    is_record_fault=True,
-    invalidates_samples=True,
-)
-def check_interpolated_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report stretches that were filled by linear interpolation."""
-    straight_by_channel = {
-        name: _find_straight_samples(log, name)
-        for name in log.measured_motion
-        if name in STATE_NAMES
-    }
-    names = tuple(name for name, is_straight in straight_by_channel.items() if is_straight.any())
-    if not names:
-        return
-    is_straight = np.logical_or.reduce([straight_by_channel[name] for name in names])
-    starts, stops = find_runs(is_straight)
-    durations = log.t[stops - 1] - log.t[starts]
-    straight_share = float(is_straight.mean())
-    longest_segment = int(np.argmax(durations))
-    start_time = float(log.t[starts[longest_segment]])
-    text = (
-        f"{', '.join(names)} are exactly linear for {durations.sum():.1f} s"
-        f" ({format_share(straight_share)}), the longest {durations[longest_segment]:.1f} s from t"
-        f" = {start_time:.2f} s: they were interpolated"
-    )
-    figures = {"seconds": durations.sum(), "longest": durations[longest_segment]}
-    yield make_finding(
-        text,
-        {**figures, "t": start_time, "share": straight_share},
-        sample_mask=is_straight,
-        channels=names,
-    )
-
-
-def _find_straight_samples(log: LogStatistics, name: str) -> np.ndarray:
-    """Return [T] bool: samples in linear runs of a channel that is noisy elsewhere."""
-    is_straight_sample = np.zeros(len(log), dtype=bool)
-    values = log.subsample[name]
-    second_differences = np.abs(np.diff(np.diff(values) / np.diff(log.subsample.t)))
-    second_differences = second_differences[np.isfinite(second_differences)]
-    if second_differences.size < 100:
-        return is_straight_sample
-    typical_bend = nan_median(second_differences)
-    rounding_error = 1e-9 * float(np.nanmax(np.abs(values))) / log.sampling_interval
-    resolution = estimate_resolution(values) / log.sampling_interval
-    # a coarse or smooth channel has linear runs of its own; only noise changes the slope at every
-    # sample
-    is_coarse = resolution > 0.0 and 8.0 * resolution >= typical_bend
-    slope_noise = log.noise_std(name) * np.sqrt(6.0)
-    is_noisy = slope_noise > 0.5 * nan_median(np.abs(np.diff(values, 2)))
-    if is_coarse or typical_bend <= 10.0 * rounding_error or not is_noisy:
-        return is_straight_sample
-    slope = np.diff(log[name]) / np.diff(log.t)
-    bends = np.abs(np.diff(slope))
-    is_flat = bends <= max(1e-5 * typical_bend, rounding_error, 2.1 * resolution)
-    if float(is_flat.mean()) > _MAX_STRAIGHT_SHARE:
-        return is_straight_sample
-    is_moving = np.abs(slope[:-1]) > 10.0 * rounding_error
-    is_moving &= ~_is_coarsely_printed(log[name])[1:]
-    starts, stops = find_runs(is_flat & is_moving)
-    is_long = log.t[stops] - log.t[starts] >= _MIN_STRAIGHT_DURATION
-    is_long &= stops - starts >= _MIN_STRAIGHT_SAMPLES
-    return mask_from_ranges(is_straight_sample.size, starts[is_long], stops[is_long] + 2)
-
-
-_MIN_INCREMENT_IN_DIGITS = 5.0
-"""Equal increments are chance if the median increment is less than this number of units of the last
-printed digit."""
-
-
-def _is_coarsely_printed(values: np.ndarray) -> np.ndarray:
-    """Return [T - 1] bool: increments of few units of the last printed digit.
-
-    Large values of a table with few significant digits repeat and have equal increments by chance.
-    """
-    resolution = printed_resolution(values)
-    if resolution is None:
-        return np.zeros(values.size - 1, dtype=bool)
-    increment = nan_median(np.abs(np.diff(values)))
-    is_coarse: np.ndarray = _MIN_INCREMENT_IN_DIGITS * resolution[1:] >= increment
-    return is_coarse
-
-
-@check(
-    "values",
-    "spikes",
-    fix="correct or empty these cells; a fit bridges them and leaves them out",
-    is_record_fault=True,
-    invalidates_samples=True,
-)
-def check_spikes(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report single samples far outside the range of all other samples."""
-    for name, is_spike in find_spikes(log.log).items():
-        values = log[name]
-        worst_index = int(
-            np.argmax(np.where(is_spike, np.abs(values - np.nanmedian(values)), -1.0))
-        )
-        text = (
-            f"{int(is_spike.sum())} single samples of {name} are far outside the other values, the"
-            f" worst {format_quantity(float(values[worst_index]), log.units[name])} at t ="
-            f" {log.t[worst_index]:.2f} s"
-        )
-        yield make_finding(
-            text,
-            {"count": is_spike.sum(), "t": log.t[worst_index]},
-            sample_mask=is_spike,
-            channels=(name,),
-        )
 
 
 @check("values", "outliers", invalidates_samples=True)
@@ -684,6 +513,10 @@ def check_resolution(log: LogStatistics, make_finding: Check) -> Iterator[Findin
         )
 
 
+_MIN_REPEATED_SHARE = 0.1
+"""Smallest share of repeated positions that is reported."""
+
+
 @check(
     "values",
     "held",
@@ -705,6 +538,27 @@ def check_sample_and_hold(log: LogStatistics, make_finding: Check) -> Iterator[F
             yield make_finding(
                 text, {"every": update_interval}, level="note" if name in STATE_NAMES else None
             )
+    if not {"x", "y"} <= {*log.measured_motion}:
+        return
+    increments = np.diff(log.log.stack(("x", "y")), axis=0)
+    is_repeated = (increments == 0.0).all(axis=1)
+    starts, stops = find_runs(is_repeated)
+    is_short = stops - starts < _MIN_FROZEN_STEPS
+    repeated_share = float((stops - starts)[is_short].sum()) / len(log)
+    # a position with steps of several times its resolution does not repeat by chance
+    steps = np.abs(increments[~is_repeated])
+    resolution = float(steps[steps > 0.0].min(initial=np.inf))
+    is_regular = median_update_interval(log.log.stack(("x", "y"))) > 1.0
+    if (
+        repeated_share >= _MIN_REPEATED_SHARE
+        and not is_regular
+        and nan_median(steps.max(axis=1)) > 4.0 * resolution
+    ):
+        text = (
+            f"{format_share(repeated_share)} of the rows repeat the last position: the fix is older"
+            " than the row"
+        )
+        yield make_finding(text, {"share": repeated_share})
 
 
 @check("values", "jump")
