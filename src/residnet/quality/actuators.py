@@ -166,6 +166,7 @@ class ResponseModel:
         terms: integrals of the terms of the hull over the blocks [K, k].
         inputs: integrals of the effect of the input [K, S], one column for each shift.
         changes: changes of the velocity [K].
+        travel: integrals of the velocity [K].
         shifts: times in s by which the input is delayed, increasing and symmetric about zero [S].
     """
 
@@ -173,6 +174,7 @@ class ResponseModel:
     terms: np.ndarray
     inputs: np.ndarray
     changes: np.ndarray
+    travel: np.ndarray
     shifts: np.ndarray
 
     @cached_property
@@ -198,8 +200,19 @@ class ResponseModel:
 
     def fit(self, delay: float = 0.0) -> LeastSquaresFit:
         """Fit the model with an input that is delayed by `delay` s; it is the last column."""
-        column = self.inputs[:, np.argmin(np.abs(self.shifts - delay))]
-        return fit_least_squares(np.column_stack((self.terms, column)), self.changes)
+        return fit_least_squares(np.column_stack((self.terms, self._input(delay))), self.changes)
+
+    def fit_travel(self, delay: float = 0.0) -> LeastSquaresFit:
+        """Fit the integral of the velocity; the last column is the steady effect of the input.
+
+        Over blocks that are longer than the response (K of Nomoto's model), the velocity is
+        proportional to the input, and `fit` cannot separate both.
+        """
+        regressors = (self.terms[:, 0], self.changes, self._input(delay))
+        return fit_least_squares(np.column_stack(regressors), self.travel)
+
+    def _input(self, delay: float) -> np.ndarray:
+        return self.inputs[:, np.argmin(np.abs(self.shifts - delay))]
 
 
 _N_SHIFTS = 61
@@ -257,6 +270,7 @@ def _make_response_model(
         terms[is_finite],
         inputs[is_finite],
         changes[is_finite],
+        blocks.make_integrator(log[velocity])(0)[is_finite],
         shifts * log.sampling_interval,
     )
 
@@ -424,7 +438,8 @@ def check_rudder_sign(log: LogStatistics, make_finding: Check) -> Iterator[Findi
         fit = model.fit(delay)
         without_steering = fit_least_squares(model.terms, model.changes).sum_of_squares
         is_identifiable = without_steering > _MIN_STEERING_IMPROVEMENT * fit.sum_of_squares
-        if not is_identifiable or abs(fit.t_statistic) < _MIN_T_STATISTIC:
+        is_consistent = fit.t_statistic * model.fit_travel(delay).t_statistic > 0.0
+        if not (is_identifiable and is_consistent) or abs(fit.t_statistic) < _MIN_T_STATISTIC:
             return
         is_reversed = fit.t_statistic < 0.0
         effect = model.fit().coefficients[-1] * np.nanmean(_rudder_flow(log, names))
