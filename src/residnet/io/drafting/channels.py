@@ -7,6 +7,7 @@ the heading. Columns are regressed on these quantities to determine their factor
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any, final
@@ -196,26 +197,15 @@ class ChannelMapper:
                 dict.fromkeys(PoseFrame(False, f.is_from_east) for f in self._candidate_frames)
             )
         score = self._search_heading_frame()
-        if score < _MIN_FRAME_SCORE:
-            # a heading positive to port, next to north and east, fits none of the frames
-            as_logged = (self._logs, self._motions, self._psi_unit, self._pose_frame)
-            self._logs = [
-                RawTable(t, {n: -values if n == "psi" else values for n, values in columns.items()})
-                for t, columns in ((table.t, table.columns) for table in self._logs)
-            ]
-            reversed_score = self._search_heading_frame()
-            if reversed_score > _MIN_BODY_CONSISTENCY:
-                score = reversed_score
-                self._sign_flipped.add("psi")
-                text = "the motion is consistent with the heading only if it is positive to port"
-                self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
-            else:
-                self._logs, self._motions, self._psi_unit, self._pose_frame = as_logged
+        if self._pose_frame.is_reversed:
+            text = "the motion is consistent with the heading only if it is positive to port"
+            self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), text)
         if parse_header_unit(self._names["psi"], "rad") is None:
             reason = f"position and heading are most consistent in {self._psi_unit}"
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"the header has no unit; {reason}")
         if not is_named_north_east and not self._is_ros_pose and self._is_mirrored():
-            self._pose_frame = PoseFrame(*(not flag for flag in self._pose_frame))
+            is_swapped, is_from_east, is_reversed = self._pose_frame
+            self._pose_frame = PoseFrame(not is_swapped, not is_from_east, is_reversed)
             self._motions = [
                 estimate_motion(table, self._psi_unit, self._pose_frame) for table in self._logs
             ]
@@ -232,7 +222,7 @@ class ChannelMapper:
             self._draft_notes.add_guess((*CHANNELS_KEY, "psi"), f"{text}: check units and axes")
         # swapped columns have been exchanged by name
         self._is_swapped = self._pose_frame.is_swapped
-        self._pose_frame = PoseFrame(False, self._pose_frame.is_from_east)
+        self._pose_frame = self._pose_frame._replace(is_swapped=False)
 
     def _search_heading_frame(self) -> float:
         """Set the most consistent unit and frame of the heading; returns their score, at most 1."""
@@ -245,14 +235,20 @@ class ChannelMapper:
         if not header_unit and largest_value > 720.0:
             candidate_units.append("cdeg")
         best_candidate = (-np.inf, "rad", self._candidate_frames[0])
-        for unit in candidate_units:
-            for frame in self._candidate_frames:
-                motions = [estimate_motion(table, unit, frame) for table in self._logs]
-                score = self._score_consistency(motions)
-                # a later candidate must be clearly better: the first ones are the usual ones
-                if score > best_candidate[0] + 0.02:
-                    best_candidate = (score, unit, frame)
-                    self._motions = motions
+        for is_reversed, unit, frame in itertools.product(
+            (False, True), candidate_units, self._candidate_frames
+        ):
+            # a heading positive to port is rare: the usual frames must fail
+            if is_reversed and best_candidate[0] >= _MIN_FRAME_SCORE:
+                break
+            frame = frame._replace(is_reversed=is_reversed)
+            motions = [estimate_motion(table, unit, frame) for table in self._logs]
+            score = self._score_consistency(motions)
+            # a later candidate must be clearly better: the first ones are the usual ones
+            min_score = _MIN_BODY_CONSISTENCY if is_reversed else -np.inf
+            if score > max(best_candidate[0] + 0.02, min_score):
+                best_candidate = (score, unit, frame)
+                self._motions = motions
         score, self._psi_unit, self._pose_frame = best_candidate
         return score
 
@@ -607,7 +603,7 @@ class ChannelMapper:
             )
         if name == "psi":
             entry["unit"] = self._psi_unit
-            entry |= {"sign": -1} if "psi" in self._sign_flipped else {}
+            entry |= {"sign": -1} if self._pose_frame.is_reversed else {}
             return entry | ({"frame": "enu"} if self._pose_frame.is_from_east else {})
         if self._is_earth_fixed and name in ("u", "v"):
             entry["frame"] = "ned"

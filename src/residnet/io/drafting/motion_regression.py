@@ -29,10 +29,12 @@ class PoseFrame(NamedTuple):
     Attributes:
         is_swapped: whether x is east and y is north.
         is_from_east: whether psi is counter-clockwise from east.
+        is_reversed: whether psi has the opposite direction.
     """
 
     is_swapped: bool
     is_from_east: bool
+    is_reversed: bool = False
 
 
 POSE_FRAMES = (PoseFrame(False, False), PoseFrame(True, False), PoseFrame(False, True))
@@ -107,7 +109,7 @@ class Motion(NamedTuple):
 
 def convert_heading(table: RawTable, unit: str, frame: PoseFrame) -> np.ndarray:
     """Return the heading of a table clockwise from north [T] in rad, unwrapped."""
-    psi = table.columns["psi"] * to_si(unit, "rad")
+    psi = table.columns["psi"] * to_si(unit, "rad") * (-1.0 if frame.is_reversed else 1.0)
     return unwrap_angle(np.pi / 2 - psi if frame.is_from_east else psi)
 
 
