@@ -34,8 +34,8 @@ class Finding:
         figures: numbers in SI units.
         action: recommended action; empty without one.
         sample_mask: affected samples [T] bool; None if the finding is not about single samples.
-        effect: measured effect on a fit: relative change of its one-step predictions if the fault
-            is removed from the log (`residnet.quality.effects`); None if it was not measured.
+        effect: relative change of the dead-reckoning error or of a velocity if the fault is removed
+            from the log (`residnet.quality.effects`), 0 if small; None if it was not measured.
         channels: channels of the affected samples.
         repair: returns a log with the fault corrected; None if no correction is known.
         is_record_fault: whether the recording itself is faulty, so that it must be corrected

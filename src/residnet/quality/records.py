@@ -22,7 +22,7 @@ class FindingRow(Record):
         code: kind of finding.
         text: one line with figures.
         action: recommended action; empty without one.
-        effect: relative change of the predictions of a one-step fit without the fault; None if it
+        effect: relative change of dead reckoning or of a velocity without the fault; None if it
             was not measured.
         figures: numbers in SI units; None for a number that is not finite.
     """

@@ -561,12 +561,14 @@ def check_sample_and_hold(log: LogStatistics, make_finding: Check) -> Iterator[F
         yield make_finding(text, {"share": repeated_share})
 
 
-@check("values", "jump")
+@check("values", "jump", is_record_fault=True)
 def check_velocity_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report steps of a velocity within one sample, which the inertia of a vessel excludes."""
     for name in (name for name in log.velocities if name in log.measured_motion):
         values = np.where(log.is_spike(name), np.nan, log[name])
-        changes = np.abs(np.diff(values))
+        # a velocity may change by any amount in a gap
+        is_gap = np.diff(log.t) > 3.0 * log.sampling_interval
+        changes = np.where(is_gap, np.nan, np.abs(np.diff(values)))
         if np.isfinite(changes).sum() < 50:
             continue
         changes = np.nan_to_num(changes)
