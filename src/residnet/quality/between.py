@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -21,7 +19,7 @@ from residnet.core.names import (
 )
 from residnet.core.stretches import find_runs
 from residnet.io.split import hash_rows, row_sampling_interval
-from residnet.preprocessing.channel_values import estimate_noise_std, nan_median, nan_std
+from residnet.preprocessing.channel_values import estimate_noise_std, nan_std
 from residnet.preprocessing.statistics import MIN_SAMPLES
 from residnet.quality.consensus import (
     Consensus,
@@ -42,7 +40,6 @@ from residnet.quality.statistics import (
     MIN_TURN_SHARE,
     MOTION_CHANNELS,
     LogStatistics,
-    abs_quantile,
     compute_port_share,
     moving_average,
 )
@@ -117,101 +114,48 @@ def with_derived_velocities(log: LogStatistics) -> LogStatistics:
 @check("between", "copied_part", fix="exclude it, or put both into one split")
 def check_copies(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     """Report rows that occur in two logs, or at two places of one log."""
-    velocities = [name for name in VELOCITY_NAMES if name in logs]
-    names = velocities if len(velocities) > 1 else sorted(logs.channels)
-    candidate_logs = _preselect_logs([log.log for log in logs.logs], names)
-    if not names or not candidate_logs:
-        return
-    for (i, j, offset), shared_places in sorted(_find_shared_rows(candidate_logs, names).items()):
-        # the longest uninterrupted copy with this distance between the rows
-        is_shared = np.zeros(len(candidate_logs[i]) + 1, dtype=bool)
-        is_shared[shared_places] = True
-        starts, stops = find_runs(is_shared)
-        longest_segment = int(np.argmax(stops - starts))
-        n_copied = int(stops[longest_segment] - starts[longest_segment])
-        start = int(starts[longest_segment])
-        # equal consecutive rows are reported as frozen measurements
-        if n_copied < _MIN_COPIED_ROWS or (i == j and offset == 1):
-            continue
-        figures = {"rows": n_copied, "first": start, "offset": offset}
-        a = candidate_logs[i]
+    # a log that was read alone has the same rows with another origin of the positions
+    names = [name for name in logs.channels if name not in ("x", "y", "z")] or logs.channels
+    # of very many rows a sample is compared; equal rows have equal hashes and are sampled together
+    interval = row_sampling_interval([log.log for log in logs.logs])
+    hashes = np.concatenate([hash_rows(log.log, names) for log in logs.logs])
+    rows = np.flatnonzero(hashes % np.uint64(interval) == 0)
+    _, first_places, inverse = np.unique(hashes[rows], return_index=True, return_inverse=True)
+    sources = rows[first_places[inverse]]
+    log_starts = np.cumsum([0, *map(len, logs.logs)])
+    source_logs, copy_logs = np.searchsorted(log_starts, (sources, rows), side="right") - 1
+    # a copy is a run of rows whose first occurrences are equally far away; those of frozen rows
+    # become more distant, those of rows that are held for some samples alternate
+    keys = np.stack((source_logs, copy_logs, rows - sources))
+    labels = np.cumsum(np.diff(keys, axis=1, prepend=keys[:, :1]).any(axis=0))
+    labels[rows == sources] = -1
+    longest_runs: dict[tuple[int, int], tuple[int, int]] = {}
+    for start, stop in zip(*find_runs(labels), strict=True):
+        pair = int(source_logs[start]), int(copy_logs[start])
+        longest_start, longest_stop = longest_runs.get(pair, (0, 0))
+        if stop - start > max(longest_stop - longest_start, _MIN_COPIED_ROWS // interval - 1, 2):
+            longest_runs[pair] = int(start), int(stop)
+    for (i, j), (start, stop) in sorted(longest_runs.items()):
+        n_copied = int(rows[stop - 1] - rows[start]) + 1
+        first_row = int(sources[start] - log_starts[i])
+        offset = int(rows[start] - log_starts[j]) - first_row
+        figures = {"rows": n_copied, "first": first_row, "offset": offset}
         if i == j:
             text = (
-                f"{a.name}: rows {start} to {start + n_copied - 1} are repeated from row"
-                f" {start + offset} on"
+                f"{logs.logs[i].name}: rows {first_row} to {first_row + n_copied - 1} are repeated"
+                f" from row {first_row + offset} on"
             )
             yield make_finding(text, figures, code="repeated_block", fix="delete one of the copies")
         else:
-            yield _describe_copy(logs, a, candidate_logs[j], figures, make_finding)
-
-
-def _preselect_logs(logs: list[Log], names: Sequence[str]) -> list[Log]:
-    """Return the logs that may share rows with each other, by a sample if there are many rows.
-
-    The sample is drawn by hash value: equal rows have equal hashes, so that all copies of a row
-    are sampled or none.
-    """
-    if not names or (sampling_interval := row_sampling_interval(logs)) <= 1:
-        return logs
-    sampled_hashes = [
-        hashes[hashes % np.uint64(sampling_interval) == 0]
-        for hashes in (hash_rows(log, names) for log in logs)
-    ]
-    rows, n_occurrences = np.unique(np.concatenate(sampled_hashes), return_counts=True)
-    shared_hashes = rows[(n_occurrences > 1) & (n_occurrences <= 2 * len(logs))]
-    may_share_rows = [
-        int(np.isin(hashes_of_log, shared_hashes).sum()) * sampling_interval >= _MIN_COPIED_ROWS
-        for hashes_of_log in sampled_hashes
-    ]
-    return list(itertools.compress(logs, may_share_rows))
-
-
-def _find_shared_rows(
-    logs: Sequence[Log], names: Sequence[str]
-) -> dict[tuple[int, int, int], list[int]]:
-    """Return the rows with equal values by indices of both logs and difference of row numbers.
-
-    Args:
-        logs: logs to compare; at least one.
-        names: channels that are compared.
-
-    Returns:
-        (i, j, offset) -> row numbers in log i, whose copies are `offset` rows later in log j.
-    """
-    # each row is hashed independently, so all logs can be hashed in one call
-    if len(logs) == 1:
-        # concatenating would copy all channels of a long log
-        joined_log = logs[0]
-    else:
-        joined_log = Log(
-            "together",
-            np.concatenate([log.t for log in logs]),
-            {name: np.concatenate([log[name] for log in logs]) for name in names},
-            logs[0].units,
-        )
-    hashes = np.split(hash_rows(joined_log, names), np.cumsum([len(log) for log in logs])[:-1])
-    log_indices = np.repeat(np.arange(len(logs)), [hashes_of_log.size for hashes_of_log in hashes])
-    row_indices = np.concatenate([np.arange(hashes_of_log.size) for hashes_of_log in hashes])
-    _, hash_indices, n_occurrences = np.unique(
-        np.concatenate(hashes), return_inverse=True, return_counts=True
-    )
-    # rows with many occurrences belong to a vessel at rest
-    shared_rows = np.flatnonzero(
-        (n_occurrences[hash_indices] > 1) & (n_occurrences[hash_indices] <= 2 * len(logs))
-    )
-    shared_rows = shared_rows[np.argsort(hash_indices[shared_rows], kind="stable")]
-    rows_by_pair: dict[tuple[int, int, int], list[int]] = {}
-    for _, equal_rows in itertools.groupby(
-        shared_rows.tolist(), key=lambda i: int(hash_indices[i])
-    ):
-        for i, j in itertools.combinations(sorted(equal_rows), 2):
-            key = int(log_indices[i]), int(log_indices[j]), int(row_indices[j] - row_indices[i])
-            rows_by_pair.setdefault(key, []).append(int(row_indices[i]))
-    return rows_by_pair
+            yield _describe_copy(logs, logs.logs[i], logs.logs[j], figures, make_finding)
 
 
 def _describe_copy(
-    logs: LogSet, a: Log, b: Log, figures: Mapping[str, float], make_finding: Check
+    logs: LogSet,
+    a: LogStatistics,
+    b: LogStatistics,
+    figures: Mapping[str, float],
+    make_finding: Check,
 ) -> Finding:
     """Return the finding on rows of log `a` that occur in log `b`.
 
@@ -223,14 +167,14 @@ def _describe_copy(
         make_finding: constructor of the finding.
     """
     n_copied = int(figures["rows"])
-    records = {log.name: log for log in logs.logs}
-    split_conflict = logs.split_conflict(records[a.name], records[b.name])
+    split_conflict = logs.split_conflict(a, b)
     level: Level = "fatal" if split_conflict else "will mislead"
     if logs.splits and not {a.name, b.name} <= logs.splits.keys():
         # the config already excludes one of the logs
         level = "note"
     conflict_text = f" ({split_conflict})" if split_conflict else ""
-    if n_copied >= max(len(a), len(b)) - 1:
+    # of very many rows the first and the last one are not in the sample
+    if n_copied >= 0.99 * max(len(a), len(b)):
         text = f"{a.name} and {b.name} are the same{conflict_text}"
         fix = "exclude one of them"
         return make_finding(text, figures, code="duplicate_log", level=level, fix=fix)
@@ -244,95 +188,39 @@ def _describe_copy(
     return make_finding(text, figures, level=level)
 
 
-_COMPARED_STATES = ("x", "y", "u", "v", "r")
-
-
-@check("between", "continued", "note")
-def check_continued_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Report a log that continues another one: a run that was split into files."""
-    is_comparable = [
-        len(log) >= 20 and sum(n in log for n in _COMPARED_STATES) >= 4 for log in logs.logs
-    ]
-    if sum(is_comparable) < 2:
-        return
-
-    def compute_per_log(statistic: Callable[[np.ndarray], float]) -> np.ndarray:
-        """Return a statistic per log and state [L, 5]; NaN for missing states."""
-        return np.array(
-            [
-                [statistic(log[n]) if n in log else np.nan for n in _COMPARED_STATES]
-                for log in logs.logs
-            ]
-        )
-
-    initial_states = compute_per_log(lambda x: float(x[:3].mean()))
-    final_states = compute_per_log(lambda x: float(x[-3:].mean()))
-    noise_levels = compute_per_log(estimate_noise_std)
-    high_levels = compute_per_log(lambda x: float(abs_quantile(x, 0.9)))
-    typical_changes = compute_per_log(lambda x: nan_median(np.abs(np.diff(x))))
-    for i, a in enumerate(logs.logs):
-        normalized_differences = np.abs(initial_states - final_states[i]) / np.maximum(
-            typical_changes[i] + noise_levels[i] + noise_levels, 1e-12
-        )
-        max_differences = np.nan_to_num(
-            np.max(np.where(np.isnan(normalized_differences), 0.0, normalized_differences), axis=1)
-        )
-        for j in np.flatnonzero(max_differences <= 30.0):
-            b = logs.logs[j]
-            if j == i or not (is_comparable[i] and is_comparable[j]):
-                continue
-            pause_duration = float(b.t[0] - a.t[-1])
-            start_offset = float(abs(b.t[0]))
-            is_contiguous = (
-                min(abs(a.t[-1]), start_offset) > 2.0 * a.sampling_interval
-                and 0.0 < pause_duration < 3.0 * a.sampling_interval
-            )
-            # two runs may begin and end at rest at the same berth
-            is_at_rest = math.hypot(*final_states[i, 2:4]) < 0.2 * math.hypot(*high_levels[i, 2:4])
-            has_restarted_clock = (
-                abs(b.t[0] - a.t[0]) <= 1e-9 or b.t[0] <= 2.0 * a.sampling_interval
-            )
-            if not is_contiguous and (
-                not has_restarted_clock or max_differences[j] > 8.0 or is_at_rest
-            ):
-                continue
-            split_conflict = logs.split_conflict(a, b)
-            text = f"{b.name} continues where {a.name} ends"
-            text += (
-                f", {pause_duration:.2f} s later: a run that was split into files"
-                if is_contiguous
-                else ""
-            )
-            text += f"; they belong to {split_conflict}" if split_conflict else ""
-            fix = "put them into one split" if split_conflict or not logs.splits else ""
-            yield make_finding(text, {"pause": pause_duration}, fix=fix)
-
-
 @check(
     "between",
     "overlapping",
     "note",
     "two vessels, or two recordings of one run? put them into one split",
 )
-def check_overlapping_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Report logs that overlap in time."""
-    start_times, end_times = np.array([(log.t[0], log.t[-1]) for log in logs.logs]).T
-    for i, a in enumerate(logs.logs if float(end_times.max()) > _MIN_UNIX_TIME else ()):
-        overlap_durations = np.minimum(a.t[-1], end_times[i + 1 :]) - np.maximum(
-            a.t[0], start_times[i + 1 :]
-        )
-        is_dated = np.minimum(a.t[0], start_times[i + 1 :]) > _MIN_UNIX_TIME
-        for j in np.flatnonzero(is_dated & (overlap_durations > 0.0)).tolist():
-            b = logs.logs[i + 1 + j]
-            overlap_duration = float(overlap_durations[j])
-            yield make_finding(
-                f"{a.name} and {b.name} overlap in time for {overlap_duration:.1f} s",
-                {"seconds": overlap_duration},
-            )
+def check_recording_times(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
+    """Report logs with one clock that overlap in time, or of which one continues the other."""
+    ordered_logs = sorted(logs.logs, key=lambda log: float(log.t[0]))
+    for i, a in enumerate(ordered_logs):
+        # logs whose clocks start at zero have no common clock
+        is_dated = a.t[0] > _MIN_UNIX_TIME
+        for b in ordered_logs[i + 1 :]:
+            pause = float(b.t[0] - a.t[-1])
+            if pause >= 3.0 * a.sampling_interval:
+                break
+            if pause > 0.0 and b.t[0] > 2.0 * a.sampling_interval:
+                split_conflict = logs.split_conflict(a, b)
+                text = (
+                    f"{b.name} continues where {a.name} ends, {pause:.2f} s later: a run that was"
+                    " split into files"
+                )
+                text += f"; they belong to {split_conflict}" if split_conflict else ""
+                fix = "put them into one split" if split_conflict or not logs.splits else ""
+                yield make_finding(text, {"pause": pause}, code="continued", fix=fix)
+            elif pause < 0.0 and is_dated:
+                seconds = min(-pause, float(b.t[-1] - b.t[0]))
+                text = f"{a.name} and {b.name} overlap in time for {seconds:.1f} s"
+                yield make_finding(text, {"seconds": seconds})
 
 
-_COMPARED_ROWS = 50 * 4 ** np.arange(12) - 1
-"""Rows at which commands are compared first; manoeuvres may have equal starts."""
+_MIN_EQUAL_COMMANDS = 50
+"""Smallest number of samples of logs with the same commands."""
 
 
 @check(
@@ -344,33 +232,17 @@ _COMPARED_ROWS = 50 * 4 ** np.arange(12) - 1
 def check_same_commands(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     """Report logs with identical commands."""
     names = [name for name in logs.inputs if not name.startswith(("wind", "current"))]
-    sampled_commands = np.full((len(logs.logs), len(names), _COMPARED_ROWS.size), np.nan)
-    for i, log in enumerate(logs.logs if names else ()):
-        sampled_rows = _COMPARED_ROWS[len(log) > _COMPARED_ROWS]
-        sampled_commands[i, :, : sampled_rows.size] = [log[name][sampled_rows] for name in names]
-    is_close = functools.partial(np.isclose, rtol=1e-6, atol=1e-9)
-    for i, a in enumerate(logs.logs if names else ()):
-        later_commands = sampled_commands[i + 1 :]
-        # a command that is constant in the compared rows does not distinguish logs
-        is_changing = (np.abs(np.diff(sampled_commands[i])) > 0.0) & np.isfinite(
-            later_commands[..., 1:]
-        )
-        is_different = (
-            ~is_close(sampled_commands[i], later_commands)
-            & np.isfinite(sampled_commands[i] - later_commands)
-            & is_changing.any(-1, keepdims=True)
-        )
-        for b in itertools.compress(logs.logs[i + 1 :], ~is_different.any(axis=(1, 2))):
+    logs_by_first_commands: dict[bytes, list[LogStatistics]] = {}
+    for log in logs.logs if names else ():
+        first_commands = log.log.stack(names)[:_MIN_EQUAL_COMMANDS]
+        if len(first_commands) == _MIN_EQUAL_COMMANDS:
+            logs_by_first_commands.setdefault(first_commands.tobytes(), []).append(log)
+    for group in logs_by_first_commands.values():
+        for a, b in itertools.combinations(group, 2):
             n_common = min(len(a), len(b))
             moving_inputs = [name for name in names if nan_std(a[name][:n_common]) > 1e-9]
-            command_pairs = ((a[name][:n_common], b[name][:n_common]) for name in moving_inputs)
-            if (
-                n_common < 50
-                or not moving_inputs
-                or not all(
-                    is_close(*command_pair, equal_nan=True).all() for command_pair in command_pairs
-                )
-            ):
+            commands, other_commands = (log.log.stack(moving_inputs)[:n_common] for log in (a, b))
+            if not moving_inputs or not np.array_equal(commands, other_commands, equal_nan=True):
                 continue
             split_conflict = logs.split_conflict(a, b)
             text = (
