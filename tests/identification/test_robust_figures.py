@@ -9,17 +9,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from fleets import drawn
 from random_vessels import small_boat_logs
 
 import residnet
 from residnet.core.log import Log
-from residnet.core.progress import on_progress
-from residnet.identification.prepared import mask_unexplained_idle
 from residnet.identification.recipe import compute_winsorized_std
-from residnet.preprocessing.align import GridConfig
-from residnet.preprocessing.masks import UNEXPLAINED_IDLE
-from residnet.preprocessing.prepare import PrepareConfig
 
 INPUTS = ("n_port", "n_stbd")
 Splits = dict[str, list[Log]]
@@ -120,46 +114,3 @@ def test_winsorized_std_equals_the_standard_deviation_and_ignores_a_spike() -> N
     assert compute_winsorized_std(few) == pytest.approx(np.std(values[:40]), rel=0.1)
     assert compute_winsorized_std(np.full(3, np.nan)) == 0.0
     assert compute_winsorized_std(np.array([4.0])) == 0.0
-
-
-def rest_inputs(log: Log) -> Log:
-    """Replace the inputs of a stretch by zero, as a dead record does."""
-    channels = {name: values.copy() for name, values in log.channels.items()}
-    rows = slice(len(log) // 2, len(log) // 2 + round(0.15 * len(log)))
-    for name in INPUTS:
-        channels[name][rows] = 0.0
-    return log.replace(channels=channels)
-
-
-@pytest.fixture(scope="module")
-def idle_splits() -> Splits:
-    """Every split has a log with a stretch of zero inputs that do not explain the motion."""
-    logs = drawn("twin", 11, 3)[2].logs
-    return {
-        "train": [rest_inputs(logs[2]), *logs[3:]],
-        "validation": [rest_inputs(logs[1])],
-        "test": [rest_inputs(logs[0])],
-    }
-
-
-# 6 s; test_values_of_a_masked_stretch_enter_no_figure masks, too
-@pytest.mark.long
-def test_unexplained_stretches_are_masked_in_training_only_and_only_on_request(
-    idle_splits: Splits,
-) -> None:
-    keep = PrepareConfig(grid=GridConfig(step=0.1))
-    assert mask_unexplained_idle(idle_splits, keep, INPUTS) == idle_splits
-    messages: list[str] = []
-    with on_progress(lambda event: messages.append(str(event))):
-        masked = mask_unexplained_idle(
-            idle_splits, keep.model_copy(update={"dead_commands": "mask"}), INPUTS
-        )
-    assert masked["train"][0].masks[UNEXPLAINED_IDLE].any()
-    assert masked["validation"] == idle_splits["validation"]
-    assert masked["test"] == idle_splits["test"]
-    assert "excluded from training" in " ".join(messages)
-    findings = residnet.inspect(idle_splits["train"], inputs=INPUTS)
-    (row,) = findings[findings["code"] == "dead_commands"].to_dict("records")
-    assert row["level"] == "note"
-    assert "?" in row["text"]
-    assert "prepare.dead_commands: mask" in row["action"]

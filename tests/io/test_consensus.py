@@ -11,8 +11,6 @@ from fleets import CONTRADICTIONS, Fleet, drawn
 
 from residnet.core.log import Log
 from residnet.quality import Finding, inspect_log_set
-from residnet.quality.consensus import find_unexplained_idle
-from residnet.quality.statistics import LogStatistics
 from residnet.tasks.fit.config import FitConfig
 from residnet.tasks.registry import load_task
 
@@ -121,32 +119,6 @@ def test_find_consensus_with_a_shared_fault_flags_all_logs_with_it(
     named = find_contradictions([*wrong, *logs[3:]], fleet)
     assert sorted(one.text.split(":")[0] for one in named) == [log.name for log in logs[:3]]
     assert {one.code for one in named} == {f"contradicts_{cause}"}
-
-
-def _hand_on_the_wheel(fleet: Fleet) -> tuple[list[Log], slice]:
-    """Replace the inputs of a stretch of the first log by their rest at zero."""
-    log = fleet.logs[0]
-    rows = slice(len(log) // 2, len(log) // 2 + round(0.15 * len(log)))
-    channels = {name: values.copy() for name, values in log.channels.items()}
-    for name in fleet.inputs:
-        channels[name][rows] = 0.0
-    return [log.replace(channels=channels), *fleet.logs[1:]], rows
-
-
-def test_find_unexplained_idle_returns_the_planted_stretch(fleets: list[Fleet]) -> None:
-    fleet = fleets[0]
-    records = [LogStatistics(log, fleet.inputs) for log in fleet.logs]
-    assert find_unexplained_idle(records, [], fleet.inputs) == {}
-    logs, rows = _hand_on_the_wheel(fleet)
-    records = [LogStatistics(log, fleet.inputs) for log in logs]
-    for training, predicted_only in ((records, []), (records[1:], records[:1])):
-        ((start, stop),) = find_unexplained_idle(training, predicted_only, fleet.inputs)[
-            logs[0].name
-        ]
-        assert abs(start - rows.start) <= 1
-        assert abs(stop - rows.stop) <= 1
-    (told,) = inspect_log_set(logs, fleet.inputs).find_by_code("dead_commands")
-    assert told.text.startswith(logs[0].name)
 
 
 def test_find_consensus_without_majority_says_so() -> None:

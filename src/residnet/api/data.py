@@ -27,7 +27,6 @@ from residnet.core.log import Log
 from residnet.core.names import suggest_name
 from residnet.core.progress import ProgressCallback, log_message, report_progress
 from residnet.evaluation.protocol import EvaluationConfig, longest_segment_length
-from residnet.identification.prepared import mask_unexplained_idle
 from residnet.identification.recipe import PreparationPlan, make_evaluation_settings
 from residnet.io.drafting.log_files import find_log_files
 from residnet.io.drafting.questions import (
@@ -442,7 +441,7 @@ def prepare(
         settings_from: dataset whose settings are used; all logs then form the split `external`.
         progress: called with the progress of the work.
         settings: further keys of the sections `signals` (exogenous, forces, velocities),
-            `prepare` (masks, derivative, motion, trim, hold, beside, dead_commands) and
+            `prepare` (masks, derivative, motion, trim, hold, beside) and
             `evaluation` (protocols, selection, scales, groups, divergence) of a config, as in YAML;
             without `selection` the first of `protocols` is used for model selection.
 
@@ -626,7 +625,6 @@ def _validate_masks(masks: Any, function_name: str) -> tuple[MaskRule, ...]:
 def _prepare_splits(
     splits: Mapping[str, Sequence[Log]], signals: SignalsConfig, config: PrepareConfig
 ) -> dict[str, list[PreparedLog]]:
-    splits = mask_unexplained_idle(splits, config, signals.regressor_columns)
     n_done = 0
     total = sum(map(len, splits.values()))
     prepared: dict[str, list[PreparedLog]] = {}

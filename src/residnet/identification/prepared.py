@@ -14,8 +14,7 @@ from residnet.core.log import Log
 from residnet.core.progress import log_message
 from residnet.evaluation.protocol import longest_segment_length
 from residnet.identification.settings import FitSettings
-from residnet.preprocessing.masks import UNEXPLAINED_IDLE
-from residnet.preprocessing.prepare import PrepareConfig, PreparedLog, prepare_log
+from residnet.preprocessing.prepare import PreparedLog, prepare_log
 from residnet.training.records import CurrentRow
 
 _MAX_SAMPLES = 500_000
@@ -34,7 +33,6 @@ def prepare_splits(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -
         DataError: if a training log has no usable sample, or another log no window of a protocol.
     """
     signals = settings.signals
-    splits = mask_unexplained_idle(splits, settings.prepare, signals.regressor_columns)
     prepared = {
         split: paged.PageReleasingList(
             prepare_log(log_part, split, signals.input_columns, settings.prepare, signals.dof)
@@ -84,49 +82,6 @@ def _report_sources(logs: Sequence[PreparedLog]) -> None:
             log_message(
                 f"  {log.log.name}: spikes are interpolated and masked (samples: {counts_text})"
             )
-
-
-def mask_unexplained_idle(
-    splits: Mapping[str, Sequence[Log]], config: PrepareConfig, input_names: Sequence[str]
-) -> dict[str, Sequence[Log]]:
-    """Mask idle segments of training logs whose motion is unexplained, if the config asks for it.
-
-    In an idle segment all inputs are constant. Its motion is unexplained if a model fitted to the
-    other logs does not predict it, for example if the vessel was controlled by hand while the
-    logged commands stood still.
-
-    Validation and test logs are returned unchanged, since errors of the models in such stretches
-    must count.
-
-    Args:
-        splits: canonical logs by split.
-        config: preparation settings; `dead_commands` says whether to mask.
-        input_names: input channels of the model.
-    """
-    if config.dead_commands == "keep" or "train" not in splits:
-        return dict(splits)
-    # reading a config must not import the data checks
-    from residnet.quality.consensus import find_unexplained_idle
-    from residnet.quality.statistics import LogStatistics
-
-    reference_logs = [*splits["train"], *splits.get("validation", ())]
-    idle_segments = find_unexplained_idle(
-        [LogStatistics(log, input_names) for log in reference_logs], [], input_names
-    )
-
-    def mask_log(log: Log) -> Log:
-        is_idle = np.zeros(len(log), dtype=bool)
-        for first, last in idle_segments.get(log.name, ()):
-            is_idle[first : last + 1] = True
-            log_message(
-                f"  {log.name}: t = {log.t[first]:.1f} to {log.t[last]:.1f} s is excluded from"
-                " training (prepare.dead_commands: mask): all inputs are constant and the other"
-                " logs do not explain the motion"
-            )
-        masks = {**log.masks, UNEXPLAINED_IDLE: is_idle}
-        return log.replace(masks=masks) if is_idle.any() else log
-
-    return {**splits, "train": [mask_log(log) for log in splits["train"]]}
 
 
 def split_long_log(log: Log) -> list[Log]:

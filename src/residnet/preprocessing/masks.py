@@ -32,8 +32,6 @@ from residnet.preprocessing.channel_values import (
 
 HARD_PREFIX = "hard:"
 RATE_PREFIX = "rate:"
-UNEXPLAINED_IDLE = f"{HARD_PREFIX}dead_commands"
-"""Reason of motion that no input explains while all inputs are constant (`PrepareConfig`)."""
 
 
 class MaskRule(Config, ABC):

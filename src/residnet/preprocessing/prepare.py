@@ -53,11 +53,6 @@ class PrepareConfig(Config):
             the derivative filter, with the weights of the filter. With `means` the derivative does
             not lag a step of an input, and short oscillations are attenuated equally on both sides
             of the equation.
-        dead_commands: treatment of stretches of training logs in which all inputs are constant
-            while the vessel moves as no model of the other logs explains: a steady manoeuvre,
-            manual control, or a stopped recorder. `residnet inspect` asks the user which it was.
-            `keep` trains on them, `mask` splits training logs there. Validation and test logs are
-            never masked, since errors of unexplained motion are errors of the models.
     """
 
     grid: GridConfig
@@ -67,7 +62,6 @@ class PrepareConfig(Config):
     trim: Seconds = Field(default=0.0, ge=0)
     hold: Literal["start", "mean"] = "start"
     beside: Literal["samples", "means"] = "samples"
-    dead_commands: Literal["mask", "keep"] = "keep"
 
 
 @dataclass(frozen=True)

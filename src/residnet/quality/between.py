@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 
@@ -24,7 +25,6 @@ from residnet.preprocessing.statistics import MIN_SAMPLES
 from residnet.quality.consensus import (
     Consensus,
     find_consensus,
-    find_dead_steering,
 )
 from residnet.quality.excitation import compute_condition_number, format_names
 from residnet.quality.findings import (
@@ -39,8 +39,11 @@ from residnet.quality.outlier_causes import rank_hypotheses
 from residnet.quality.statistics import (
     MIN_TURN_SHARE,
     MOTION_CHANNELS,
+    STEERING_CHANNELS,
     LogStatistics,
     compute_port_share,
+    count_reversals,
+    interpolate_gaps,
     moving_average,
 )
 from residnet.regression.pair_symmetry import assess_pair_symmetry
@@ -284,6 +287,10 @@ def check_extrapolation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
                 yield make_finding(text, {"share": share_outside}, level=level)
 
 
+_MIN_SPREAD = 1e-3
+"""Relative standard deviation of an input below which it is constant."""
+
+
 def _relative_spread(*value_arrays: np.ndarray) -> float:
     """Return the standard deviation of a channel beyond its noise, over its largest value."""
     finite_values = np.concatenate(value_arrays)
@@ -355,7 +362,7 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     # inputs that are constant in each log but differ among logs carry information
     if (
         driving_inputs
-        and max(max_spread_within_logs.values()) < 1e-3
+        and max(max_spread_within_logs.values()) < _MIN_SPREAD
         and max(spread_among_logs.values()) <= 1e-2
     ):
         text = f"no input ({', '.join(driving_inputs)}) varies within any of {n_logs} logs"
@@ -364,7 +371,7 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     constant_inputs = [
         name
         for name in driving_inputs
-        if max(max_spread_within_logs[name], spread_among_logs[name]) < 1e-3
+        if max(max_spread_within_logs[name], spread_among_logs[name]) < _MIN_SPREAD
     ]
     if constant_inputs:
         text = (
@@ -403,6 +410,57 @@ def check_excitation(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
         )
 
 
+_MIN_SWING = math.radians(20.0)
+"""Swing of a heading to both sides that was steered.
+
+Gusts cause it in at most one of ten straight runs; in steered fleets at least three of ten logs do
+it.
+"""
+_MIN_WEAVING_SHARE = 0.2
+"""Share of logs with such a heading from which a vessel was steered."""
+
+
+def find_dead_steering(logs: LogSet) -> list[str]:
+    """Return steering records that are constant in every log though the headings swing.
+
+    On a vessel with a propeller on either side, both steer.
+    """
+    pairs = port_starboard_pairs(logs.inputs)
+    partners = pairs | {stbd: port for port, stbd in pairs.items()}
+    steering = [name for name in logs.inputs if name in STEERING_CHANNELS or name in partners]
+    varying = [
+        name
+        for name in steering
+        if any(_relative_spread(log[name]) > _MIN_SPREAD for log in logs.logs)
+    ]
+    # another rudder may have steered
+    if "r" not in logs or not {*STEERING_CHANNELS}.isdisjoint(varying):
+        return []
+
+    def is_weaving(log: LogStatistics) -> bool:
+        integrated = np.cumsum(np.nan_to_num(log["r"])) * log.sampling_interval
+        heading = interpolate_gaps(log.t, log["psi"]) if "psi" in log else integrated
+        return count_reversals(heading, _MIN_SWING) >= 2
+
+    if np.mean([is_weaving(log.subsample) for log in logs.logs]) < _MIN_WEAVING_SHARE:
+        return []
+    return [
+        name
+        for name in steering
+        if name not in varying and (partners[name] in varying if name in partners else not varying)
+    ]
+
+
+@check("between", "contradicts_dead", fix="find the channel that holds the steering")
+def check_dead_steering(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
+    """Report steering records that are constant in every log though the vessel was steered."""
+    for name in find_dead_steering(logs):
+        yield make_finding(
+            f"{name} is constant in every log while the heading swings by more than"
+            f" {math.degrees(_MIN_SWING):.0f} deg to both sides: its record is dead"
+        )
+
+
 _MIN_DEVIANCE_DIFFERENCE = 3.84
 """Smallest difference of deviances of a significant change: 95 % quantile of chi-squared."""
 
@@ -410,20 +468,7 @@ _MIN_DEVIANCE_DIFFERENCE = 3.84
 @check("between", "contradicts", fix="")
 def check_contradicting_logs(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
     """Report logs that a model of the other logs does not explain, with the likeliest cause."""
-    consensus = logs.consensus
-    if consensus is None:
-        return
-    dead_steering, unexplained_share = find_dead_steering(consensus)
-    for name in dead_steering:
-        text = (
-            f"{name} is constant in every log, and no recorded channel explains"
-            f" {format_share(unexplained_share)} of the changes of the yaw rate: its record is dead"
-        )
-        fix = "find the channel that holds the steering"
-        yield make_finding(
-            text, {"unexplained": unexplained_share}, code="contradicts_dead", fix=fix
-        )
-    if dead_steering:
+    if find_dead_steering(logs) or (consensus := logs.consensus) is None:
         # without the steering no log explains another
         return
     # no log is accused by a model that does not explain the agreeing logs
@@ -482,30 +527,6 @@ _ACTIONS = {
     "vessel": "exclude it, or fit it separately",
 }
 """Kind of hypothesis -> recommended action."""
-
-
-@check(
-    "between",
-    "dead_commands",
-    "note",
-    fix="if the record is wrong there, prepare.dead_commands: mask excludes it from training",
-)
-def check_unexplained_idle(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Ask about motion that no recorded input explains while all inputs are constant.
-
-    Steady turns and full-power runs look the same, so the user decides.
-    """
-    consensus = logs.consensus
-    for i in consensus.fleet.usable if consensus else ():
-        log = logs.logs[i]
-        for start, stop in consensus.find_unexplained_idle(i) if consensus else ():
-            text = (
-                f"{log.name}: from t = {log.t[start]:.1f} to {log.t[stop]:.1f} s all inputs are"
-                " constant and no other log explains the motion: was this a manoeuvre (steady turn,"
-                " full power), or manual control or a stopped recorder?"
-            )
-            seconds = log.t[stop] - log.t[start]
-            yield make_finding(text, {"t": log.t[start], "seconds": seconds})
 
 
 @check("between", "asymmetric_pair", "note")

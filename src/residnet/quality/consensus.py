@@ -24,17 +24,13 @@ from functools import cached_property
 
 import numpy as np
 
-from residnet.core.arrays.paged import MAX_SAMPLES_IN_MEMORY
 from residnet.core.layout import SIX_DOF_LAYOUT
 from residnet.core.names import VELOCITY_NAMES, azimuth_thrusters
 from residnet.core.stretches import find_runs
 from residnet.preprocessing.channel_values import SIGMA_OF_MAD
 from residnet.preprocessing.statistics import MIN_SAMPLES
 from residnet.quality.statistics import (
-    STEERING_CHANNELS,
     LogStatistics,
-    count_reversals,
-    interpolate_gaps,
     make_blocks,
 )
 
@@ -93,12 +89,6 @@ RANGE_MARGIN = 0.1
 """Share of the inliers' range by which an input may exceed it without extrapolation."""
 SIZE_MARGIN = 0.02
 """Share of the inliers' largest value by which an input may exceed their range."""
-# Motion that no input explains. Of 92 idle stretches of KVLCC2's logs none reaches 3.2; of 311 of
-# the tanker's six do, among them all three in which she accelerates with all inputs at exactly 0.
-MIN_UNEXPLAINED_Z = 5.5
-"""Smallest RMS standardised residual of an unexplained idle stretch."""
-MAX_UNEXPLAINED_SHARE = 0.2
-"""Share of a log up to which such stretches are manual control instead of a wrong log."""
 MIN_RELATIVE_STD = 1e-3
 """Relative standard deviation of an input below which it is constant."""
 Samples = Mapping[str, np.ndarray]
@@ -633,13 +623,11 @@ class Consensus:
         fleet: the logs with the data of the decision.
         inliers: indices of the agreeing logs.
         outliers: indices of the contradicting logs, the most severe first.
-        idle: cache of the unexplained idle stretches by log.
     """
 
     fleet: Fleet
     inliers: list[int]
     outliers: list[int] = field(default_factory=list)
-    idle: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
 
     @cached_property
     def excess_var(self) -> dict[int, np.ndarray]:
@@ -716,74 +704,6 @@ class Consensus:
     def compute_residual_share(self) -> np.ndarray:
         """Return the unexplained share of the change of each velocity [n]."""
         return np.asarray(np.sqrt(np.median([*self.excess_var.values()], axis=0)))
-
-    def find_unexplained_idle(self, i: int) -> list[tuple[int, int]]:
-        """Return the unexplained idle stretches of one of the logs, first and last samples."""
-        if i not in self.fleet.usable or len(self.inliers) < 2 or not self.fleet.actuators:
-            return []
-        if i not in self.idle:
-            # all of an outlier is unexplained, so there only inputs at exactly zero count
-            at_zero = i not in self.inliers
-
-            def find_under(consensus: Consensus) -> list[tuple[int, int]]:
-                fleet = consensus.fleet
-                return consensus.find_idle_stretches(
-                    fleet.logs[i], fleet.data[i], i, at_zero=at_zero
-                )
-
-            stretches = find_under(self)
-            # where the features lack terms of the vessel, the model with these terms decides
-            if stretches and self.adequate is not self:
-                stretches = find_under(self.adequate) if self.adequate else []
-            self.idle[i] = stretches
-        return self.idle[i]
-
-    def find_idle_stretches(
-        self,
-        log: LogStatistics,
-        data: BlockData,
-        excluding: int | None = None,
-        *,
-        at_zero: bool = False,
-    ) -> list[tuple[int, int]]:
-        """Return stretches in which all inputs are constant and nothing explains the motion.
-
-        Empty if they exceed a fifth of the log, which then is wrong as a whole.
-
-        Args:
-            excluding: log that the model is not fitted to.
-            at_zero: inputs must be exactly zero.
-        """
-        inputs = log.log.stack(self.fleet.actuators)
-        constant = (np.diff(inputs, axis=0) == 0.0).all(1)
-        if at_zero:
-            constant &= (inputs[1:] == 0.0).all(1)
-        starts, stops = find_runs(np.append(constant, False))
-        is_long = stops - starts >= data.length
-        if not is_long.any():
-            return []
-        fit = self.fit_inliers(excluding)
-        z = fit.standardize_residuals(data)
-        idle = []
-        # a steady turn or a stop is unlike the median motion: its lack of fit is that of like ones
-        has_replicates = len(self.inliers) > MAX_SPARSE_LOGS
-        local_squares = (
-            self.fleet.estimate_local_squares(self.inliers, data, excluding)
-            if has_replicates
-            else np.zeros_like(z)
-        )
-        usual_squares = fit.compute_predictive_std(data) ** 2
-        for start, stop in zip(starts[is_long].tolist(), stops[is_long].tolist(), strict=True):
-            inside = (data.start >= start) & (data.start + data.length <= stop)
-            if inside.sum() > 1:
-                variance_ratio = local_squares[inside].mean(0) / usual_squares[inside].mean(0)
-                mean_square = np.mean(z[inside] ** 2, axis=0) / np.maximum(variance_ratio, 1.0)
-                unexplained = np.sqrt(mean_square) > MIN_UNEXPLAINED_Z
-                material = np.sqrt(np.mean(data.Y[inside] ** 2, axis=0)) > MIN_MATERIAL_ERROR
-                if (unexplained & material).any():
-                    idle.append((start, stop))
-        is_mostly_idle = sum(b - a for a, b in idle) > MAX_UNEXPLAINED_SHARE * len(log)
-        return [] if is_mostly_idle else idle
 
     def is_only_extrapolating(self, i: int) -> bool:
         """Return whether a log is an outlier only outside of the inliers' range of inputs.
@@ -870,104 +790,13 @@ def _partition_logs(fleet: Fleet, start: Sequence[int]) -> Consensus:
         if worst < 0:
             break
         inliers.remove(worst)
-    consensus = Consensus(fleet, inliers)
     remaining = [i for i in fleet.usable if i not in inliers]
-    # some seconds of manual control do not make a log an outlier
-    trimmed = {}
-    for i in remaining:
-        data = fleet.data[i]
-        idle = np.array(consensus.find_unexplained_idle(i), dtype=int).reshape(-1, 2)
-        is_clear = (data.start[:, None] + data.length <= idle[:, 0]) | (
-            data.start[:, None] >= idle[:, 1]
-        )
-        clear_data = data.subset(np.asarray(is_clear.all(axis=1)))
-        trimmed[i] = clear_data if clear_data.is_sufficient else data
-    scores = fleet.with_data(trimmed).score_logs(inliers, remaining) if remaining else {}
-    rejoined = {i: trimmed[i] for i in remaining if scores[i].severity <= 1.0}
-    outliers = sorted(set(remaining) - set(rejoined), key=lambda i: -scores[i].severity)
-    inliers = sorted((*inliers, *rejoined))
-    return Consensus(fleet.with_data(rejoined), inliers, outliers, consensus.idle)
+    scores = fleet.score_logs(inliers, remaining) if remaining else {}
+    rejoined = [i for i in remaining if scores[i].severity <= 1.0]
+    outliers = sorted({*remaining} - {*rejoined}, key=lambda i: -scores[i].severity)
+    return Consensus(fleet, sorted((*inliers, *rejoined)), outliers)
 
 
 def replace_channels(log: LogStatistics, channels: Mapping[str, np.ndarray]) -> LogStatistics:
     """Return the log with new or replaced channels [T]; its statistics are computed again."""
     return LogStatistics(log.log.replace(channels={**log.log.channels, **channels}), log.inputs)
-
-
-# --- dead inputs -----------------------------------------------------------------------------
-
-
-def find_unexplained_idle(
-    training: Sequence[LogStatistics],
-    predicted_only: Sequence[LogStatistics],
-    inputs: Sequence[str],
-) -> dict[str, list[tuple[int, int]]]:
-    """Return stretches of motion that no recorded input explains while all inputs are constant.
-
-    Causes are manual control or a stopped recorder.
-
-    Args:
-        training: logs that the models are fitted to; each is predicted by a model of the
-            other training logs.
-        predicted_only: logs that are predicted by the model of the training logs.
-        inputs: channels that drive the vessel.
-
-    Returns:
-        Name of a log -> first and last samples.
-    """
-
-    def is_usable(log: LogStatistics) -> bool:
-        sampled = 1 < len(log) <= MAX_SAMPLES_IN_MEMORY and bool((np.diff(log.t) > 0.0).all())
-        return sampled and all(name in log for name in inputs)
-
-    logs = [log for log in training if is_usable(log)]
-    if not any(all(name in log for log in logs) for name in VELOCITY_NAMES) or not logs:
-        return {}
-    consensus = find_consensus(logs, inputs)
-    fleet = consensus.fleet
-    idle = {log.name: consensus.find_unexplained_idle(i) for i, log in enumerate(logs)}
-    if len(consensus.inliers) > 1 and fleet.actuators:
-        for log in predicted_only:
-            if is_usable(log) and set(fleet.velocities) <= set(log):
-                idle[log.name] = consensus.find_idle_stretches(log, fleet.assemble_scaled(log))
-    return {name: stretches for name, stretches in idle.items() if stretches}
-
-
-# The residual share of the changes of r is .02 to .31 with valid records, and .30 to .71 with dead
-# steering (40 fleets of scripts/bench/fleets.py).
-MIN_UNSTEERED_SHARE = 0.3
-# A heading that swings this far to both sides was steered: gusts cause it in at most one of ten
-# straight runs; in steered fleets at least three of ten logs do it.
-MIN_SWING = math.radians(20.0)
-MIN_WEAVING_SHARE = 0.2
-"""Share of logs with such a heading from which a fleet was steered."""
-
-
-def find_dead_steering(consensus: Consensus) -> tuple[list[str], float]:
-    """Return steering records that are constant in every log, and the unexplained share of yaw.
-
-    The list is empty where one of them varies, or where the other inputs explain the yaw rate.
-    On a vessel with a propeller on either side, both steer.
-    """
-    fleet = consensus.fleet
-    if "r" not in fleet.velocities or len(consensus.inliers) < 2:
-        return [], 0.0
-
-    def is_always_constant(name: str) -> bool:
-        sizes = (max(float(np.nanmax(np.abs(log[name]))), 1e-12) for log in fleet.logs)
-        pairs = zip(fleet.logs, sizes, strict=True)
-        return all(log.std(name) <= MIN_RELATIVE_STD * size for log, size in pairs)
-
-    def is_weaving(log: LogStatistics) -> bool:
-        integrated = np.cumsum(np.nan_to_num(log["r"])) * log.sampling_interval
-        heading = interpolate_gaps(log.t, log["psi"]) if "psi" in log else integrated
-        return count_reversals(heading, MIN_SWING) >= 2
-
-    paired_inputs = [n for n in fleet.actuators if n.endswith(("port", "stbd", "left", "right"))]
-    steering = [n for n in fleet.actuators if n in STEERING_CHANNELS] or paired_inputs
-    dead_names = [name for name in steering if is_always_constant(name)]
-    share = float(consensus.compute_residual_share()[fleet.velocities.index("r")])
-    if not dead_names or share <= MIN_UNSTEERED_SHARE:
-        return [], share
-    has_weaving = np.mean([is_weaving(log) for log in fleet.logs]) >= MIN_WEAVING_SHARE
-    return (dead_names, share) if has_weaving else ([], share)

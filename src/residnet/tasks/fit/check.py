@@ -33,7 +33,7 @@ def check(config: FitConfig) -> None:
         for log, split in zip(make_dummy_logs(config.data), split_names, strict=True):
             logs[split].append(log)
         # the effect of masks is unknown before the trials are simulated
-        prepare = config.prepare.model_copy(update={"masks": (), "dead_commands": "keep"})
+        prepare = config.prepare.model_copy(update={"masks": ()})
         settings = config.model_copy(update={"prepare": prepare})
         prepared = _prepare_one_log_per_length(logs, settings)
     else:
