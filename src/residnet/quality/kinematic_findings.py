@@ -200,7 +200,7 @@ def _make_repair(
     if cause_kind == "lag":
         return make_correction(channel_names, delay=estimates[0])
     if name == "heading":
-        return make_correction(("psi",), offset=estimates[0])
+        return make_correction(("psi",), offset=-estimates[0])
     if name == "bias":
         return lambda log: with_channels(log, u=log["u"] - estimates[0], v=log["v"] - estimates[1])
     if name == "lever_arm":
