@@ -12,12 +12,7 @@ from residnet.core.log import Log
 from residnet.manoeuvres.trials import simulate_trial_logs
 from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.quality.actuators import estimate_neutral_angle
-from residnet.quality.statistics import (
-    LogStatistics,
-    make_blocks,
-    make_input_terms,
-    make_velocity_terms,
-)
+from residnet.quality.statistics import LogStatistics, make_blocks
 
 Random = np.random.Generator
 Range = tuple[float, float]
@@ -398,9 +393,13 @@ def one_step_errors(log: Log) -> np.ndarray:
     """RMS residuals of the changes of u, v, r over some seconds, fitted by polynomial terms."""
     statistics = LogStatistics(log, driving(log))
     velocities = {name: statistics[name] for name in statistics.velocities}
+    u, v, r = velocities.values()
     inputs = [log[name] for name in statistics.inputs if statistics.std(name) > 0.0]
-    terms = [np.ones(len(log)), *make_velocity_terms(velocities)]
-    terms += make_input_terms(inputs, velocities.get("u"), is_linear=len(inputs) > 4)
+    terms = [np.ones(len(log)), u * v, u * r, v * r, *inputs]
+    terms += [power for x in velocities.values() for power in (x, x * np.abs(x))]
+    # terms of many inputs would outnumber the blocks
+    for x in inputs if len(inputs) <= 4 else ():
+        terms += [x * np.abs(x), u * np.abs(u) * x]
     blocks = make_blocks(statistics, *velocities)
     x = blocks.make_integrator(np.stack(terms, axis=-1))(0)
     y = blocks.compute_changes(np.stack([*velocities.values()], axis=-1))

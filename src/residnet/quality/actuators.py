@@ -17,7 +17,7 @@ import numpy as np
 from residnet.core.names import port_starboard_pairs
 from residnet.preprocessing.channel_values import nan_median, nan_std
 from residnet.preprocessing.statistics import MIN_SAMPLES
-from residnet.quality.findings import Check, Finding, check, make_correction
+from residnet.quality.findings import Check, Finding, check
 from residnet.quality.statistics import (
     MIN_TURN_SHARE,
     STEERING_CHANNELS,
@@ -83,8 +83,7 @@ def check_propeller_unit(log: LogStatistics, make_finding: Check) -> Iterator[Fi
                 f"{name} reaches {revolutions:.4g} 1/s, more than any propeller or out of"
                 " proportion to the yaw rate: rpm taken as 1/s?"
             )
-            repair = make_correction((name,), factor=60.0)
-            yield make_finding(text, {"largest": revolutions}, repair=repair)
+            yield make_finding(text, {"largest": revolutions})
 
 
 def _steering_share(log: LogStatistics, names: Sequence[str]) -> float:
@@ -143,14 +142,14 @@ def check_propeller_sign(log: LogStatistics, make_finding: Check) -> Iterator[Fi
         opposing_propellers = []
     for name in opposing_propellers:
         text = f"{name} turns against the direction of motion"
-        yield make_finding(text, repair=make_correction((name,), factor=-1.0))
+        yield make_finding(text)
     surge_model = None if opposing_propellers else log.cached(_fit_surge_model)
     t_statistic = surge_model.fit().t_statistic if surge_model is not None else 0.0
     if t_statistic < -_MIN_T_STATISTIC:
         text = (
             f"more {', '.join(names)} decelerates the vessel ({-t_statistic:.0f} standard errors)"
         )
-        yield make_finding(text, {"t": -t_statistic}, repair=make_correction(names, factor=-1.0))
+        yield make_finding(text, {"t": -t_statistic})
 
 
 _MAX_SPEED_RATIO_OF_BRAKING = 0.5
@@ -400,7 +399,6 @@ def check_rudder_bias(log: LogStatistics, make_finding: Check) -> Iterator[Findi
             text,
             {"angle": neutral.angle, "error": neutral.standard_error},
             fix="subtract the offset, or provide a steady wind or current as an input",
-            repair=make_correction(("delta",), offset=-neutral.angle),
         )
 
 
@@ -491,4 +489,4 @@ def check_acausal_response(log: LogStatistics, make_finding: Check) -> Iterator[
                 f" is {improvement:.1f} times smaller with a shifted input)"
             )
             figures = {"lag": delay, "better": improvement}
-            yield make_finding(text, figures, repair=make_correction(model.names, delay=-delay))
+            yield make_finding(text, figures)

@@ -36,7 +36,6 @@ class Finding:
         sample_mask: affected samples [T] bool; None if the finding is not about single samples.
         effect: relative change of the dead-reckoning error or of a velocity if the fault is removed
             from the log (`residnet.quality.effects`), 0 if small; None if it was not measured.
-        channels: channels of the affected samples.
         repair: returns a log with the fault corrected; None if no correction is known.
         is_record_fault: whether the recording itself is faulty, so that it must be corrected
             regardless of its effect on a fit.
@@ -51,7 +50,6 @@ class Finding:
     action: str = ""
     sample_mask: np.ndarray | None = field(default=None, repr=False, compare=False)
     effect: float | None = None
-    channels: tuple[str, ...] = ()
     repair: Callable[[Log], Log] | None = field(default=None, repr=False, compare=False)
     is_record_fault: bool = field(default=False, repr=False, compare=False)
     invalidates_samples: bool = field(default=False, repr=False, compare=False)
@@ -129,7 +127,6 @@ class Check:
         level: Level | None = None,
         fix: str | None = None,
         sample_mask: np.ndarray | None = None,
-        channels: tuple[str, ...] = (),
         repair: Callable[[Log], Log] | None = None,
     ) -> Finding:
         """Create a finding of this check; arguments that are not given default to the check.
@@ -141,7 +138,6 @@ class Check:
             level: level of the finding.
             fix: recommended action, see `Finding.action`.
             sample_mask: affected samples [T] bool.
-            channels: channels of the affected samples.
             repair: returns a log with the fault corrected.
         """
         return Finding(
@@ -151,7 +147,6 @@ class Check:
             {name: float(value) for name, value in (figures or {}).items()},
             self.fix if fix is None else fix,
             sample_mask,
-            channels=channels,
             repair=repair,
             is_record_fault=self.is_record_fault,
             invalidates_samples=self.invalidates_samples,

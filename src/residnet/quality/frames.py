@@ -26,7 +26,6 @@ from residnet.quality.findings import (
     Level,
     check,
     describe_unit_confusion,
-    make_correction,
 )
 from residnet.quality.kinematic_findings import POSITION_LIMITS, YAW_LIMITS, make_cause_findings
 from residnet.quality.kinematics import estimate_position_causes, estimate_yaw_causes
@@ -351,7 +350,6 @@ def _report_jumps(
             text.format(int(is_jump.sum()), *sizes) + f" at t = {time:.2f} s",
             {"count": is_jump.sum(), "largest": excess[worst], "t": time},
             sample_mask=np.append(is_jump, False) | np.append(False, is_jump),
-            channels=("x", "y") if np.iscomplexobj(pose) else ("psi",),
         )
 
 
@@ -463,13 +461,11 @@ def check_yaw_drift(log: LogStatistics, make_finding: Check) -> Iterator[Finding
     )
     level: Level = "will mislead" if is_significant else "note"
     fix = "take the bias off r, or use the rate of psi in its place" if is_significant else ""
-    repair = make_correction(("r",), offset=bias)
     yield make_finding(
         text,
         {"end": final_drift, "most": max_drift, "bias": bias},
         level=level,
         fix=fix,
-        repair=repair,
     )
 
 

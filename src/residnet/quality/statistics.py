@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from functools import cache, cached_property
 from typing import Any, NamedTuple, TypeVar
 
@@ -424,29 +424,3 @@ def make_blocks(log: LogStatistics, *velocities: str) -> OverlappingBlocks:
     return OverlappingBlocks(
         log.t, np.arange(0, len(log) - block_length, block_stride), block_length
     )
-
-
-def make_velocity_terms(velocities: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-    """Return linear and quadratic terms of the velocities."""
-    terms = [*velocities.values(), *(values * np.abs(values) for values in velocities.values())]
-    if "u" in velocities:
-        terms += [velocities["u"] * velocities[name] for name in ("v", "r") if name in velocities]
-    if "v" in velocities and "r" in velocities:
-        terms.append(velocities["v"] * velocities["r"])
-    return terms
-
-
-def make_input_terms(
-    input_values: Sequence[np.ndarray], u: np.ndarray | None, *, is_linear: bool
-) -> list[np.ndarray]:
-    """Return linear, quadratic and speed-dependent terms of the inputs.
-
-    Args:
-        input_values: values [T] of each input.
-        u: surge velocity [T]; None omits the terms with the speed.
-        is_linear: whether to return the linear terms only.
-    """
-    if is_linear:
-        return [*input_values]
-    flow_terms = [] if u is None else [u * np.abs(u) * values for values in input_values]
-    return [*input_values, *(values * np.abs(values) for values in input_values), *flow_terms]

@@ -273,7 +273,6 @@ def check_wrong_values(log: LogStatistics, make_finding: Check) -> Iterator[Find
                 level=level,
                 fix=fix,
                 sample_mask=is_new,
-                channels=(name,),
             )
 
 
@@ -325,7 +324,6 @@ def check_frozen_sensors(log: LogStatistics, make_finding: Check) -> Iterator[Fi
             level=level,
             fix=f"mask them and what follows (kind: frozen, channels: [{', '.join(names)}])",
             sample_mask=affected,
-            channels=names,
         )
 
 
@@ -436,9 +434,7 @@ def check_outliers(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
         level: Level = "will mislead" if n_outliers > 2 else "note"
         fix = f"mask them (kind: hampel, channels: [{name}])"
         figures = {"count": n_outliers, "share": outlier_share, "t": time}
-        yield make_finding(
-            text, figures, level=level, fix=fix, sample_mask=is_outlier, channels=(name,)
-        )
+        yield make_finding(text, figures, level=level, fix=fix, sample_mask=is_outlier)
 
 
 @check("values", "clipping", fix="mask them, or log with a wider range", invalidates_samples=True)
@@ -462,7 +458,7 @@ def check_clipping(log: LogStatistics, make_finding: Check) -> Iterator[Finding]
                 f" {n_clipped} samples ({format_share(clipped_share)}): the sensor clips or holds"
             )
             figures = {"count": n_clipped, "share": clipped_share, "limit": limit}
-            yield make_finding(text, figures, sample_mask=log[name] == limit, channels=(name,))
+            yield make_finding(text, figures, sample_mask=log[name] == limit)
 
 
 # smallest number of levels between the 5th and the 95th percentile for a sufficient resolution
@@ -600,7 +596,6 @@ def check_velocity_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Fi
                 },
                 fix=f"mask it (kind: jump, channel: {name}), or split the log there",
                 sample_mask=np.append(False, is_jump) | np.append(is_jump, False),
-                channels=(name,),
             )
 
 
