@@ -15,7 +15,6 @@ from residnet.core.names import (
     POSE_NAMES,
     SET_POINT_CHANNELS,
     VELOCITY_NAMES,
-    get_pair_parity,
     port_starboard_pairs,
 )
 from residnet.core.stretches import find_runs
@@ -46,7 +45,6 @@ from residnet.quality.statistics import (
     interpolate_gaps,
     moving_average,
 )
-from residnet.regression.pair_symmetry import assess_pair_symmetry
 
 # smallest number of consecutive equal rows that is no coincidence
 _MIN_COPIED_ROWS = 20
@@ -527,49 +525,3 @@ _ACTIONS = {
     "vessel": "exclude it, or fit it separately",
 }
 """Kind of hypothesis -> recommended action."""
-
-
-@check("between", "asymmetric_pair", "note")
-def check_pair_symmetry(logs: LogSet, make_finding: Check) -> Iterator[Finding]:
-    """Report port/starboard inputs whose effects are not mirror images of each other.
-
-    The accelerations are differences of smoothed velocities.
-    """
-    velocities = [name for name in VELOCITY_NAMES if name in logs]
-    pairs = port_starboard_pairs(logs.inputs)
-    if not pairs or not velocities:
-        return
-    names = [*velocities, *logs.inputs]
-    channels = []
-    accelerations = []
-    group = []
-    for log_number, log in enumerate(logs.logs):
-        log_sample = log.subsample
-        if len(log_sample) < MIN_SAMPLES:
-            continue
-        smoothed = np.column_stack([log_sample.smoothed(name) for name in velocities])
-        rates = np.gradient(smoothed, log_sample.t, axis=0)
-        values = np.column_stack((smoothed, log_sample.log.stack(logs.inputs)))
-        is_finite = np.isfinite(values).all(axis=1) & np.isfinite(rates).all(axis=1)
-        channels.append(values[is_finite])
-        accelerations.append(rates[is_finite])
-        group.append(np.full(int(is_finite.sum()), log_number))
-    if not channels or sum(map(len, channels)) < MIN_SAMPLES:
-        return
-    for pair in pairs.items():
-        symmetry = assess_pair_symmetry(
-            pair,
-            names,
-            np.concatenate(channels),
-            np.concatenate(accelerations),
-            np.concatenate(group),
-            velocities,
-            [1 if name == "u" else -1 for name in velocities],
-            get_pair_parity(pair[0]),
-        )
-        if not symmetry.is_symmetric:
-            yield make_finding(
-                symmetry.description,
-                {"p_value": symmetry.p_value, "ratio": symmetry.ratio},
-                fix=f"a fit does not mirror them; if the record is wrong, {symmetry.proposal}",
-            )
