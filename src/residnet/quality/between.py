@@ -503,7 +503,6 @@ def check_contradicting_logs(logs: LogSet, make_finding: Check) -> Iterator[Find
         figures = {
             "left": residual_ratio,
             "size": hypothesis.size,
-            "effect": consensus.compute_influence(i),
         }
         yield make_finding(
             text,

@@ -501,9 +501,7 @@ class Fleet:
             for i in of
         }
 
-    def estimate_local_squares(
-        self, inliers: Sequence[int], data: BlockData, excluding: int | None
-    ) -> np.ndarray:
+    def estimate_local_squares(self, inliers: Sequence[int], i: int) -> np.ndarray:
         """Return the squared residuals [K, n] of the inliers in the motions of another log.
 
         Each block of the log is paired with the nearest block of the inliers, whose residual is
@@ -512,10 +510,10 @@ class Fleet:
 
         Args:
             inliers: indices of the inliers.
-            data: scaled data of the other log.
-            excluding: index of the other log; None if it is none of the fleet.
+            i: index of the other log.
         """
-        references = [j for j in inliers if j != excluding]
+        data = self.data[i]
+        references = [j for j in inliers if j != i]
         references = references[:: -(-len(references) // MAX_REFERENCES)]
         fits = self.fit_leave_one_out(inliers, references)
         squares = [
@@ -636,10 +634,9 @@ class Consensus:
         fits = self.fleet.fit_leave_one_out(self.inliers, self.inliers) if has_several else {}
         return self.fleet.estimate_excess_var(self.inliers, fits, len(self.inliers))
 
-    def fit_inliers(self, excluding: int | None = None) -> RidgeFit:
-        """Return the fit to the inliers without one of them, with the usual residual variance."""
-        key = -1 if excluding is None else excluding
-        fit = self.fleet.fit_leave_one_out(self.inliers, [key])[key]
+    def fit_inliers(self, excluding: int) -> RidgeFit:
+        """Return the fit to the inliers without one log, with the usual residual variance."""
+        fit = self.fleet.fit_leave_one_out(self.inliers, [excluding])[excluding]
         usual = [variance for i, variance in self.excess_var.items() if i != excluding]
         fit.residual_var = np.maximum(np.median(usual, axis=0), 1e-12)
         return fit
@@ -657,7 +654,8 @@ class Consensus:
         the vessel (lack of fit), and a log with another manoeuvre is no contradiction. Then the
         model with these terms decides which logs are outliers.
         """
-        if float(self.compute_residual_share().min()) > MAX_UNEXPLAINED_MOTION:
+        unexplained_shares = np.sqrt(np.median([*self.excess_var.values()], axis=0))
+        if float(unexplained_shares.min()) > MAX_UNEXPLAINED_MOTION:
             return None
         if len(self.inliers) < 2:
             return self
@@ -687,23 +685,9 @@ class Consensus:
         """
         if len(self.inliers) <= MAX_SPARSE_LOGS:
             return self.is_outlier(i)
-        squares = self.fleet.estimate_local_squares(self.inliers, self.fleet.data[i], i)
+        squares = self.fleet.estimate_local_squares(self.inliers, i)
         min_variance = {i: squares.mean(0)}
         return self.fleet.score_logs(self.inliers, [i], min_variance)[i].severity > 1.0
-
-    def compute_influence(self, i: int) -> float:
-        """Return the relative change of the predictions by including a log in the fit."""
-        other_data = [self.fleet.data[j] for j in self.inliers if j != i]
-        fit_without = RidgeFit(*pool_moments(other_data))
-        fit_with = RidgeFit(*pool_moments([*other_data, self.fleet.data[i]]))
-        change = np.concatenate(
-            [data.X @ (fit_without.coef - fit_with.coef) for data in other_data]
-        )
-        return float(np.sqrt(np.mean(change**2, axis=0)).max())
-
-    def compute_residual_share(self) -> np.ndarray:
-        """Return the unexplained share of the change of each velocity [n]."""
-        return np.asarray(np.sqrt(np.median([*self.excess_var.values()], axis=0)))
 
     def is_only_extrapolating(self, i: int) -> bool:
         """Return whether a log is an outlier only outside of the inliers' range of inputs.
