@@ -256,8 +256,10 @@ def interpolate_gaps(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def smooth_by_parabola(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Smooth values [T] by a moving parabola over 15 samples; NaN is interpolated."""
+    """Smooth values [T] by a moving parabola over 15 samples, if so many; interpolate NaN."""
     gap_free = interpolate_gaps(np.arange(t.size), values)
+    if t.size < SMOOTHING_SAMPLES:
+        return gap_free
     return fit_local_polynomials(gap_free[:, None], SMOOTHING_SAMPLES, 2, 1.0)[0][:, 0]
 
 
