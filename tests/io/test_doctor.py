@@ -674,3 +674,17 @@ def test_check_extrapolation_notes_channels_that_do_not_drive_the_vessel() -> No
     for inputs, level in ((["delta"], "note"), (["delta", "e_heading"], "will mislead")):
         found = inspect_log_set(logs, inputs, splits).find_by_code("extrapolation")
         assert [f.level for f in found if f.text.startswith("e_heading")] == [level]
+
+
+@pytest.mark.parametrize("names", [("x", "y", "psi"), ("psi",)])
+def test_interpolated_stretch_of_several_noisy_channels(names: tuple[str, ...]) -> None:
+    random = np.random.default_rng(4)
+    channels = {n: LOG[n] + 0.02 * random.normal(size=T.size) for n in ("x", "y", "psi")}
+    ends = np.array([100, 180])
+    for name in names:
+        channels[name][100:181] = np.interp(T[100:181], T[ends], channels[name][ends])
+    findings = inspect_log(Log("filled", T, channels), ()).find_by_code("interpolated")
+    # a single channel is also straight by its resolution
+    assert len(findings) == (len(names) > 1)
+    if findings:
+        assert findings[0].figures["t"] == pytest.approx(T[100], abs=0.3)

@@ -347,6 +347,15 @@ def _rudder_bias(ship: Ship, log: Log, random: Random) -> Log:
     return changed(log, delta=log["delta"] + bias)
 
 
+@fault("15 s interpolated", "interpolated", ships=())
+def _interpolated(ship: Ship, log: Log, random: Random) -> Log:
+    count = max(round(15.0 / step_of(log)), 30)
+    start = int(random.integers(len(log) // 5, len(log) - count - 10))
+    at = np.arange(len(log))
+    out = (at <= start) | (at >= start + count)
+    return changed(log, **{n: np.interp(at, at[out], log[n][out]) for n in _MOTION})
+
+
 def course(log: Log) -> np.ndarray:
     """Course over ground [T] from smoothed velocities and heading, continuous."""
     return np.asarray(log["psi"] + np.arctan2(log["v"], np.maximum(log["u"], 1e-3)))

@@ -394,6 +394,55 @@ def _moves_after_run(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
     return np.asarray((stops < changes.size - 3) & is_large_step)
 
 
+_MIN_STRAIGHT_SAMPLES = 8
+"""Smallest number of samples of a straight stretch."""
+_MIN_STRAIGHT_DURATION = 1.0
+"""Shortest duration of a straight stretch in s."""
+
+
+@check(
+    "values",
+    "interpolated",
+    fix="leave the cells between two measurements empty",
+    is_record_fault=True,
+    invalidates_samples=True,
+)
+def check_interpolated_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
+    """Report stretches of two or more noisy channels that are straight lines at the same time.
+
+    A single channel is also straight by the resolution of its values.
+    """
+    if len(log) < _MIN_STRAIGHT_SAMPLES:
+        return
+    names = tuple(name for name in log.measured_motion if name in STATE_NAMES)
+    n_straight = np.zeros(len(log) - 2)
+    for name in names:
+        bends = np.abs(np.diff(np.diff(log[name]) / np.diff(log.t)))
+        is_noise = np.sqrt(6.0) * log.noise_std(name) > 0.5 * nan_median(
+            np.abs(np.diff(log[name], 2))
+        )
+        is_flat = (bends <= 1e-5 * nan_median(bends)) & (np.diff(log[name])[1:] != 0.0)
+        n_straight += is_flat & is_noise
+    starts, stops = find_runs(n_straight >= 2.0)
+    durations = log.t[stops] - log.t[starts]
+    is_long = (durations >= _MIN_STRAIGHT_DURATION) & (stops - starts >= _MIN_STRAIGHT_SAMPLES)
+    if not is_long.any():
+        return
+    is_straight = mask_from_ranges(len(log), starts[is_long], stops[is_long] + 2)
+    longest = int(np.argmax(durations))
+    text = (
+        f"motion is exactly linear for {durations[is_long].sum():.1f} s"
+        f" ({format_share(float(is_straight.mean()))}), the longest {durations[longest]:.1f} s from"
+        f" t = {log.t[starts[longest]]:.2f} s: it was interpolated"
+    )
+    figures = {"seconds": durations[is_long].sum(), "longest": durations[longest]}
+    yield make_finding(
+        text,
+        {**figures, "t": log.t[starts[longest]], "share": is_straight.mean()},
+        sample_mask=is_straight,
+    )
+
+
 @check("values", "outliers", invalidates_samples=True)
 def check_outliers(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report outliers among neighbouring samples, by the rule of the mask `hampel`.
