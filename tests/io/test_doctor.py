@@ -29,6 +29,7 @@ from residnet.quality import (
     inspect_log_set,
     summarize_inspection,
 )
+from residnet.quality.between import with_derived_velocities
 from residnet.quality.findings import run_checks
 from residnet.quality.kinematics import estimate_position_causes, estimate_yaw_causes
 from residnet.quality.records import InspectionFile
@@ -439,6 +440,22 @@ def test_check_gaps_accepts_a_few_lost_rows_of_a_fast_recorder(n_lost: int, fix:
     is_present = (t < 10.0) | (t > 10.0 + 0.01 * n_lost)
     log = Log("fast", t[is_present], {"u": 1.0 + 0.2 * np.sin(0.3 * t[is_present])})
     assert fix in one(inspect_log(log), "gaps").action
+
+
+def test_a_gap_in_time_is_no_jump_and_no_motion() -> None:
+    is_logged = (T < 80.0) | (T > 88.0)
+    log = LOG.select_rows(np.flatnonzero(is_logged))
+    r = np.where(log.t > 88.0, log["r"] + 0.4 * np.ptp(LOG["r"]), log["r"])
+    channels = {**log.channels, "r": r}
+    assert not inspect_log(log.replace(channels=channels)).find_by_code("jump")
+    pose = {name: log[name].copy() for name in ("x", "y", "psi")}
+    pose["x"][:50] = np.nan
+    derived = with_derived_velocities(LogStatistics(log.replace(channels=pose), ()))
+    is_known = np.isfinite(derived["u"])
+    assert not is_known[:50].any()
+    is_known[:60] = is_known[-10:] = False
+    np.testing.assert_allclose(derived["u"][is_known], log["u"][is_known], atol=0.1)
+    assert is_known.mean() > 0.9
 
 
 def test_a_speed_that_is_slower_than_its_log_is_no_repeated_row() -> None:

@@ -22,6 +22,7 @@ from residnet.io.readers import ReaderConfig
 from residnet.io.readers.detect import AutoConfig, detect_recording_format
 from residnet.io.readers.formats.topic_folder import TopicFolderConfig
 from residnet.io.readers.recording import ALL_FIELDS
+from residnet.io.readers.tables import read_column_names
 from residnet.io.readers.text_encoding import detect_encoding
 from residnet.io.split import extract_segment
 from residnet.tasks.input_selection import choose_inputs
@@ -315,3 +316,12 @@ def test_table_with_one_variable_on_each_line(tmp_path: Path) -> None:
     # a table with three columns of numbers is none
     path.write_text("t,key,value\n0,1,2\n1,2,3\n")
     assert detect_recording_format(path) is None
+
+
+def test_files_with_other_titles_in_comments_have_the_same_columns(tmp_path: Path) -> None:
+    texts = ["# Trial 1\n# 2 Bf\nt,x\n0,1\n", "# Trial 2\nt,x\n0,2\n", "# t,x\n0,1\n", "t,x\n0,1\n"]
+    keys = []
+    for number, text in enumerate(texts):
+        (path := tmp_path / f"{number}.csv").write_text(text)
+        keys.append(read_column_names(path))
+    assert keys == [("t,x",), ("t,x",), ("# t,x",), ("t,x",)]

@@ -38,6 +38,7 @@ from residnet.quality.outlier_causes import rank_hypotheses
 from residnet.quality.statistics import (
     MIN_TURN_SHARE,
     MOTION_CHANNELS,
+    SMOOTHING_SAMPLES,
     STEERING_CHANNELS,
     LogStatistics,
     compute_port_share,
@@ -102,6 +103,12 @@ def with_derived_velocities(log: LogStatistics) -> LogStatistics:
     if "u" in log or len(log) < MIN_SAMPLES or not all(name in log for name in POSE_NAMES):
         return log
     ground_velocity = np.gradient(log.smoothed("x") + 1j * log.smoothed("y"), log.t)
+    ground_velocity[log.near_seam(SMOOTHING_SAMPLES)] = np.nan
+    known_rows = np.flatnonzero(np.isfinite(log["x"]))
+    if known_rows.size:
+        # a receiver without a fix at the start or the end is not at rest
+        ground_velocity[: known_rows[0]] = np.nan
+        ground_velocity[known_rows[-1] + 1 :] = np.nan
     body_velocity = ground_velocity * np.exp(-1j * log["psi"])
     derived_velocities = {"u": body_velocity.real, "v": body_velocity.imag}
     completed_log = log.log.replace(

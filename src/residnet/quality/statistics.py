@@ -46,6 +46,8 @@ Chosen by hand; `tests/io/test_relations.py` compares findings on the subsample 
 """
 _SEAM_STEPS = 5
 """Gap between the stretches of a subsample in sampling intervals: too long for interpolation."""
+_MIN_GAP_STEPS = 8.0
+"""Shortest gap in a log in sampling intervals across which no statistic is computed."""
 _T = TypeVar("_T")
 
 
@@ -213,10 +215,14 @@ class LogStatistics:
         return LogStatistics(log, self.inputs, self._seams, subsample, self._invalid)
 
     def near_seam(self, n_samples: int) -> np.ndarray:
-        """Return [T] bool: samples within a distance in samples from a seam of two stretches."""
-        if self._seams is None:
-            return np.zeros(len(self), dtype=bool)
-        seam_indices = np.searchsorted(self.t, self._seams)
+        """Return [T] bool: samples within a distance in samples from a seam or a gap.
+
+        A seam is the boundary of two stretches of a subsample.
+        """
+        is_gap = np.diff(self.t) > _MIN_GAP_STEPS * self.sampling_interval
+        seam_indices = np.flatnonzero(is_gap) + 1
+        if self._seams is not None:
+            seam_indices = np.union1d(seam_indices, np.searchsorted(self.t, self._seams))
         return mask_from_ranges(
             len(self), seam_indices - n_samples - _SEAM_STEPS, seam_indices + n_samples
         )

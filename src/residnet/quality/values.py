@@ -616,7 +616,8 @@ def check_velocity_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Fi
         changes = np.where(is_gap, np.nan, np.abs(np.diff(values)))
         if np.isfinite(changes).sum() < 50:
             continue
-        changes = np.nan_to_num(changes)
+        is_gap = np.diff(log.t) > 3.5 * log.sampling_interval
+        changes = np.where(is_gap, 0.0, np.nan_to_num(changes))
         lower, upper = nan_quantiles(values, 0.01, 0.99)
         # a step exceeds the noise, 30 % of the range, and four times the neighbouring changes
         min_jump = 0.3 * (upper - lower)

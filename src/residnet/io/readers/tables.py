@@ -10,6 +10,7 @@ import codecs
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, final
 
@@ -870,10 +871,15 @@ def read_parquet_head(path: Path, rows: int) -> pd.DataFrame:
         return table
 
 
+_MAX_COMMENT_LINES = 50
+"""Largest number of lines of comments above a table."""
+
+
 def read_column_names(path: Path) -> tuple[str, ...]:
     """Return a key that is equal for tables with the same columns.
 
-    It is the column names of a Parquet file, the first line of a text, and empty for other formats.
+    It is the column names of a Parquet file, the first line of a text below its comments, and empty
+    for other formats.
     """
     path = locate_file(path)
     table_kind = TABLE_KINDS.get(path.suffix.lower(), "csv")
@@ -881,8 +887,16 @@ def read_column_names(path: Path) -> tuple[str, ...]:
         return tuple(_read_parquet_names(path))
     if table_kind != "csv":
         return ()
+    line = comment = ""
     with path.open("rb") as stream:
-        line = stream.readline(1 << 16).decode(errors="replace").strip()
+        for raw_line in islice(stream, _MAX_COMMENT_LINES):
+            comment = line
+            line = raw_line[: 1 << 16].decode(errors="replace").strip()
+            if not line.startswith(("#", "%", "//")):
+                break
+    # titles in comments differ from file to file; the last one may have the names
+    if comment and count_numbers(line) > 1:
+        line = comment
     for start in ("Format Version", "NO_OF_FRAMES"):
         if line.startswith(start):
             # the first line of an export of motion capture has the take or its length
