@@ -172,7 +172,6 @@ TOLD: list[tuple[Log, str, str, str, dict[str, float]]] = [
     (NO_POSE, "absent", "note", "", {}),
     # inputs and excitation
     (TWIN, "constant", "note", "n is constant at 10", {}),
-    (TWIN, "condition", "note", "delta_stbd", {}),
     (changed(**STOPPED), "standing", "will mislead", "at rest for 30 %", {"share": 0.3}),
     (changed(wind_dir=1.0 - PSI), "relative_wind", "will mislead", "contains psi", {"slope": -1}),
     (changed(delta=np.degrees(LOG["delta"])), "unit", "will mislead", "more than any rudder", {}),

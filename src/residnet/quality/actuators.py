@@ -402,6 +402,8 @@ def check_rudder_bias(log: LogStatistics, make_finding: Check) -> Iterator[Findi
         )
 
 
+_MIN_STEADY_STATISTIC = 3.0
+"""t statistic of the steady yaw rate that confirms a sign."""
 _MIN_STEERING_IMPROVEMENT = 1.2
 """Smallest ratio of the residual sums of squares without and with the steering inputs."""
 
@@ -436,7 +438,8 @@ def check_rudder_sign(log: LogStatistics, make_finding: Check) -> Iterator[Findi
         fit = model.fit(delay)
         without_steering = fit_least_squares(model.terms, model.changes).sum_of_squares
         is_identifiable = without_steering > _MIN_STEERING_IMPROVEMENT * fit.sum_of_squares
-        is_consistent = fit.t_statistic * model.fit_travel(delay).t_statistic > 0.0
+        steady_statistic = model.fit_travel(delay).t_statistic * np.sign(fit.t_statistic)
+        is_consistent = steady_statistic > _MIN_STEADY_STATISTIC
         if not (is_identifiable and is_consistent) or abs(fit.t_statistic) < _MIN_T_STATISTIC:
             return
         is_reversed = fit.t_statistic < 0.0

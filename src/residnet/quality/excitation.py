@@ -1,4 +1,4 @@
-"""Checks of excitation: ranges, standstill and collinearity of velocities and inputs."""
+"""Checks of excitation: ranges and standstill; the condition number of several channels."""
 
 from __future__ import annotations
 
@@ -16,17 +16,15 @@ from residnet.quality.findings import (
     format_quantity,
     format_share,
 )
-from residnet.quality.statistics import LogStatistics, interpolate_gaps, moving_average
+from residnet.quality.statistics import LogStatistics, moving_average
 
-_MAX_CONDITION_NUMBER = 30.0
-"""Condition number from which collinearity is harmful (Belsley, Kuh and Welsch 1980)."""
 # In the checks below `make_finding` is the registered check itself: called with a text, it creates
 # a finding with the code, severity and action of the check as defaults.
 
 
 @check("excitation", "range", "note")
 def report_ranges(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report range, standard deviation and bandwidth of velocities and inputs."""
+    """Report range and standard deviation of velocities and inputs."""
     for name in (*log.velocities, *log.inputs):
         values = log[name][np.isfinite(log[name])]
         unit = log.units[name]
@@ -43,22 +41,8 @@ def report_ranges(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
             continue
         text = (
             f"{name} from {format_quantity(lower, unit)} to {format_quantity(upper, unit)},"
-            " standard deviation"
+            f" standard deviation {format_quantity(std, unit)}"
         )
-        text += f" {format_quantity(std, unit)}"
-        if name in log.inputs and values.size >= 20:
-            subsample = log.subsample
-            power_spectrum = (
-                np.abs(
-                    np.fft.rfft(interpolate_gaps(subsample.t, subsample[name]) - values.mean())[1:]
-                )
-                ** 2
-            )
-            # bandwidth: frequency below which lies 95 % of the power
-            cumulative_power = np.cumsum(power_spectrum)
-            bandwidth_index = 1 + np.searchsorted(cumulative_power, 0.95 * cumulative_power[-1])
-            statistics["band"] = float(bandwidth_index / (len(subsample) * log.sampling_interval))
-            text += f", 95 % of its power below {statistics['band']:.3g} Hz"
         yield make_finding(text, statistics)
 
 
@@ -107,28 +91,6 @@ def check_samples_at_rest(log: LogStatistics, make_finding: Check) -> Iterator[F
             level=severity,
             sample_mask=is_at_rest,
         )
-
-
-@check("excitation", "condition", "note", on_subsample=True)
-def report_condition_number(subsample: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report collinear velocities and inputs of a log."""
-    names = [
-        name
-        for name in (*subsample.velocities, *subsample.inputs)
-        if subsample.std(name) > 1e-6 * np.nanmax(np.abs(subsample[name]))
-    ]
-    columns = subsample.log.stack(names)
-    columns = columns[np.isfinite(columns).all(axis=1)]
-    if len(names) < 2 or columns.shape[0] < 10 * len(names):
-        return
-    condition_number, collinear_names = compute_condition_number(columns, names)
-    text = f"condition number of {format_names(names)} (centred, scaled): {condition_number:.3g}"
-    if condition_number > _MAX_CONDITION_NUMBER:
-        text += (
-            f"; {', '.join(collinear_names)} are collinear in this log: only other manoeuvres can"
-            " separate their effects"
-        )
-    yield make_finding(text, {"condition": condition_number})
 
 
 def format_names(names: Sequence[str]) -> str:

@@ -1,7 +1,4 @@
-"""Checks of input channels and of auxiliary channels.
-
-Inputs: limits, unit, stuck actuators. Auxiliary channels: relative wind, which contains the motion.
-"""
+"""Checks of input channels: the unit of a rudder, stuck actuators, and relative wind."""
 
 from __future__ import annotations
 
@@ -19,7 +16,6 @@ from residnet.quality.findings import (
     Level,
     check,
     format_quantity,
-    format_share,
 )
 from residnet.quality.statistics import (
     LogStatistics,
@@ -28,37 +24,10 @@ from residnet.quality.statistics import (
 )
 
 
-def _finite_inputs(log: LogStatistics) -> list[str]:
-    return [name for name in log.inputs if np.isfinite(log[name]).sum() > 1]
-
-
-@check("inputs", "at_limits", "note", "a model cannot learn the behaviour beyond these limits")
-def check_input_limits(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
-    """Report inputs that are often at their limits."""
-    for name in _finite_inputs(log):
-        finite_values = log[name][np.isfinite(log[name])]
-        unit = log.units[name]
-        lower = float(finite_values.min())
-        upper = float(finite_values.max())
-        margin = 1e-3 * (upper - lower)
-        limit_shares = (
-            float((finite_values <= lower + margin).mean()),
-            float((finite_values >= upper - margin).mean()),
-        )
-        if max(limit_shares) <= 0.01 or np.unique(finite_values).size <= 2:
-            continue
-        text = (
-            f"{name} is at its limits {format_quantity(lower, unit)}"
-            f" ({format_share(limit_shares[0])}) and {format_quantity(upper, unit)}"
-            f" ({format_share(limit_shares[1])})"
-        )
-        yield make_finding(text, {"low": lower, "high": upper, "share": sum(limit_shares)})
-
-
 @check("inputs", "unit", fix="correct the unit in the channel map", is_record_fault=True)
 def check_rudder_unit(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report rudder angles that are too large for any rudder."""
-    for name in _finite_inputs(log):
+    for name in log.inputs:
         largest = abs_quantile(log[name], 0.99)
         if name in ("delta", "cmd_delta") and largest > math.radians(100.0):
             largest_text = format_quantity(largest, "rad")
