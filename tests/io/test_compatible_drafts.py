@@ -297,7 +297,9 @@ def test_messages_of_an_unknown_type_are_mapped_by_their_fields() -> None:
     fields = {name: motion.sample(name, TIMES) for name in ("x", "y", "psi", "u", "v", "r")}
     series = Series("/boat/state", "usv_msgs/msg/State", fields, stamp=TIMES)
     target = Series("/boat/setpoint", "usv_msgs/msg/State", fields, stamp=TIMES)
-    recording = Recording(Path("run.mcap"), {"/boat/state": series, "/boat/setpoint": target})
+    pose = {name: fields[name] for name in ("x", "y", "psi")}
+    fix = Series("/boat/fix", "usv_msgs/msg/Fix", pose, stamp=TIMES)
+    recording = Recording(Path("run.mcap"), {item.name: item for item in (fix, series, target)})
     assert find_named_table([recording], DraftNotes(), needs_pose=False) is None
     sources = find_named_table([recording], DraftNotes(), needs_pose=True)
     assert sources is not None

@@ -101,17 +101,18 @@ def _choose_named_fields(
         and len(series) >= MIN_MOTION_ROWS
         and all(_find_pose_columns([*_name_vector_parts(series.fields)]))
     ]
-    if len({frozenset(series.fields) for series in candidates}) < len(candidates):
-        table_names = ", ".join(series.name for series in candidates)
+    tables = [series for series in candidates if not series.message_type]
+    if len({frozenset(series.fields) for series in tables}) < len(tables):
+        table_names = ", ".join(series.name for series in tables)
         raise DataError(
-            f"{recording.path}: contains {len(candidates)} tables of the same columns"
+            f"{recording.path}: contains {len(tables)} tables of the same columns"
             f" ({table_names[:120]}), each a separate log; write each to a file, in Python"
             " pandas.DataFrame({name: column for name, column in table.items()}).to_csv(...)"
         )
-    if len(candidates) > 1:
-        return {}, ""
     sources, topic = _find_named_topics(recording) if needs_pose else ({}, "")
-    for series in candidates:
+    # of several poses the one with most velocities
+    candidates.sort(key=lambda series: -len(_find_velocities(_name_vector_parts(series.fields))))
+    for series in candidates[:1]:
         fields = _name_vector_parts(series.fields)
         # other series are read where they have velocities that the one with the pose lacks
         if not _find_velocities(sources) - _find_velocities(fields):
