@@ -78,15 +78,9 @@ def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
     has_yaw_rate = bool(np.isfinite(r).any())
 
     def choose_half_window(noise: float, typical_rate: float) -> int:
-        max_duration = float(log.t[-1] - log.t[0]) / 15.0
-        return max(
-            round(
-                0.5
-                * min(max(1.5, 10.0 * noise / max(typical_rate, 1e-9)), max_duration)
-                / log.sampling_interval
-            ),
-            3,
-        )
+        duration = max(1.5, 10.0 * noise / max(typical_rate, 1e-9))
+        duration = min(duration, float(log.t[-1] - log.t[0]) / 15.0)
+        return max(round(0.5 * duration / log.sampling_interval), 3)
 
     def central_difference(values: np.ndarray, half_window: int) -> np.ndarray:
         """Return central differences [T] over the window, NaN at the ends."""
@@ -121,19 +115,19 @@ def compute_averaged_rates(log: LogStatistics) -> AveragedRates:
     yaw_rate_noise = np.sqrt(0.5) * log.noise_std("psi") / (yaw_half_window * log.sampling_interval)
     if has_yaw_rate:
         yaw_rate_noise = max(yaw_rate_noise, log.noise_std("r") / np.sqrt(2.0 * yaw_half_window))
+    rotation = np.exp(1j * log["psi"])
+    velocity = u + 1j * v
+    velocity_by_convention = {
+        "as declared": rotation * velocity,
+        "psi reversed": rotation.conj() * velocity,
+        "v reversed": rotation * velocity.conj(),
+        "earth axes": velocity,
+    }
     return AveragedRates(
         central_difference(log["x"] + 1j * log["y"], position_half_window),
         {
-            "as declared": trapezoidal_mean(
-                np.exp(1j * log["psi"]) * (u + 1j * v), position_half_window
-            ),
-            "psi reversed": trapezoidal_mean(
-                np.exp(-1j * log["psi"]) * (u + 1j * v), position_half_window
-            ),
-            "v reversed": trapezoidal_mean(
-                np.exp(1j * log["psi"]) * (u - 1j * v), position_half_window
-            ),
-            "earth axes": trapezoidal_mean(u + 1j * v, position_half_window),
+            name: trapezoidal_mean(values, position_half_window)
+            for name, values in velocity_by_convention.items()
         },
         central_difference(log["psi"], yaw_half_window),
         trapezoidal_mean(r, yaw_half_window),

@@ -52,8 +52,6 @@ _MAX_CLOCK_SAMPLES = 8000
 """Largest number of samples of a search of delays, which bounds its computing time."""
 _MAX_CLOCKS = 2
 """Largest number of clocks besides that of the reference."""
-_CAUSES_UNLIKE_DELAYS = ("gain_u", "heading", "lever_arm", "current", "bias", "ramp")
-"""Causes that a regression does not select in place of a delay."""
 _MIN_CLOCK_ADVANTAGE = 20.0
 """Smallest reduction of the BIC by a further clock."""
 _MAX_CONDITION_INDEX = 30.0
@@ -393,10 +391,11 @@ def _compare_clocks(
     if rectangle_model is not None:
         return _explain_increments(rectangle_model).causes
     regression = _explain_increments(model)
-    # a delay is not mistaken for a scale of surge, a constant angle or a constant velocity
-    is_unlike = all(name in _CAUSES_UNLIKE_DELAYS for name in regression.causes)
-    residual_square = float(np.nan_to_num(regression.squares).mean()) if regression.causes else 0.0
-    if is_unlike or residual_square <= _MAX_ROUNDING_SHARE * regression.response_square:
+    if not regression.causes:
+        return {}
+    # what is left of exact values is rounding
+    residual_square = float(np.nan_to_num(regression.squares).mean())
+    if residual_square <= _MAX_ROUNDING_SHARE * regression.response_square:
         return regression.causes
     excerpt = log.excerpt_middle(_MAX_CLOCK_SAMPLES)
     shifts = _search_shifts(excerpt, make_model, _select_channels(excerpt, *names), clocks)
@@ -636,17 +635,18 @@ def _explain_increments(
             -1, whitened_rows.shape[1]
         )
     y = whitened_rows[:, 0]
-    cause_columns = whitened_rows[:, 1:]
+    has_effect = whitened_rows[:, 1:].any(axis=0)
+    cause_columns = whitened_rows[:, 1:][:, has_effect]
+    names = np.array([name for name, columns_of_cause in columns.items() for _ in columns_of_cause])
+    names = names[has_effect]
     # large residuals that no cause explains are jumps of the pose, which are excluded
-    column_scales = np.maximum(np.abs(cause_columns).max(axis=0), 1e-300)
-    scaled_columns = cause_columns / column_scales
+    scaled_columns = cause_columns / np.abs(cause_columns).max(axis=0)
     abs_residuals = np.abs(
         y
         - scaled_columns
         @ np.linalg.lstsq(scaled_columns.T @ scaled_columns, scaled_columns.T @ y, rcond=1e-12)[0]
     )
     is_inlier = abs_residuals <= 8.0 * SIGMA_OF_MAD * max(nan_median(abs_residuals), 1e-300)
-    names = np.array([name for name, columns_of_cause in columns.items() for _ in columns_of_cause])
     causes, coefficients = _orthogonal_matching_pursuit(
         np.where(is_inlier, y, 0.0),
         np.where(is_inlier[:, None], cause_columns, 0.0),
@@ -657,7 +657,6 @@ def _explain_increments(
     squares_by_component = (residuals**2).reshape(retained_indices.size, -1)
     squares[retained_indices] = squares_by_component.sum(axis=1)
     is_selected = coefficients != 0.0
-    n_parameters = int(np.count_nonzero(is_selected))
     dimension = squares_by_component.shape[1]
     response_square = dimension * float(np.mean(y**2))
     return _Explanation(
@@ -666,7 +665,7 @@ def _explain_increments(
         dimension,
         response_square,
         min_deviation,
-        n_parameters,
+        int(np.count_nonzero(is_selected)),
         _compute_condition_index(cause_columns[is_inlier][:, is_selected]),
     )
 
@@ -675,9 +674,7 @@ def _compute_condition_index(columns: np.ndarray) -> float:
     """Return the condition number of columns [N, k] scaled to unit length; 1 without columns."""
     if columns.shape[1] == 0:
         return 1.0
-    scaled_columns = columns / np.linalg.norm(columns, axis=0)
-    eigenvalues = np.linalg.eigvalsh(scaled_columns.T @ scaled_columns)
-    return math.sqrt(float(eigenvalues[-1]) / max(float(eigenvalues[0]), 1e-300))
+    return float(np.linalg.cond(columns / np.linalg.norm(columns, axis=0)))
 
 
 def _orthogonal_matching_pursuit(
@@ -694,12 +691,9 @@ def _orthogonal_matching_pursuit(
     Returns:
         Cause -> estimate, in the order of selection, and the coefficients [k] of all columns.
     """
-    column_norms = np.linalg.norm(regressors, axis=0)
     coefficients = np.zeros(names.size)
-    indices = np.flatnonzero(column_norms > 0.0)
-    regressors = regressors[:, column_norms > 0.0] / column_norms[column_norms > 0.0]
-    names = names[column_norms > 0.0]
-    column_norms = column_norms[column_norms > 0.0]
+    column_norms = np.maximum(np.linalg.norm(regressors, axis=0), 1e-300)
+    regressors = regressors / column_norms
     gram = regressors.T @ regressors
     product = regressors.T @ response
     energy = float(response @ response)
@@ -767,7 +761,7 @@ def _orthogonal_matching_pursuit(
         np.sqrt(np.maximum(sandwich_variance, np.diag(white_noise_covariance))) / column_norms
     )
     estimates = least_squares_fit.coefficients / column_norms
-    coefficients[indices[is_selected]] = estimates
+    coefficients[is_selected] = estimates
     # columns of gains are integrals of the measured values, which are 1 + gain times too large
     is_gain = np.array([name.startswith("gain") for name in names.tolist()])
     true_share = np.where(is_gain, 1.0 - estimates, 1.0)
