@@ -307,6 +307,18 @@ def check_position_jumps(log: LogStatistics, make_finding: Check) -> Iterator[Fi
     yield from _report_jumps(log, make_finding, log["x"] + 1j * log["y"], velocity, text)
 
 
+def _compute_unexplained_steps(
+    log: LogStatistics, pose: np.ndarray, rate: np.ndarray
+) -> np.ndarray:
+    """Return the sizes of the steps [T - 1] of a pose beyond the integral of its rate [T].
+
+    They are NaN where the integral is unknown, as over a gap.
+    """
+    dt = np.diff(log.t)
+    dt = np.where(dt > 3.5 * log.sampling_interval, np.nan, dt)
+    return np.asarray(np.abs(np.diff(pose) - 0.5 * dt * (rate[1:] + rate[:-1])))
+
+
 def _report_jumps(
     log: LogStatistics,
     make_finding: Check,
@@ -327,13 +339,11 @@ def _report_jumps(
         min_jump: smallest jump in m or rad.
         display_factor: factor from m or rad to the unit of the text.
     """
-    dt = np.diff(log.t)
-    dt = np.where(dt > 3.5 * log.sampling_interval, np.nan, dt)
-    explained_steps = 0.5 * dt * (rate[1:] + rate[:-1])
-    excess = np.abs(np.nan_to_num(np.diff(pose) - explained_steps))
-    explained_distances = np.abs(explained_steps[np.isfinite(explained_steps)])
-    if explained_distances.size:
-        min_jump = max(min_jump, 0.5 * nan_quantiles(explained_distances, 0.95)[0])
+    excess = np.nan_to_num(_compute_unexplained_steps(log, pose, rate))
+    steps = np.abs(np.diff(pose))
+    steps = steps[np.isfinite(steps)]
+    if steps.size:
+        min_jump = max(min_jump, 0.5 * nan_quantiles(steps, 0.95)[0])
     limit = max(15.0 * nan_median(excess), min_jump)
     is_jump = excess > limit
     if is_jump.any():
@@ -360,11 +370,9 @@ def check_position_causes(log: LogStatistics, make_finding: Check) -> Iterator[F
     if "r" in log and "course" in log.cached(estimate_yaw_causes):
         return
     if "r" in log:
-        dt = np.diff(log.t)
-        dt = np.where(dt > 3.5 * log.sampling_interval, np.nan, dt)
-        excess = np.diff(log["psi"]) - 0.5 * dt * (log["r"][1:] + log["r"][:-1])
+        excess = _compute_unexplained_steps(log, log["psi"], log["r"])
         # a reset of the pose, which has a check of its own, looks like delays and scales
-        if np.nanmax(np.abs(excess), initial=0.0) > _MIN_HEADING_RESET:
+        if np.nanmax(excess, initial=0.0) > _MIN_HEADING_RESET:
             return
     causes = log.cached(estimate_position_causes)
     yield from make_cause_findings(causes, POSITION_LIMITS, log, make_finding)
