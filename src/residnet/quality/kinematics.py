@@ -50,10 +50,8 @@ _MIN_COURSE_ADVANTAGE = 100.0
 proportional."""
 _MAX_CLOCK_SAMPLES = 8000
 """Largest number of samples of a search of delays, which bounds its computing time."""
-_MAX_CLOCKS = 2
-"""Largest number of clocks besides that of the reference."""
 _MIN_CLOCK_ADVANTAGE = 20.0
-"""Smallest reduction of the BIC by a further clock."""
+"""Smallest reduction of the BIC by the shift of a clock."""
 _MAX_CONDITION_INDEX = 30.0
 """Largest condition index of the causes beside a delay. Above it they cannot be separated: in a
 zigzag of one period a delay of the heading is a gain of sway with a delay of u and v (Belsley, Kuh
@@ -372,7 +370,7 @@ def _compare_clocks(
     names: Sequence[str],
     clocks: Mapping[str, tuple[str, ...]],
 ) -> dict[str, KinematicCause]:
-    """Estimate the causes with the delays of up to two clocks, as far as these are more likely.
+    """Estimate the causes with the delay of a clock, if this is more likely.
 
     A lag in the regression is the first term of a series. Where a delay is longer than the motion
     takes to change, the series diverges, and other causes explain more than this term. Therefore
@@ -398,94 +396,55 @@ def _compare_clocks(
     if residual_square <= _MAX_ROUNDING_SHARE * regression.response_square:
         return regression.causes
     excerpt = log.excerpt_middle(_MAX_CLOCK_SAMPLES)
-    shifts = _search_shifts(excerpt, make_model, _select_channels(excerpt, *names), clocks)
-    if not shifts:
+    clock, n_samples = _select_clock(excerpt, make_model, _select_channels(excerpt, *names), clocks)
+    if n_samples == 0:
         return regression.causes
-    explanation = _explain_increments(
-        make_model(log, _shift_clocks(log, channels, clocks, shifts)), [*shifts]
-    )
-    return {
-        name: replace(
-            cause,
-            estimates=cause.estimates
-            + _clock_sign(name) * shifts.get(name, 0) * log.sampling_interval,
-        )
-        for name, cause in explanation.causes.items()
-    }
+    shifted = _shift_channels(log, channels, clocks[clock], n_samples)
+    causes = _explain_increments(make_model(log, shifted), [clock]).causes
+    if clock in causes:
+        delay = _clock_sign(clock) * n_samples * log.sampling_interval
+        causes[clock] = replace(causes[clock], estimates=causes[clock].estimates + delay)
+    return causes
 
 
-def _search_shifts(
+def _select_clock(
     log: LogStatistics,
     make_model: Callable[..., _IncrementModel],
     channels: Channels,
     clocks: Mapping[str, tuple[str, ...]],
-) -> dict[str, int]:
-    """Return lag -> number of samples by which its channels are taken later, by forward selection.
+) -> tuple[str, int]:
+    """Return the likeliest clock and the number of samples by which its channels are taken later.
 
-    A further clock is selected if it reduces the BIC by more than `_MIN_CLOCK_ADVANTAGE`.
+    A clock is selected if it reduces the BIC by more than `_MIN_CLOCK_ADVANTAGE`; otherwise the
+    number is 0. A lag of the regression accounts for a second clock.
     """
     model = make_model(log, channels)
-    shifts: dict[str, int] = {}
-    best = _explain_increments(model)
-    min_deviation = best.min_deviation
-    for _ in range(_MAX_CLOCKS):
-        trials = []
-        for name in clocks:
-            if name in model.columns and name not in shifts:
-                trial = _estimate_shifts(
-                    log, make_model, channels, clocks, {**shifts, name: 0}, min_deviation
-                )
-                trials += [] if trial is None else [trial]
-        if not trials:
-            break
-        bics = _compute_bics([best, *(explanation for explanation, _ in trials)])
-        likeliest = int(np.argmin(bics[1:]))
-        if bics[0] - bics[1 + likeliest] < _MIN_CLOCK_ADVANTAGE:
-            break
-        best, shifts = trials[likeliest]
-    return shifts
-
-
-def _estimate_shifts(
-    log: LogStatistics,
-    make_model: Callable[..., _IncrementModel],
-    channels: Channels,
-    clocks: Mapping[str, tuple[str, ...]],
-    shifts: dict[str, int],
-    min_deviation: float,
-) -> tuple[_Explanation, dict[str, int]] | None:
-    """Estimate the delays of some clocks by the Gauss-Newton method.
-
-    Returns:
-        The causes that remain and the shifts; None if the method diverges, or if the causes cannot
-        be separated.
-    """
-    for _ in range(_MAX_ITERATIONS):
-        shifted = _shift_clocks(log, channels, clocks, shifts)
-        explanation = _explain_increments(make_model(log, shifted), [*shifts], min_deviation)
-        estimate = explanation, shifts
-        shifts = {
-            clock: n_samples
-            + round(_clock_sign(clock) * explanation.estimate(clock) / log.sampling_interval)
-            for clock, n_samples in shifts.items()
-        }
-        if max(map(abs, shifts.values())) * log.sampling_interval > _MAX_SHIFT:
-            return None
-        if shifts == estimate[1]:
-            break
-    return estimate if estimate[0].condition_index <= _MAX_CONDITION_INDEX else None
-
-
-def _shift_clocks(
-    log: LogStatistics,
-    channels: Channels,
-    clocks: Mapping[str, tuple[str, ...]],
-    shifts: Mapping[str, int],
-) -> Channels:
-    """Return the channels with those of each clock taken a number of samples later."""
-    for clock, n_samples in shifts.items():
-        channels = _shift_channels(log, channels, clocks[clock], n_samples)
-    return channels
+    regression = _explain_increments(model)
+    explanations = [regression]
+    shifts = [("", 0)]
+    for clock in clocks:
+        if clock not in model.columns:
+            continue
+        n_samples = 0
+        for _ in range(_MAX_ITERATIONS):
+            # Gauss-Newton: the lag that is left corrects the shift
+            shifted = _shift_channels(log, channels, clocks[clock], n_samples)
+            explanation = _explain_increments(
+                make_model(log, shifted), [clock], regression.min_deviation
+            )
+            lag = _clock_sign(clock) * explanation.estimate(clock)
+            correction = round(lag / log.sampling_interval)
+            is_too_long = abs(n_samples + correction) * log.sampling_interval > _MAX_SHIFT
+            if correction == 0 or is_too_long:
+                break
+            n_samples += correction
+        # the causes must be separable
+        if not is_too_long and explanation.condition_index <= _MAX_CONDITION_INDEX:
+            explanations.append(explanation)
+            shifts.append((clock, n_samples))
+    bics = _compute_bics(explanations)
+    bics[0] -= _MIN_CLOCK_ADVANTAGE
+    return shifts[int(np.argmin(bics))]
 
 
 def _clock_sign(name: str) -> float:
