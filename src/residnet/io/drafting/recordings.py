@@ -27,7 +27,7 @@ from residnet.io.drafting.questions import CHANNELS_KEY, READER_KEY, DraftNotes
 from residnet.io.drafting.tables import draft_manoeuvre_setting
 from residnet.io.header_vocabulary import guess_scaling, infer_unit
 from residnet.io.readers.detect import AutoConfig, detect_external_kind
-from residnet.io.readers.messages import extend_with_standard_messages
+from residnet.io.readers.messages import extend_with_standard_messages, is_ned_format
 from residnet.io.readers.quantities import ChannelPlan
 from residnet.io.readers.recording import ALL_FIELDS, Recording
 from residnet.io.readers.topics import align_clocks
@@ -89,7 +89,14 @@ def draft_recordings(
     if not steps and log is not None:
         steps = [float(np.median(np.diff(log.t)))]
     has_pose = log is not None and {"x", "y", "psi"} <= log.channels.keys()
-    needs_pose = log is None or not has_pose or not _is_consistent(log)
+    # formats such as NMEA and ULog define their frames: a contradiction is an error of the sensors
+    has_fixed_frame = any(
+        is_ned_format(aligned[0].series[source.topic])
+        for source in pose_sources
+        if source.topic in aligned[0].series
+    )
+    is_contradictory = log is not None and not has_fixed_frame and not _is_consistent(log)
+    needs_pose = not has_pose or is_contradictory
     sources = find_named_table(aligned, draft_notes, needs_pose=needs_pose)
     known_channels: set[str] = set()
     if sources is None:
