@@ -104,7 +104,7 @@ def draft_tables(
         raise DataError(
             f"{main_preview.path}: no column has the name of a channel"
             f" ({', '.join(common_numeric[:12])});"
-            f" {_suggest_table_fix(main_preview, clock, common_numeric)}"
+            f" {_suggest_table_fix(common_numeric)}"
         )
     for channel, entry in channels.items():
         is_input = channel not in (*MOTION_AND_WIND_CHANNELS, *QUATERNION, *MAX_COORDINATES)
@@ -257,24 +257,10 @@ def _find_common_columns(
     return common_columns
 
 
-def _suggest_table_fix(
-    preview: TablePreview, clock: TableClock, numeric_columns: Sequence[str]
-) -> str:
+def _suggest_table_fix(numeric_columns: Sequence[str]) -> str:
     """Return an instruction for a table without channels."""
     if not numeric_columns:
         return "the files have no common column of numbers: give files of one kind"
-    category_columns = [
-        name
-        for name, cells in preview.text_columns.items()
-        if 1 < cells.nunique() <= len(cells) / 4
-    ]
-    category_columns = [name for name in category_columns if name not in clock.columns]
-    if len(numeric_columns) == 1 and category_columns:
-        return (
-            f"'{category_columns[0]}' names the quantity of each row: make columns of it, in Python"
-            f" pandas.read_csv(file).pivot_table({numeric_columns[0]!r}, {clock.columns[0]!r},"
-            f" {category_columns[0]!r}).to_csv('log.csv')"
-        )
     if len(numeric_columns) == 1:
         return (
             "if each file has one quantity, join them to one table, in Python"
