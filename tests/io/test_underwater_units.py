@@ -106,6 +106,9 @@ def test_units_of_a_steep_diver_in_axes_of_ros(
     table |= {"linear_z": -motion["w"] / speed_factor, "angular_x": motion["p"] / rate_factor}
     table |= {"angular_y": -motion["q"] / rate_factor, "angular_z": -motion["r"] / rate_factor}
     table |= {f"thruster_{k}": np.sin(motion["t"] / (k + 2.0)) for k in range(8)}
+    # an empty message
+    for axis in "xyzw":
+        table[f"orientation_{axis}"][20] = 0.0
     units = draft_units(table, tmp_path / "dive.csv")
     for name, sign in (("u", 1), ("v", -1), ("w", -1)):
         assert units[name] == (speed_unit, sign), name

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.frames import unwrap_angle
 from residnet.core.layout import DegreesOfFreedom
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import to_si
@@ -171,7 +172,7 @@ def _add_derived_angles(table: RawTable, derived_angles: Mapping[str, tuple[str,
                 continue
             quaternion = normalize_quaternion(*complete_quaternion(part_values))
             roll, pitch = quaternion_tilt(*quaternion)
-            angles = {"phi": np.unwrap(roll), "theta": pitch, "psi": quaternion_yaw(*quaternion)}
+            angles = {"phi": unwrap_angle(roll), "theta": pitch, "psi": quaternion_yaw(*quaternion)}
             columns[name] = angles[name]
     return RawTable(table.t, columns)
 
