@@ -692,6 +692,17 @@ def test_check_extrapolation_notes_channels_that_do_not_drive_the_vessel() -> No
         assert [f.level for f in found if f.text.startswith("e_heading")] == [level]
 
 
+def test_channels_with_the_noise_of_rounding_are_not_interpolated() -> None:
+    # slopes change by one step of the last digit, and stay for 1.2 s now and then
+    random = np.random.default_rng(4)
+    is_steady = np.arange(1200) % 60 < 14
+    slopes = np.where(is_steady, 50.0, 50.0 + random.integers(-1, 2, (2, 1200)))
+    psi, x = 0.01 * np.cumsum(slopes, axis=1).round()
+    channels = {"psi": np.radians(psi), "x": 0.1 * x}
+    log = Log("simulated", 0.1 * np.arange(1200), channels)
+    assert not inspect_log(log, ()).find_by_code("interpolated")
+
+
 @pytest.mark.parametrize("names", [("x", "y", "psi"), ("psi",)])
 def test_interpolated_stretch_of_several_noisy_channels(names: tuple[str, ...]) -> None:
     random = np.random.default_rng(4)

@@ -410,7 +410,7 @@ _MIN_STRAIGHT_DURATION = 1.0
 def check_interpolated_values(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
     """Report stretches of two or more noisy channels that are straight lines at the same time.
 
-    A single channel is also straight by the resolution of its values.
+    Channels without noise are straight by the resolution of their values.
     """
     if len(log) < _MIN_STRAIGHT_SAMPLES:
         return
@@ -421,7 +421,11 @@ def check_interpolated_values(log: LogStatistics, make_finding: Check) -> Iterat
         is_noise = np.sqrt(6.0) * log.noise_std(name) > 0.5 * nan_median(
             np.abs(np.diff(log[name], 2))
         )
-        is_flat = (bends <= 1e-5 * nan_median(bends)) & (np.diff(log[name])[1:] != 0.0)
+        typical_bend = nan_median(bends)
+        # the noise of rounding is at most a few steps of the last printed digit
+        smallest_bend = bends[bends > 1e-5 * typical_bend].min(initial=np.inf)
+        is_noise &= typical_bend > 2.5 * smallest_bend
+        is_flat = (bends <= 1e-5 * typical_bend) & (np.diff(log[name])[1:] != 0.0)
         n_straight += is_flat & is_noise
     starts, stops = find_runs(n_straight >= 2.0)
     durations = log.t[stops] - log.t[starts]
