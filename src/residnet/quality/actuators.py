@@ -457,6 +457,8 @@ def check_rudder_sign(log: LogStatistics, make_finding: Check) -> Iterator[Findi
 
 _MIN_LEAD_TIME = 0.45
 """Lead of a response in s above which it is no inaccuracy."""
+_MIN_LEAD_SAMPLES = 2.5
+"""Lead in samples; 2 samples are possible where velocities are derived from positions."""
 _MIN_CAUSAL_RATIO = 2.0
 """Smallest ratio of the residual sum of squares of the best causal delay to that of the best one.
 
@@ -484,7 +486,7 @@ def check_acausal_response(log: LogStatistics, make_finding: Check) -> Iterator[
         delay = model.best_delay()
         causal_residual = model.sum_of_squares(model.best_delay(min_delay=0.0))
         improvement = causal_residual / model.sum_of_squares(delay)
-        min_lead_time = max(_MIN_LEAD_TIME, 1.5 * log.sampling_interval)
+        min_lead_time = max(_MIN_LEAD_TIME, _MIN_LEAD_SAMPLES * log.sampling_interval)
         if improvement > _MIN_CAUSAL_RATIO and -delay > min_lead_time:
             channels = ", ".join(model.names)
             text = (
