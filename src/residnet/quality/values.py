@@ -396,8 +396,8 @@ def _moves_after_run(values: np.ndarray, stops: np.ndarray) -> np.ndarray:
 
 _MIN_STRAIGHT_SAMPLES = 8
 """Smallest number of samples of a straight stretch."""
-_MIN_STRAIGHT_DURATION = 1.0
-"""Shortest duration of a straight stretch in s."""
+_MIN_STRAIGHT_DURATION = 3.0
+"""Shortest duration of a straight stretch in s; a table of three digits has some of 1.9 s."""
 
 
 @check(
