@@ -162,9 +162,12 @@ class ChannelMapper:
         fit = fit_to_motion(self._logs, self._motions, name)
         is_noise = name == "r" and not fit.is_significant
         max_share = _MAX_NOISE_SHARE if is_noise else NEGLIGIBLE_MOTION_SHARE
-        if motions and spread < max_share * float(
-            np.std(np.concatenate([motion[component_index] for motion in motions]))
-        ):
+        if not motions:
+            return
+        reference = np.concatenate([motion[component_index] for motion in motions])
+        # jumps of the heading, as where it was interpolated across a full circle, are no motion
+        limit = 3.0 * float(np.quantile(np.abs(reference), 0.9))
+        if spread < max_share * float(np.std(np.clip(reference, -limit, limit))):
             column = self._names.pop(name)
             text = f"'{column}' does not move, but position and heading do; left out: {name} is"
             self._draft_notes.add_note(CHANNELS_KEY, f"{text} derived from them")
