@@ -210,8 +210,10 @@ def test_times_that_are_days_whole_seconds_or_beside_a_counter(tmp_path: Path) -
     assert content["time"]["unit"] == "day"
     np.testing.assert_allclose(log.t - log.t[0], T, atol=1e-3)
     path.write_text("\n".join(text({"No.": np.arange(T.size), **COLUMNS, "Zeit": np.floor(T)})))
-    log, content, _ = drafted(path)
+    log, content, marks = drafted(path)
     assert content["time"]["column"] == "Zeit", "a counter is no time"
+    guesses = [guess for key, guess in marks.guessed_values if key[-1] == "time"]
+    assert ["spread evenly" in guess for guess in guesses] == [True]
     np.testing.assert_allclose(log.t - log.t[0], T, atol=1e-9)
     assert "coarse_stamps" in [found["code"] for found in log.meta["findings"]]
     # times of Unix keep their digits where a log is cut
@@ -323,3 +325,7 @@ def test_files_with_other_titles_in_comments_have_the_same_columns(tmp_path: Pat
         (path := tmp_path / f"{number}.csv").write_text(text)
         keys.append(read_column_names(path))
     assert keys == [("t,x",), ("t,x",), ("# t,x",), ("t,x",)]
+    # a row may have text between its numbers, and the names of ROS begin with a percent sign
+    for number in range(2):
+        path.write_text(f"%time,field.frame,field.x\n1{number},odom,2\n")
+        assert read_column_names(path) == ("%time,field.frame,field.x",)

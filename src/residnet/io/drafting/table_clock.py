@@ -184,21 +184,28 @@ def detect_clock(preview: TablePreview) -> TableClock:
         unit, guess = guess_time_unit(values)
     if clock_column not in time_columns:
         guess = f"no column has a name of time; this one increases like a clock. {guess}".strip()
-    seconds = _repair_preview_clock(preview, values * to_si(unit), to_si(unit))
+    seconds, interpolation = _repair_preview_clock(preview, values * to_si(unit), to_si(unit))
+    guess = ". ".join(filter(None, (guess, interpolation)))
     return TableClock({"column": clock_column, "unit": unit}, seconds, guess, (clock_column,))
 
 
 def _repair_preview_clock(
     preview: TablePreview, t: np.ndarray, clock_resolution: float | None = None
-) -> np.ndarray:
-    """Return the times [T] in s of a table with the corrections that its reader will apply."""
+) -> tuple[np.ndarray, str]:
+    """Return the times [T] in s of a table with the corrections that its reader will apply.
+
+    The second value says how rows with the same stamp are interpolated; empty without such rows.
+    """
     is_finite = np.isfinite(t)
     if is_finite.sum() < 2 or not preview.numeric_columns:
-        return t
+        return t, ""
     t = t.copy()
     columns = (values[is_finite] for values in preview.numeric_columns.values())
-    t[is_finite], _ = repair_clock(t[is_finite], columns, clock_resolution)
-    return t
+    t[is_finite], remarks = repair_clock(t[is_finite], columns, clock_resolution)
+    texts = (
+        remark["text"] for remark in remarks if remark["code"] in ("printed_clock", "coarse_stamps")
+    )
+    return t, next(texts, "")
 
 
 def _detect_date_clock(preview: TablePreview, date_columns: dict[str, pd.Series]) -> TableClock:
@@ -240,7 +247,8 @@ def _detect_date_clock(preview: TablePreview, date_columns: dict[str, pd.Series]
         guess = "day and month of the dates are ambiguous in the first rows"
     settings |= {"order": order} if order in ("dmy", "mdy") else {}
     stamps = parse_texts(texts, has_only_dates=True)
-    seconds = _repair_preview_clock(preview, stamps.seconds_since(int(stamps.ns[0])))
+    seconds, interpolation = _repair_preview_clock(preview, stamps.seconds_since(int(stamps.ns[0])))
+    guess = ". ".join(filter(None, (guess, interpolation)))
     return TableClock(
         settings, seconds, guess, (column, *date_only_columns[: not complete_columns])
     )

@@ -7,6 +7,7 @@ starboard, down); psi is unwrapped.
 from __future__ import annotations
 
 import codecs
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ from residnet.io.readers.base import (
     require_values,
     wrap_read_errors,
 )
+from residnet.io.readers.cell_values import is_value
 from residnet.io.readers.clock_repair import find_unique_rows, repair_clock
 from residnet.io.readers.excel_tables import join_excel_sheets, read_excel_sheet
 from residnet.io.readers.json_tables import JsonObjectReader
@@ -895,7 +897,8 @@ def read_column_names(path: Path) -> tuple[str, ...]:
             if not line.startswith(("#", "%", "//")):
                 break
     # titles in comments differ from file to file; the last one may have the names
-    if comment and count_numbers(line) > 1:
+    cells = re.split(r"[\s,;|]+", line)
+    if comment and 2 * sum(map(is_value, cells)) > len(cells):
         line = comment
     for start in ("Format Version", "NO_OF_FRAMES"):
         if line.startswith(start):
