@@ -715,3 +715,11 @@ def test_interpolated_stretch_of_several_noisy_channels(names: tuple[str, ...]) 
     assert len(findings) == (len(names) > 1)
     if findings:
         assert findings[0].figures["t"] == pytest.approx(T[100], abs=0.3)
+
+
+def test_a_heading_without_positions_shows_sign_and_bias_of_a_gyro() -> None:
+    rates = {"sign": -LOG["r"], "bias": LOG["r"] + np.radians(1.0)}
+    for code, name in (("gain", "sign"), ("yaw_drift", "bias")):
+        channels = {"psi": PSI, "r": rates[name], "u": LOG["u"], "v": LOG["v"]}
+        findings = inspect_log(Log("no_gps", T, channels), ()).find_by_code(code)
+        assert [finding.level for finding in findings] == ["will mislead"]

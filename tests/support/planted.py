@@ -12,7 +12,7 @@ from residnet.core.log import Log
 from residnet.manoeuvres.trials import simulate_trial_logs
 from residnet.manoeuvres.trials_config import SimulatedTrials
 from residnet.quality.actuators import estimate_neutral_angle
-from residnet.quality.statistics import LogStatistics, make_blocks
+from residnet.quality.statistics import LogStatistics
 
 Random = np.random.Generator
 Range = tuple[float, float]
@@ -396,40 +396,6 @@ _FILLS = [-999.0, -9999.0, 9.96921e36, 1e20, -32768.0]
 _one_cell("one spike", lambda g, here, span: here + span * g.uniform(2.0, 6.0) * sign(g))
 _one_cell("fill value", lambda g, here, span: float(g.choice(_FILLS)))
 _one_cell("absurd value", lambda g, here, span: 10.0 ** g.uniform(6, 30) * sign(g))
-
-
-def one_step_errors(log: Log) -> np.ndarray:
-    """RMS residuals of the changes of u, v, r over some seconds, fitted by polynomial terms."""
-    statistics = LogStatistics(log, driving(log))
-    velocities = {name: statistics[name] for name in statistics.velocities}
-    u, v, r = velocities.values()
-    inputs = [log[name] for name in statistics.inputs if statistics.std(name) > 0.0]
-    terms = [np.ones(len(log)), u * v, u * r, v * r, *inputs]
-    terms += [power for x in velocities.values() for power in (x, x * np.abs(x))]
-    # terms of many inputs would outnumber the blocks
-    for x in inputs if len(inputs) <= 4 else ():
-        terms += [x * np.abs(x), u * np.abs(u) * x]
-    blocks = make_blocks(statistics, *velocities)
-    x = blocks.make_integrator(np.stack(terms, axis=-1))(0)
-    y = blocks.compute_changes(np.stack([*velocities.values()], axis=-1))
-    known = np.isfinite(x).all(axis=1) & np.isfinite(y).all(axis=1)
-    residuals = y[known] - x[known] @ np.linalg.lstsq(x[known], y[known], rcond=1e-6)[0]
-    return np.asarray(np.sqrt(np.mean(residuals**2, axis=0)))
-
-
-def _inputs_late(name: str, inputs: Sequence[str], hosts: tuple[str, ...]) -> None:
-    """Register late inputs, where a fit to the log would be the worse for it by a tenth."""
-
-    @fault(name, "acausal", "contradicts_late", ships=(), hosts=hosts)
-    def damage(ship: Ship, log: Log, random: Random) -> Log:
-        out = late(log, ship.lag[0], *(n for n in inputs if n in log.channels))
-        if float((one_step_errors(out) / one_step_errors(log)).max()) < 1.1:
-            raise Undecidable
-        return out
-
-
-_inputs_late("propeller late .7 s", _PROPELLERS, _ANY)
-_inputs_late("rudder late .7 s", ("delta",), _RUDDER)
 
 
 def _copied(ship: Ship, logs: list[Log], random: Random) -> list[Log]:

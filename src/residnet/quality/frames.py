@@ -378,7 +378,7 @@ def check_position_causes(log: LogStatistics, make_finding: Check) -> Iterator[F
     yield from make_cause_findings(causes, POSITION_LIMITS, log, make_finding)
 
 
-_YAW_MOTION = (*POSE_NAMES, "r")
+_YAW_MOTION = ("psi", "r")
 _MIN_YAW_CORRELATION = 0.5
 """Smallest correlation, at any lag and sign, of a yaw rate with the derivative of the heading."""
 
@@ -388,7 +388,7 @@ _MIN_YAW_CORRELATION = 0.5
     "yaw_rate",
     "fatal",
     "are both columns of this vessel and this clock?",
-    required_channels=_YAW_MOTION,
+    required_channels=(*POSE_NAMES, "r"),
     on_subsample=True,
 )
 def check_yaw_rate(log: LogStatistics, make_finding: Check) -> Iterator[Finding]:
