@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import written_recorders
 from written_logs import EPOCH, reader_for, trial
@@ -20,6 +21,8 @@ import residnet
 from residnet.core.config import validate_config
 from residnet.core.errors import DataError
 from residnet.core.log import Log
+from residnet.io.drafting.questions import DraftNotes
+from residnet.io.drafting.reading import read_drafted
 from residnet.io.readers import ReaderConfig
 from residnet.io.readers.detect import detect_recording_format
 
@@ -304,3 +307,24 @@ def test_ardupilot_as_text(tmp_path: Path) -> None:
     for name in ("x", "y", "u", "v"):
         at_ours = np.interp(read.t - 5.0, log.t, log[name])
         np.testing.assert_allclose(read[name], at_ours, atol=0.02, err_msg=name)
+
+
+def test_topics_whose_standard_messages_lack_a_heading_are_mapped_by_name(tmp_path: Path) -> None:
+    t = 0.1 * np.arange(600)
+    psi = 0.6 * np.sin(0.1 * t)
+    x, y = np.cumsum(0.2 * np.cos(psi)), np.cumsum(0.2 * np.sin(psi))
+    zeros = np.zeros(t.size)
+    velocity = {"vx": 2.0 * np.cos(psi), "vy": 2.0 * np.sin(psi), "vz": zeros}
+    quaternion = (np.cos(0.5 * psi), zeros, zeros, np.sin(0.5 * psi))
+    tables = {
+        "vehicle_local_position_0": {"x": x, "y": y, "z": zeros, **velocity, "heading": psi},
+        "vehicle_attitude_0": {f"q[{k}]": part for k, part in enumerate(quaternion)},
+        "actuator_servos_0": {"control[0]": np.cos(0.1 * t)},
+    }
+    for name, columns in tables.items():
+        path = tmp_path / "log0" / f"{name}.csv"
+        path.parent.mkdir(exist_ok=True)
+        pd.DataFrame({"timestamp": (1e6 * t).astype(int), **columns}).to_csv(path, index=False)
+    result = read_drafted([tmp_path / "log0"], DraftNotes())
+    (log,) = result.logs.values()
+    assert np.ptp(log["psi"]) > 1.0

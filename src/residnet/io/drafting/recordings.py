@@ -95,8 +95,7 @@ def draft_recordings(
         for source in pose_sources
         if source.topic in aligned[0].series
     )
-    is_contradictory = log is not None and not has_fixed_frame and not _is_consistent(log)
-    needs_pose = not has_pose or is_contradictory
+    needs_pose = log is None or not has_pose or not (has_fixed_frame or _is_consistent(log))
     sources = find_named_table(aligned, draft_notes, needs_pose=needs_pose)
     known_channels: set[str] = set()
     if sources is None:
