@@ -27,6 +27,7 @@ from residnet.quality import (
     build_inspection,
     inspect_log,
     inspect_log_set,
+    kinematics,
     summarize_inspection,
 )
 from residnet.quality.between import with_derived_velocities
@@ -723,3 +724,18 @@ def test_a_heading_without_positions_shows_sign_and_bias_of_a_gyro() -> None:
         channels = {"psi": PSI, "r": rates[name], "u": LOG["u"], "v": LOG["v"]}
         findings = inspect_log(Log("no_gps", T, channels), ()).find_by_code(code)
         assert [finding.level for finding in findings] == ["will mislead"]
+
+
+def test_no_delay_is_tried_where_the_regression_has_no_lag(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_arguments: object) -> tuple[str, int]:
+        raise AssertionError("a delay was tried")
+
+    monkeypatch.setattr(kinematics, "_select_clock", refuse)
+    random = np.random.default_rng(7)
+    antenna = 3.0 * np.exp(1j * PSI)
+    noise = 0.05 * random.normal(size=(2, T.size))
+    channels = {"x": LOG["x"] + antenna.real + noise[0], "y": LOG["y"] + antenna.imag + noise[1]}
+    statistics = LogStatistics(LOG.replace(channels={**LOG.channels, **channels}))
+    causes = estimate_position_causes(statistics)
+    assert [*causes] == ["lever_arm"]
+    assert causes["lever_arm"].estimates[0] == pytest.approx(3.0, abs=0.1)

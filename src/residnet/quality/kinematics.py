@@ -389,8 +389,9 @@ def _compare_clocks(
     if rectangle_model is not None:
         return _explain_increments(rectangle_model).causes
     regression = _explain_increments(model)
-    if not regression.causes:
-        return {}
+    # a delay is a lag to first order; without one, a shift imitates a cause such as a lever arm
+    if not regression.causes.keys() & clocks.keys():
+        return regression.causes
     # what is left of exact values is rounding
     residual_square = float(np.nan_to_num(regression.squares).mean())
     if residual_square <= _MAX_ROUNDING_SHARE * regression.response_square:
